@@ -12,11 +12,14 @@ Read a skin without knowing its hardware::
 import os
 
 from skinware import realtime, threads
-from skinware.driver_service import DriverFrame, DriverReader, DriverWriter
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader, DriverWriter
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
-from skinware.skin import Skin, SkinLayout, Snapshot
+from skinware.skin import Skin
+from skinware.skin_layout import SkinLayout
+from skinware.snapshot import Snapshot
 from skinware.status import BusReason, BusState, PatchState, Status
 from skinware.structure import Structure
 from skinware.window import Window

@@ -57,12 +57,10 @@ def column(name: str, data: npt.ArrayLike, code: str) -> npt.NDArray[Any]:
 
 
 def texts(column: npt.NDArray[np.bytes_]) -> list[str]:
-    """The texts of a column of names."""
     return [text.decode(errors="replace") for text in column.tolist()]
 
 
 def frozen(array: npt.NDArray[_T]) -> npt.NDArray[_T]:
-    """The same array, read-only."""
     array.flags.writeable = False
     return array
 

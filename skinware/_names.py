@@ -59,5 +59,4 @@ def name_in_module(type_name: str, number: int, is_only: bool) -> str:
 
 
 def joined(owner: str, name: str) -> str:
-    """A name after that of what it belongs to."""
     return f"{owner}, {name}" if name else owner

@@ -15,6 +15,3 @@ def printable(text: str, keep: str = "") -> str:
     if text.translate(dict.fromkeys(map(ord, keep))).isprintable():
         return text
     return "".join(sign if sign.isprintable() or sign in keep else "?" for sign in text)
-
-
-__all__ = ["printable"]

@@ -6,7 +6,6 @@ import warnings
 
 
 def renamed(old: str, new: str) -> None:
-    """Warn the caller of whoever calls this."""
     warnings.warn(
         f"{old} is called {new} now; the old name ends with the next release", DeprecationWarning, stacklevel=3
     )

@@ -123,7 +123,6 @@ class BridgeState:
 
 
 def service_name(robot: str) -> str:
-    """Name of the service with the state of the bridge to a robot."""
     return f"{robot[:40]}-bridge"
 
 
@@ -134,7 +133,6 @@ class BridgeFrame(Frame):
 
     @property
     def state(self) -> BridgeState:
-        """All of it."""
         error_ns = int(self.column("clock_error_ns"))
         is_known = error_ns >= 0
         rows = self.column("services")[: int(self.column("count"))]
@@ -220,7 +218,6 @@ class BridgeStateWriter:
         self._service.commit(at_ns)
 
     def close(self) -> None:
-        """Withdraw the service. Idempotent."""
         self._service.close()
 
     def __enter__(self) -> Self:
@@ -254,14 +251,3 @@ def _state_of(row: npt.NDArray[Any]) -> ServiceState:
 
 def _text(column: npt.NDArray[Any]) -> str:
     return bytes(column.item()).decode(errors="replace")
-
-
-__all__ = [
-    "KIND",
-    "BridgeFrame",
-    "BridgeReader",
-    "BridgeState",
-    "BridgeStateWriter",
-    "ServiceState",
-    "service_name",
-]

@@ -130,7 +130,6 @@ class DriverFrame(Frame):
         return self._told("bus_data_path", (len(self.structure.buses),), np.uint8)
 
     def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """A column that a driver need not have."""
         return self.column(name).reshape(shape) if name in self._columns else np.zeros(shape, dtype)
 
     # -- by type ------------------------------------------------------------------------------------------------

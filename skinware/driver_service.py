@@ -24,8 +24,6 @@ from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
-__all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter", "counters_of"]
-
 KIND = "driver"
 _REQUIRED = ("values", "status", "module_time_ns", "patch_state", "bus_state")
 
@@ -293,5 +291,4 @@ def _frame_columns(
 
 
 def _names(tables: Mapping[str, npt.NDArray[Any]], table: str) -> list[str]:
-    """The texts of a table that a driver need not have."""
     return [bytes(text).decode() for text in tables.get(table, ())]

@@ -158,7 +158,6 @@ class Geometry:
         return self._take(np.array(found, np.int64), type_name, uid)
 
     def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Geometry:
-        """Some of the rows."""
         return Geometry(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
     @classmethod
@@ -341,6 +340,3 @@ def _triples(rows: npt.NDArray[np.float64]) -> tuple[Triple, ...]:
 def _string(text: str) -> str:
     """A TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
     return msgspec.json.encode(text).decode().replace("\x7f", "\\u007f")
-
-
-__all__ = ["Geometry", "GeometryGroup", "geometry_to_toml", "read_geometry"]

@@ -118,7 +118,6 @@ def unpack(data: bytes | memoryview, most: int, *, window_bits: int = zlib.MAX_W
 
 
 def _is_deeper(text: bytes, depth: int) -> bool:
-    """Whether brackets nest deeper, also in a text that is no JSON."""
     if text.count(b"[") + text.count(b"{") <= depth:
         return False
     level = 0

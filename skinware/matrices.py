@@ -103,6 +103,3 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
         if rows_and_columns(kind) is None:
             return f"module {key!r} is no matrix but {kind!r}; its geometry tells where its sensors are"
         return f"module {key!r} is {kind}, but does not have a {self._type_name} sensor at each place"
-
-
-__all__ = ["Matrices", "ModuleKey", "filled_by", "rows_and_columns"]

@@ -62,6 +62,3 @@ def sample_text(sample: dict[str, Any]) -> str:
     identifier = f"{sample['identifier']:0{8 if sample['extended'] else 3}X}"
     more = " ..." if sample["length"] > DATA_BYTES else ""
     return f"{identifier} [{sample['length']}] {bytes.fromhex(sample['data']).hex(' ').upper()}{more}".rstrip()
-
-
-__all__ = ["SAMPLE", "SAMPLES", "SAMPLES_OF_A_KIND", "Unused", "sample_report", "sample_text"]

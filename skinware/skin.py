@@ -29,8 +29,6 @@ from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.structure import Structure
 
-__all__ = ["DriverCallback", "Skin", "SkinLayout", "Snapshot"]
-
 log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
@@ -197,7 +195,6 @@ class Skin:
         self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[futex.Word, int]], Snapshot | None]:
-        """What to sleep on if that is not enough, and a snapshot if there is one that is newer."""
         if self._closed:
             raise Closed("this skin was closed")
         if now_ns() >= self._next_look_ns or self._moved_on():
@@ -374,7 +371,6 @@ def _names(given: Collection[str] | None) -> frozenset[str] | None:
 
 
 def _nearest(readers: list[_Reader]) -> tuple[DriverFrame, ...]:
-    """Of each driver the frame nearest to the newest moment that all have reached whose data still comes."""
     newest_ns = [reader.newest_acquired_ns() for reader in readers]
     time_ns = now_ns()
     reached_ns = [
@@ -393,7 +389,6 @@ def _same_frames(one: Snapshot, other: Snapshot) -> bool:
 
 
 def _too_old(snapshot: Snapshot, max_age_s: float | None) -> list[str]:
-    """The drivers whose newest data is older than that, each with its age."""
     if max_age_s is None:
         return []
     ages = zip(snapshot.layout.drivers, (frame.age_ns / NS_PER_S for frame in snapshot.frames), strict=True)

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import _names
-from skinware._columns import texts
+from skinware._columns import Index, texts
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.matrices import Matrices, ModuleKey
-from skinware.structure import Index, Structure
+from skinware.structure import Structure
 
 
 def _module_keys(driver: str, structure: Structure) -> list[ModuleKey]:

@@ -101,7 +101,6 @@ class DataPath(enum.IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> DataPath:
-        """A way that only later versions know."""
         del value
         return cls.NOT_TOLD
 

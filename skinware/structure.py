@@ -18,8 +18,6 @@ from skinware.matrices import Matrices
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 
-__all__ = ["VALUE_DTYPES", "Index", "Structure"]
-
 VALUE_DTYPES = tuple(np.dtype(code) for code in ("u1", "<i2", "<u2", "<i4", "<f4"))
 """The dtypes that values of a service may have."""
 

@@ -27,7 +27,8 @@ from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
 from skinware.service import ServiceReader, ServiceWriter
-from skinware.skin import Skin, Snapshot
+from skinware.skin import Skin
+from skinware.snapshot import Snapshot
 
 log: logging.Logger = logging.getLogger("skinware.threads")
 

@@ -53,7 +53,6 @@ class TomlText:
             raise ConfigurationError(f"{path}{line}: not TOML: {_WHERE.sub('', str(error))}") from None
 
     def place(self, keys: Sequence[str | int]) -> str:
-        """File and line of a value, for messages."""
         return f"{self._path}:{line_of(self._text, keys)}"
 
     def of_format(self, what: str, format_name: str, version: int, struct: type[T]) -> T:
@@ -83,7 +82,6 @@ class TomlText:
 
 
 def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:
-    """What is wrong with data that does not fit a struct, and where."""
     text = str(error).replace("`", "")
     keys = _KEYS_IN_ERROR.findall(text.rpartition("$")[2])
     return text, tuple(int(number) if number else key for key, number in keys)
@@ -104,7 +102,6 @@ def line_of(text: str, keys: Sequence[str | int]) -> int:
 
 
 def _paths(text: str) -> Iterator[tuple[int, Keys]]:
-    """Every line that begins a table or a value, with its keys."""
     elements: Counter[Keys] = Counter()  # of arrays of tables
     table: Keys = ()
     for number, line in enumerate(text.splitlines(), 1):

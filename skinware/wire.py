@@ -67,12 +67,10 @@ class Piece(NamedTuple):
 
 
 def service_name(driver: str) -> str:
-    """Name of the service with the wires of a driver."""
     return f"{driver[:42]}-wire"
 
 
 def size_of(form: int, count: int) -> int:
-    """Bytes of a piece of so many frames or bytes."""
     if form == BYTES:
         return PIECE.itemsize + 8 + -(-count // 8) * 8
     return PIECE.itemsize + count * (8 + ROWS[form].itemsize)

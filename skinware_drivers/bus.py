@@ -325,19 +325,3 @@ class Bus(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.channel}>"
-
-
-__all__ = [
-    "ERROR_FLAG",
-    "EXTENDED_FLAG",
-    "IDENTIFIER_MASK",
-    "LARGEST_STANDARD",
-    "REMOTE_FLAG",
-    "Bus",
-    "Filter",
-    "FrameBatch",
-    "check_identifier",
-    "identifier_text",
-    "kind_of_bus",
-    "wire_dtype",
-]

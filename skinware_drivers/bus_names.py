@@ -96,7 +96,6 @@ def _check_modbus(channel: str, options: Mapping[str, str]) -> None:
 
 
 def _split(address: str) -> tuple[str, str]:
-    """Interface and channel."""
     interface, colon, channel = address.partition(":")
     if interface in NETWORKS and channel.startswith("//"):
         return interface, channel[2:]

@@ -70,6 +70,3 @@ class Bits:
     shift: int
     width: int
     byte: int | None = None
-
-
-__all__ = ["Bits", "Byte", "Condition", "Identifier"]

@@ -73,5 +73,3 @@ OWN_BUS_COUNTERS = tuple(_OWN)
 """Names of what a bus counts, for people and other programs."""
 read_own = attrgetter(*_OWN.values())
 """The counts of a ``BusCounters``, in the order of ``OWN_BUS_COUNTERS``."""
-
-__all__ = ["OWN_BUS_COUNTERS", "BusCounters", "FramerCounters", "read_own"]

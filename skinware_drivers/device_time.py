@@ -179,7 +179,6 @@ class DeviceClock:
         return y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS
 
     def _fit_slope(self) -> None:
-        """The slope of the edge under the middle of the points, of their lower convex hull."""
         whole = list(self._points)[:-1]  # of the newest part, the best may be yet to come
         if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_NS:
             return
@@ -198,6 +197,3 @@ class DeviceClock:
 def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
     """Whether the second point lies on or above the line from the first to the third."""
     return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])
-
-
-__all__ = ["DeviceClock"]

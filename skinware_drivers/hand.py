@@ -118,6 +118,3 @@ class Hand:
             centres.append((x if self.side == "right" else -x, top - height / 2, 0.0))
             top -= height + _GAP_M
         return centres
-
-
-__all__ = ["FINGERS", "FRAME", "PITCH_M", "Grid", "Hand"]

@@ -369,7 +369,6 @@ def _check_frame(frame: Frame) -> None:
 
 
 def _has_bits(flag: Flag) -> bool:
-    """Whether the word of a flag is unsigned, and has all the bits that are meant."""
     word = np.dtype(flag.dtype)
     bits = 8 * word.itemsize
     words = flag.mask, flag.normal

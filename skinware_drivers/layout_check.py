@@ -59,7 +59,6 @@ def _check_age(cycle: Cycle, period_s: float) -> None:
 
 
 def _check_members(members: Sequence[Frame]) -> None:
-    """A cycle has one value for each channel."""
     writer: dict[int, str] = {}
     for frame in members:
         for channel in {c for values in frame.runs for c in values.channels if c is not None}:
@@ -96,6 +95,3 @@ def _range(sent: str | Packed) -> tuple[int, int]:
         return (-(1 << sent.bits - 1), (1 << sent.bits - 1) - 1) if sent.signed else (0, (1 << sent.bits) - 1)
     limits = np.iinfo(np.dtype(sent).name)
     return int(limits.min), int(limits.max)
-
-
-__all__ = ["check_layout"]

@@ -72,7 +72,6 @@ def load(kind: Kind, name: str) -> type[Any]:
 
 
 def registered(group: str) -> dict[str, EntryPoint]:
-    """What installed packages have registered in a group of entry points, by name."""
     return {entry.name: entry for entry in _selection(tuple(sys.path))(group=group)}
 
 
@@ -88,7 +87,6 @@ def short_name(name: str) -> str:
 
 
 def _class_in(name: str, kind: Kind) -> type[Any]:
-    """The one class of a kind that a file defines."""
     module = _module_of(name, kind)
     classes = dict.fromkeys(thing for thing in vars(module).values() if isinstance(thing, type))
     found = [one for one in classes if one.__module__ == module.__name__ and kind.fits(one)]
@@ -143,6 +141,3 @@ def _blamed(what: str, is_theirs: Callable[[str], bool]) -> Iterator[None]:
             text, places = error.msg, [f"{error.filename}:{error.lineno}"]
         where = f" ({places[-1]})" if places else ""
         raise ConfigurationError(f"{what} cannot be loaded: {type(error).__name__}: {text}{where}") from error
-
-
-__all__ = ["Kind", "load", "registered", "short_name"]

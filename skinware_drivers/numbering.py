@@ -91,6 +91,3 @@ class DeviceTime:
     def turn(self) -> int:
         """Counts until it is 0 again."""
         return self.modulo or 1 << 8 * np.dtype(self.dtype).itemsize
-
-
-__all__ = ["DeviceTime", "SequenceNumber"]

@@ -94,6 +94,3 @@ def check_polls(polls: Sequence[Poll], wire_s: Callable[[Poll], float]) -> str:
 
 def _ms(time_s: float) -> str:
     return f"{time_s * 1e3:.3g} ms"
-
-
-__all__ = ["Poll", "check_polls"]

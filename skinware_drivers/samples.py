@@ -60,6 +60,3 @@ class Samples:
         size = kept["data"].shape[1]
         data = np.frombuffer(payload[: min(length, size)].ljust(size, b"\0"), np.uint8)
         kept[place] = (identifier, min(length, 0xFFFF), why, 0, data)
-
-
-__all__ = ["Samples"]

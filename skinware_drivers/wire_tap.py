@@ -49,7 +49,6 @@ class WireTap:
 
     @property
     def is_open(self) -> bool:
-        """Whether things are kept."""
         return self._memory is not None
 
     @property
@@ -63,7 +62,6 @@ class WireTap:
         return int(self._kept.lost)
 
     def open(self) -> None:
-        """Keep what comes from now on. Idempotent."""
         if self._memory is None:
             self._memory = np.zeros(_ROOM, np.uint8)
             self._kept = Kept(self._memory.ctypes.data, _ROOM, 0, 0)
@@ -164,6 +162,3 @@ class WireTap:
         head = self._memory[begin : begin + PIECE.itemsize].view(PIECE)
         head[0] = (size, count, form, is_sent, np.zeros(6, np.uint8))
         return self._memory[begin + PIECE.itemsize : begin + size]
-
-
-__all__ = ["Kept", "WireTap"]

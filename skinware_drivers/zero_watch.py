@@ -56,7 +56,6 @@ class ZeroWatch(Watch):
         self.sees_all = True
 
     def _name(self, time_ns: int) -> None:
-        """Log the untouched modules once, when all that there are have been so for long."""
         has_waited = self.module_untouched & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
         untold = np.flatnonzero(has_waited & ~self._is_told)
         if len(untold) and (has_waited == self.module_untouched).all():  # not one by one
@@ -64,6 +63,3 @@ class ZeroWatch(Watch):
             names = [self.tables.structure.module_names[module] for module in untold[:_MOST_NAMES].tolist()]
             more = f" and {len(untold) - len(names)} more" if len(untold) > len(names) else ""
             log.info("nothing but 0 has come from %s%s so far: not touched yet, or dead", "; ".join(names), more)
-
-
-__all__ = ["ZeroWatch"]

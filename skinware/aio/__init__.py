@@ -41,7 +41,6 @@ class _Awaited:
         self._closed = False
 
     def close(self) -> None:
-        """Close what is awaited. Idempotent."""
         self.sync.close()
         if not self._closed:
             self._closed = True
@@ -194,7 +193,6 @@ def _remaining_s(deadline_ns: int | None) -> float:
 
 
 async def _deadline(timer: Periodic) -> bool:
-    """Wait for the next deadline of a rate."""
     await asyncio.sleep(max(0.0, (timer.deadline_ns - now_ns()) / NS_PER_S))
     timer.advance(now_ns())
     return True

@@ -63,7 +63,6 @@ class Wakeups:
         self._thread: threading.Thread | None = None
 
     def enter(self) -> None:
-        """Begin to use it."""
         with self._lock:
             self._users += 1
 
@@ -134,7 +133,6 @@ def wakeups() -> Wakeups:
 
 
 def _begin_anew() -> None:
-    """In the child of a fork, where the thread is not."""
     global _of_process
     _of_process = Wakeups()
 

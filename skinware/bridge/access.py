@@ -98,6 +98,3 @@ class _Grant:
 
     def subject(self) -> dict[str, object]:
         return {"id": self.name} | ({"cert_common_names": list(self.to)} if self.to else {})
-
-
-__all__ = ["Rules"]

@@ -84,7 +84,6 @@ class Calls:
         question.reply(msgspec.json.encode(answered))
 
     def end(self) -> None:
-        """Cancel what is under way."""
         self._ending = True
 
     def close(self) -> None:
@@ -114,6 +113,3 @@ def _why(error: Exception) -> Literal["refused", "failed", "paused", "cancelled"
     if isinstance(error, RequestRefused):
         return "refused"
     return "failed" if isinstance(error, RequestError) else "refused"
-
-
-__all__ = ["Calls"]

@@ -75,7 +75,6 @@ class PeerClock:
 
     @property
     def is_known(self) -> bool:
-        """Whether anything is."""
         return bool(self._samples)
 
     @property
@@ -92,7 +91,6 @@ class PeerClock:
         return round(self._offset_ns + self._slope * (at_ns - self._at_ns))
 
     def add(self, sample: Sample) -> None:
-        """What questions told."""
         samples = self._samples
         if samples and abs(sample.at_ns - samples[-1].at_ns) < _AT_ONCE_NS:
             samples[-1] = samples[-1].with_(sample)
@@ -136,6 +134,3 @@ def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
     ends = np.array([0.0, _HORIZON_NS])
     highest: _Floats = (high + steepest * (ends[:, None] - at)).min(axis=1)
     return highest
-
-
-__all__ = ["PeerClock", "Sample"]

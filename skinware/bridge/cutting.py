@@ -73,7 +73,6 @@ class Cut:
         self.generation: Generation = Generation(self.head.raw, whole.name)
 
     def frame(self, frame: Frame) -> RecordedDriverFrame:
-        """What stays of a frame of the generation."""
         slot = np.zeros(self.generation.slot_stride, np.uint8)
         slot[: SLOT.itemsize] = np.frombuffer(frame.slot, np.uint8, SLOT.itemsize)
         cut = RecordedDriverFrame(self.generation, memoryview(slot.data))
@@ -110,6 +109,3 @@ def _structure(
         group_period_ns=whole.group_period_ns[groups],
         geometry=None if whole.geometry is None else whole.geometry[as_index(sensors)],
     )
-
-
-__all__ = ["Cut"]

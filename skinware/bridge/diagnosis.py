@@ -51,6 +51,3 @@ def _why_no_tls(endpoint: str, host: str, connection: socket.socket, tls: Path) 
     except OSError as error:
         return f"{endpoint}: {error.strerror or error} in the TLS handshake; does it listen with --tls?"
     return ""
-
-
-__all__ = ["why_unreachable"]

@@ -125,6 +125,3 @@ def _tls(folder: Path) -> dict[str, str]:
     }
     told = {f"transport/link/tls/{name}": json.dumps(str(path.resolve())) for name, path in settings.items()}
     return {**told, "transport/link/tls/enable_mtls": "true"}
-
-
-__all__ = ["DEFAULT_LISTEN", "DEFAULT_ROUTER", "Endpoints", "endpoints", "tls_files"]

@@ -100,17 +100,14 @@ class Follower:
 
     @property
     def mode(self) -> str:
-        """``push`` or ``pull``."""
         return self._pacing.mode
 
     @property
     def _of_part(self) -> dict[str, object]:
-        """What tells in questions which part is meant."""
         return {"part": self._part} if self._part else {}
 
     @property
     def _of_frame(self) -> str:
-        """A frame, for people."""
         return f"a frame of service {self._name!r}"
 
     @property
@@ -118,7 +115,6 @@ class Follower:
         return self._peer.keys.frame(self._name, self._part)
 
     def take(self, told: Service) -> None:
-        """How it is there now."""
         before, self.state = self.state, told.state
         self._last_word = told.generation, told.sequence
         if told.generation and (self._generation is None or self._generation.generation != told.generation):
@@ -131,7 +127,6 @@ class Follower:
             self._peer.room.give_back(self._name)
 
     def look(self, time_ns: int) -> None:
-        """What is to be done by the clock."""
         if not self._peer.is_connected or self._generation is None or not self._peer.clock.is_known:
             return
         self._open = {pull: until_ns for pull, until_ns in self._open.items() if time_ns <= until_ns}
@@ -148,7 +143,6 @@ class Follower:
             self._probe()
 
     def start_over(self) -> None:
-        """Generations and counts are others from now on."""
         self._generation, self._newest, self._count = None, (0, 0), None
 
     def lost(self) -> None:
@@ -160,7 +154,6 @@ class Follower:
         self._probe_until_ns = 0
 
     def clock_told(self) -> None:
-        """The robot's clock is known."""
         if self._held and self._generation is not None:
             self._take_held()
 
@@ -215,7 +208,6 @@ class Follower:
     # -- how frames come ------------------------------------------------------------------------------------------
 
     def subscribe(self) -> None:
-        """Have its frames come, as its pacing wants it."""
         self._unsubscribe()
         self._open.clear()
         if self._generation is not None and not self._pacing.pulls:
@@ -233,7 +225,6 @@ class Follower:
                 self._take_frame(message)
 
     def _pull_all(self, here: RecordedFrame | None = None) -> None:
-        """Have as many questions open as are to be."""
         while len(self._open) < self._pacing.open:
             self._pull(here)
 
@@ -374,7 +365,6 @@ class Follower:
         self._peer.say_once(self._name, f"service {self._name!r}{what}: {error}")
 
     def _refuse(self, kind: str, error: SkinwareError) -> None:
-        """Count a message that cannot be taken."""
         self._peer.guard.refuse(kind, str(error))
 
 
@@ -408,6 +398,3 @@ def _checked(frame: RecordedFrame, generation: Generation) -> RecordedFrame:
     if max(frame.acquired_ns, frame.published_ns) > _LATEST_NS:
         raise BadRecording("its times are of no clock")
     return frame
-
-
-__all__ = ["Follower", "Traffic"]

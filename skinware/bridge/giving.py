@@ -83,7 +83,6 @@ class Stream:
 
     @property
     def newest(self) -> Frame | None:
-        """The frame that was taken last, of this generation."""
         return self._newest
 
     @property
@@ -121,7 +120,6 @@ class Stream:
             self._soon(self._give, form, frame, question, puller)
 
     def asked(self, question: Question) -> None:
-        """A receiver asks for the newest frame."""
         if question.parameters.get("form") == str(RAW):
             self._asked_raw(question)
             return
@@ -158,7 +156,6 @@ class Stream:
             question.reply(b"")
 
     def close(self) -> None:
-        """Nothing is given any more."""
         self._send.close()
         with self._lock:
             late = [question for puller in self._pullers.values() for _, question in puller.open]
@@ -180,7 +177,6 @@ class Stream:
         return puller
 
     def _asked_raw(self, question: Question) -> None:
-        """A frame as it would be pushed, now."""
         form, newest = self._form, self._newest
         if newest is None:
             question.reply(b"")
@@ -212,6 +208,3 @@ def _as_it_is(frame: Frame) -> Frame:
 def _number_in(question: Question, name: str) -> int:
     """A parameter of a question that is a number from 0 on; 0 if there is none."""
     return number_in(question.parameters.get(name, ""))
-
-
-__all__ = ["Stream"]

@@ -32,7 +32,6 @@ class Guard:
         self.last: str = ""
 
     def refuse(self, kind: str, why: str) -> None:
-        """Count a message that cannot be taken."""
         with self._lock:
             self.count += 1
             self.last = f"{kind}: {why}"[:_LONGEST]
@@ -56,8 +55,6 @@ class Guard:
         return True
 
     def of_messages(self, kind: str, heard: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        """What hears messages, guarded."""
-
         def guarded(key: str, payload: bytes) -> None:
             self.run(kind, heard, key, payload)
 
@@ -99,7 +96,6 @@ class Room:
         self._taken[name] = size
 
     def give_back(self, name: str) -> None:
-        """The service is over."""
         self._taken.pop(name, None)
 
 
@@ -107,6 +103,3 @@ def _text(error: Exception) -> str:
     if isinstance(error, SkinwareError):
         return str(error)
     return f"{type(error).__name__}: {error}"
-
-
-__all__ = ["Guard", "Room"]

@@ -110,7 +110,6 @@ class Joiner:
         self._turns.close()
 
     def _look(self) -> None:
-        """What is to be done by the clock."""
         time_ns = now_ns()
         if time_ns >= self._next_services_ns:
             self._ask_services()
@@ -277,6 +276,3 @@ class Joiner:
 
 def _quantile(values: Sequence[int], share: float) -> float | None:
     return sorted(values)[int(share * len(values))] if values else None
-
-
-__all__ = ["Joiner"]

@@ -127,13 +127,11 @@ class Sender:
         self._publisher, self.close = publisher, close
 
     def __call__(self, payload: Payload) -> None:
-        """Send them."""
         with contextlib.suppress(zenoh.ZError):  # closed
             self._publisher.put(payload)
 
     @property
     def is_heard(self) -> bool:
-        """Whether anybody listens."""
         try:
             status: Any = self._publisher.matching_status
         except zenoh.ZError:  # closed

@@ -244,12 +244,10 @@ class Keys:
         self.summary = f"{self._root}/summary"
 
     def pong(self, who: str) -> str:
-        """Of answers to somebody's pings."""
         return f"{self._root}/pong/{who}"
 
     @property
     def token(self) -> str:
-        """Of the bridge that serves it."""
         return f"skinware/live/{self.robot}/{VERSION}/{self._instance}"
 
     def of(self, service: str, what: str) -> str:
@@ -257,7 +255,6 @@ class Keys:
         return f"{self._root}/{service}/{what}"
 
     def frame(self, service: str, part: str = "") -> str:
-        """Of the frames of a service, or of a part of it."""
         return self.of(service, f"frame/{part}" if part else "frame")
 
     def call(self, service: str, operation: str) -> str:
@@ -272,7 +269,6 @@ def parts_of(key: str) -> tuple[str, str]:
 
 
 def bridge_of(key: str) -> tuple[str, str]:
-    """(robot, instance) of a key of a robot."""
     robot, instance = key.split("/")[2:4]
     return robot, instance
 
@@ -298,12 +294,10 @@ def number_in(text: str) -> int:
 
 
 def host_name() -> str:
-    """Name of this machine, for people."""
     return socket.gethostname()[:64]
 
 
 def raw_message(frame: Frame) -> bytes:
-    """A frame as it is in the ring."""
     return b"".join((_HEAD.pack(RAW, frame.generation), frame.slot))
 
 
@@ -330,7 +324,6 @@ def generation_of(message: bytes) -> int:
 
 
 def slot_of(message: bytes) -> npt.NDArray[np.uint8]:
-    """(stride,) the slot of a raw frame."""
     return np.frombuffer(message, np.uint8, offset=_HEAD.size)
 
 
@@ -361,7 +354,6 @@ class Head:
 
 
 def generation_message(about: About, head: Head) -> bytes:
-    """What a generation is, for the link."""
     text = msgspec.json.encode(about)
     return _SIZE.pack(len(text)) + text + head.packed()
 

@@ -68,11 +68,9 @@ class Mirror(Republisher):
         super().watch(fd, locked)
 
     def shift_ns(self, frame: RecordedFrame) -> int:  # noqa: ARG002
-        """Likewise."""
         return self._offset_ns()
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:
-        """Likewise."""
         return {operation: _named(text) for operation, text in self.operations.get(name, {}).items()}
 
     def take_requests(self, name: str, service: Published) -> None:
@@ -88,7 +86,6 @@ class Mirror(Republisher):
             self._give(name, frame.position)
 
     def answered(self, name: str, request: Request, answer: Answered, result: Any) -> None:
-        """What came back of a request."""
         if request.cancelled or name not in self._services:
             return
         if answer.error is not None:
@@ -109,7 +106,6 @@ class Mirror(Republisher):
                 late.request.fail("it was done, but the frame that goes with it did not come over the link")
 
     def _give(self, name: str, position: Position) -> None:
-        """Give the answers that wait for a frame that is here."""
         service = self._services[name]
         here = [waiting for waiting in self._answers[name] if waiting.at <= position]
         for waiting in here:

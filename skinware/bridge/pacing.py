@@ -103,7 +103,6 @@ class Pacing:
 
     @property
     def mode(self) -> str:
-        """``push`` or ``pull``."""
         return "pull" if self.pulls else "push"
 
     def wants_probe(self, at_ns: int, round_trip_ns: int) -> bool:
@@ -187,6 +186,3 @@ class Pacing:
     def _change(self, pulls: bool) -> None:
         self.pulls = pulls
         self._waits = _Waits()
-
-
-__all__ = ["MOST_OPEN", "Pacing"]

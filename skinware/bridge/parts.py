@@ -114,7 +114,6 @@ class Parts:
             return part
 
     def find(self, number: str) -> Part | None:
-        """The part of a wish of that number, if it is wanted."""
         return self._parts.get(number)
 
     def take(self, name: str, frame: Frame) -> None:
@@ -132,6 +131,3 @@ class Parts:
                 self._parts.pop(number).close()
         for part in list(self._parts.values()):
             part.let_go()
-
-
-__all__ = ["Part", "Parts"]

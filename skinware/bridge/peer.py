@@ -99,7 +99,6 @@ class Peer:
 
     @property
     def robot(self) -> str:
-        """Its name."""
         return self.keys.robot
 
     def ask(
@@ -180,7 +179,6 @@ class Peer:
         self.tell({"event": "switched", "robot": self.robot, "instance": self.instance, "host": self.host, "why": why})
 
     def heard(self) -> None:
-        """Something came from it."""
         self._heard_ns = now_ns()
         if not self.is_connected:
             self.is_connected, self.since_ns = True, self._heard_ns
@@ -188,7 +186,6 @@ class Peer:
             self.tell({"event": "connected", "robot": self.robot, "instance": self.instance, "host": self.host})
 
     def look(self, time_ns: int) -> None:
-        """What is to be done by the clock."""
         if time_ns >= self._next_clock_ns:
             self._ask_clock()
         if self.is_connected and time_ns - self._heard_ns > _SILENCE_NS - _PING_NS:
@@ -202,7 +199,6 @@ class Peer:
             threading.Thread(target=self._ask_why, name="skinware bridge diagnosis", daemon=True).start()
 
     def _refused(self, kind: str, why: str) -> None:
-        """In the thread that found it."""
         text = f"robot {self.robot}: {kind} cannot be read: {why}"
         self._turns.soon(lambda: self.tell({"event": "trouble", "about": "message", "why": text}))
 
@@ -268,8 +264,4 @@ class Peer:
 
 
 def _named(instance: str, host: str) -> str:
-    """A bridge, for people."""
     return f"bridge {instance[:8]} on {host}" if host else f"bridge {instance[:8]}"
-
-
-__all__ = ["ANSWER_S", "Peer", "Watcher"]

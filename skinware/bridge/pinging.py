@@ -43,13 +43,11 @@ class Pinger:
         self._known: Sample | None = None
 
     def follow(self, keys: Keys) -> None:
-        """Ask the bridge with these keys from now on."""
         self._silence()
         self._ping, self._since_ns = keys.ping, now_ns()
         self._silence = self._link.listen(keys.pong(self._who), self._guard.of_messages("a clock", self._answered))
 
     def close(self) -> None:
-        """Ask nobody any more."""
         self._ping = ""
         self._silence()
 
@@ -102,6 +100,3 @@ def answering(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Call
             link.tell(pong, _PONG.pack(asked_ns, heard_ns, clock()), Priority.CLOCK)
 
     return link.listen(keys.ping, asked)
-
-
-__all__ = ["QUESTIONS", "Pinger", "answering"]

@@ -235,7 +235,6 @@ class Server:
         self._summaries.send(drivers, len(there) - len(drivers), self.lost)
 
     def _there(self) -> list[tuple[_Whole, Service, Stream]]:
-        """The services that are there now."""
         with self._lock:
             services = [(served.whole, served.told, served.stream) for served in self._services.values()]
         return [service for service in services if service[1].state != "closed"]
@@ -256,7 +255,6 @@ class Server:
         self.guard.run("a question", work, *arguments)
 
     def _let_go(self) -> None:
-        """Forget questions and parts that are over."""
         for served in self._services.values():
             served.stream.let_go()
         self._parts.let_go()
@@ -278,7 +276,6 @@ class Server:
         return msgspec.json.encode(Services(self._instance, self._start, self._callers, services, host=host_name()))
 
     def _tell_part(self, question: Question) -> None:
-        """What there is of the sensors that somebody wants."""
         services: dict[str, Service] = {}
         try:
             missing = self._fit(read_text(question.payload, Wish), services)
@@ -334,6 +331,3 @@ class Server:
 
     def _called(self, question: Question) -> None:
         self._calls.submit(question, self._calls.carry_out, *parts_of(question.key))
-
-
-__all__ = ["Server"]

@@ -56,7 +56,6 @@ class Summaries:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether anybody listens."""
         return self._send_bytes.is_heard
 
     def count(self, frames: dict[str, int]) -> None:
@@ -120,6 +119,3 @@ def _fresh(frame: RecordedDriverFrame, structure: Structure, time_ns: int, is_li
         alive=is_live,
     )
     return int(np.count_nonzero(fresh))
-
-
-__all__ = ["Summaries", "Summarised"]

@@ -49,7 +49,6 @@ class Turns:
                 os.eventfd_write(self.fd, 1)
 
     def take(self) -> None:
-        """Do what waits."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         for _ in range(len(self._jobs)):
@@ -59,10 +58,6 @@ class Turns:
             job()
 
     def close(self) -> None:
-        """End it."""
         with self._lock:
             fd, self.fd = self.fd, -1
             os.close(fd)
-
-
-__all__ = ["Turns"]

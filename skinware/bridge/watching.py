@@ -150,6 +150,3 @@ class Watcher:
             if seen.pinger is None:  # the robot has gone meanwhile
                 pinger.close()
         pinger.ask()
-
-
-__all__ = ["Seen", "Watcher"]

@@ -12,7 +12,6 @@ _TITLES = ("service", "state", "mode", "rate", "age 50 %", "age 99 %", "not come
 
 
 def as_data(bridge: BridgeState) -> dict[str, Any]:
-    """A bridge as JSON prints it."""
     clock = None
     if bridge.clock_offset_ns is not None and bridge.clock_error_ns is not None:
         clock = {
@@ -35,7 +34,6 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
 
 
 def summary(robot: str, told: dict[str, Any]) -> str:
-    """A bridge, of which ``as_data`` tells, in a line."""
     state = "heard" if told["connected"] else "not heard"
     host = f" on {told['host']}" if told["host"] else ""
     line, clock = f"robot {robot}{host} {state} for {age_text(told['since_s'] * 1e9)}", told["clock"]
@@ -60,7 +58,6 @@ def trouble(told: dict[str, Any]) -> list[str]:
 
 
 def as_lines(robot: str, told: dict[str, Any]) -> list[str]:
-    """The same, and its services."""
     rows = [
         (
             name,
@@ -93,6 +90,3 @@ def _service_data(service: ServiceState) -> dict[str, Any]:
             "p99": None if p99_ns is None else p99_ns / 1e6,
         },
     }
-
-
-__all__ = ["as_data", "as_lines", "summary", "trouble"]

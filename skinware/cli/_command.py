@@ -53,18 +53,15 @@ def examples(*lines: str) -> str:
 
 
 def namespace_option(command: _Decorated) -> _Decorated:
-    """``--namespace NAME``."""
     text = "Namespace of drivers and readers.  [default: $SKINWARE_NAMESPACE, else 'default']"
     return click.option("--namespace", metavar="NAME", help=text)(command)
 
 
 def json_option(command: _Decorated) -> _Decorated:
-    """``--json``."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
 
 
 def group_option(command: _Decorated) -> _Decorated:
-    """``--group GROUP``."""
     return click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")(command)
 
 
@@ -74,7 +71,6 @@ def verbose_option(command: _Decorated) -> _Decorated:
 
 
 def tls_option(command: _Decorated) -> _Decorated:
-    """``--tls DIR``."""
     return click.option(
         "--tls",
         metavar="DIR",
@@ -84,7 +80,6 @@ def tls_option(command: _Decorated) -> _Decorated:
 
 
 def caller_option(command: _Decorated) -> _Decorated:
-    """``--caller NAME``."""
     return click.option(
         "--caller",
         "callers",
@@ -95,12 +90,10 @@ def caller_option(command: _Decorated) -> _Decorated:
 
 
 def insecure_option(command: _Decorated) -> _Decorated:
-    """``--insecure``."""
     return click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")(command)
 
 
 def version_option(command: _Decorated) -> _Decorated:
-    """``--version``."""
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
 
 
@@ -110,7 +103,6 @@ def warn(text: str) -> None:
 
 
 def log_to_stderr(verbose: bool) -> None:
-    """Warnings, or more, on stderr under the running command's name."""
     import logging
 
     handler = logging.StreamHandler(sys.stderr)

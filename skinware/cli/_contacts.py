@@ -39,7 +39,6 @@ def lines_of(places: Sequence[TouchedPlace], most: int) -> list[str]:
 
 
 def plain_text(place: TouchedPlace) -> str:
-    """One contact on one line, for pipes."""
     contact = place.contact
     return "  ".join(
         [
@@ -56,7 +55,6 @@ def plain_text(place: TouchedPlace) -> str:
 
 
 def as_data(place: TouchedPlace) -> dict[str, Any]:
-    """One contact as JSON prints it."""
     contact = place.contact
     return {
         "id": contact.id,

@@ -54,6 +54,3 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
         for label in drawn.labels.get(number, ()):
             signs[label.column : label.column + len(label.text)] = label.text
         yield "".join(signs).rstrip()
-
-
-__all__ = ["SIGNS", "bars", "picture"]

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import ConfigurationError, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.skin import Skin

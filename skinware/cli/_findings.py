@@ -51,6 +51,3 @@ def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDAr
     """(k,) positions in a frame of the sensors that are meant."""
     sensors: npt.NDArray[np.int64] = np.arange(structure.n_sensors)[structure.index(type_name)][finding.taxels]
     return sensors
-
-
-__all__ = ["finding_data", "finding_text"]

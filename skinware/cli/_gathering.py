@@ -170,6 +170,3 @@ class Gathering:
             self._told = mean
             gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
             echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
-
-
-__all__ = ["Gathering"]

@@ -121,12 +121,10 @@ class Arrangement:
 
     @property
     def lines(self) -> int:
-        """Height in lines of the terminal."""
         return len(self.pixels) // 2
 
     @property
     def columns(self) -> int:
-        """Width in columns of the terminal."""
         return int(self.pixels.shape[1])
 
     def draw(self, codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -266,7 +264,6 @@ class _Grid:
         return math.ceil(math.ceil(count / self.per_line) * self.pitch / 2)
 
     def lines(self, groups: list[list[_Block]]) -> int:
-        """Lines of the terminal for everything, without the last gap."""
         *above, last = (len(group) for group in groups)
         last_pixels = math.ceil(last / self.per_line) * self.pitch - self.gap
         return sum(self.group_lines(count) for count in above) + math.ceil(last_pixels / 2)

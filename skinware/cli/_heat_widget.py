@@ -63,7 +63,6 @@ class HeatMap(ScrollView, can_focus=False):
                 self.refresh_line(line)
 
     def render_line(self, y: int) -> Strip:
-        """One line of the window."""
         left, top = self.scroll_offset
         strip = self._strips.get(y + top) or self._strip(y + top)
         return strip.crop_extend(left, left + self.size.width, None).apply_style(self.rich_style)
@@ -79,7 +78,6 @@ class HeatMap(ScrollView, can_focus=False):
         return strip
 
     def on_mouse_move(self, event: events.MouseMove) -> None:
-        """Tell what the mouse points at."""
         if self._arrangement is not None:
             left, top = self.scroll_offset
             self.post_message(self.Pointed(self._arrangement.sensor_at(event.y + top, event.x + left)))

@@ -108,7 +108,6 @@ def learning_options(command: _Command) -> _Command:
 
 
 def asked_for() -> list[str]:
-    """Those of the running command that somebody gave."""
     context = click.get_current_context()
     given = [name for name in _NAMES if context.get_parameter_source(name) is not ParameterSource.DEFAULT]
     return ["--" + name.replace("_", "-") for name in given]

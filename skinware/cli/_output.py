@@ -44,24 +44,19 @@ class PatientStream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """Of the stream."""
         return self._stream.encoding
 
     @property
     def errors(self) -> str | None:  # type: ignore[override]
-        """Likewise."""
         return self._stream.errors
 
     def fileno(self) -> int:
-        """Likewise."""
         return self._fd
 
     def isatty(self) -> bool:
-        """Likewise."""
         return self._stream.isatty()
 
     def writable(self) -> bool:
-        """It is."""
         return True
 
     def write(self, text: str) -> int:
@@ -176,6 +171,3 @@ def _patient(stream: TextIO | None) -> PatientStream | None:
         if isinstance(error, OSError) and error.errno == errno.EPIPE:
             raise
         return None
-
-
-__all__ = ["PatientStream", "patient_output"]

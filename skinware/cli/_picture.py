@@ -15,7 +15,7 @@ from skinware.cli._painting import marks_text, scale_text
 from skinware.cli._palette import TRUE_COLOURS, Palette
 from skinware.cli._scale import CHANGE, RANGE, RAW, SCALES, ChangeScale, Scaled, ValueScale
 from skinware.cli._top_rows import RowKey, patches_of, title_of
-from skinware.driver_service import DriverFrame
+from skinware.driver_frame import DriverFrame
 from skinware.sensor_types import SensorType
 from skinware.skin_layout import SkinLayout
 from skinware.status import Status
@@ -74,11 +74,9 @@ class Picture:
         self._made_for: tuple[object, ...] = ()
 
     def type_in(self, structure: Structure) -> SensorType:
-        """The type that is drawn of a skin of this structure."""
         return next((t for t in structure.types if t.name == self._wanted), structure.types[0])
 
     def next_type(self, structure: Structure) -> None:
-        """Go over to the next type of the structure."""
         names = [t.name for t in structure.types]
         self._wanted = names[(names.index(self.type_in(structure).name) + 1) % len(names)]
 
@@ -122,7 +120,6 @@ class Picture:
         self._levels = None
 
     def wipe_test(self) -> None:
-        """Begin a wipe test, or end it."""
         self._wiping = not self._wiping
         for watched in self._watched.values():
             watched.wipe = None
@@ -190,7 +187,6 @@ class Picture:
         self.marks = marks_text(marks, self._palette)
 
     def _watch(self, driver: str, frame: DriverFrame) -> _Watched:
-        """What is known of a driver, with this frame."""
         watched = self._watched.get(driver)
         if watched is None or watched.structure is not frame.structure:
             watched = self._watched[driver] = _Watched(driver, frame.structure)
@@ -202,7 +198,6 @@ class Picture:
     def _scaled(
         self, watched: _Watched, frame: DriverFrame, sensors: npt.NDArray[np.int64], sensor_type: SensorType
     ) -> tuple[str, Scaled]:
-        """What the colours mean, and the levels of the sensors."""
         fresh = frame.status[sensors] == 0
         if watched.wipe is None and self.scale_name != CHANGE:
             in_range = self.scale_name == RANGE

@@ -20,7 +20,6 @@ _Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
 
 
 def regions_option(command: _Decorated) -> _Decorated:
-    """``--regions FILE``, beside a ``--region``."""
     return click.option(
         "--regions",
         "region_files",

@@ -60,7 +60,6 @@ class Terminal:
 
     @contextlib.contextmanager
     def keys(self) -> Iterator[None]:
-        """Keys are heard one by one in this block."""
         self.take()
         try:
             yield
@@ -79,12 +78,10 @@ class Terminal:
         self._replayer.watch(fd, self._hear)
 
     def draw(self) -> None:
-        """Show where it is."""
         if self._before is not None and self.is_ours:
             overwrite(self.line(terminal_width() or 80))
 
     def line(self, width: int) -> str:
-        """Where it is, in a line that is not wider than that."""
         told = self._replayer.replay()
         share = min(1.0, told["time_s"] / told["duration_s"]) if told["duration_s"] else 1.0
         bar = "=" * round(share * _BAR)

@@ -9,7 +9,8 @@ import numpy as np
 
 from skinware import bridge_state, native
 from skinware.cli import _bridges
-from skinware.driver_service import KIND, DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import KIND, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS, ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
@@ -163,7 +164,6 @@ def _histogram(h: Histogram) -> dict[str, Any]:
 
 
 def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
-    """What a service's frames consist of."""
     return [
         {
             "name": name,

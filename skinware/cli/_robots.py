@@ -199,7 +199,6 @@ class _Listed:
 
 
 def _report(robots: Sequence[Seen]) -> dict[str, Any]:
-    """How robots are, as JSON has it."""
     count = Counter(seen.robot for seen in robots)
     problems = [f"{n} robots are called {name}: give each a name of its own" for name, n in count.items() if n > 1]
     problems += [
@@ -211,7 +210,6 @@ def _report(robots: Sequence[Seen]) -> dict[str, Any]:
 
 
 def _as_text(found: dict[str, Any]) -> list[str]:
-    """The report for people, as lines."""
     lines = [plural(len(found["robots"]), "robot")]
     count = Counter(robot["robot"] for robot in found["robots"])
     rows = [row for robot in found["robots"] for row in _rows_of(robot, count[robot["robot"]] > 1)]
@@ -275,6 +273,3 @@ def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
         f"{names} and {more} more" if more else names or NO_VALUE,
         count_text(driver["problems"]),
     )
-
-
-__all__ = ["list_robots", "route"]

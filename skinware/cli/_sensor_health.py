@@ -65,7 +65,6 @@ def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any
 
 
 def as_text(found: dict[str, Any]) -> list[str]:
-    """The same for people, as lines with colours."""
     lines: list[str] = []
     for entry in found["health"]:
         counts = {name.replace("_", " "): count for name, count in entry["kinds"].items() if count}
@@ -105,7 +104,6 @@ def _entry(namespace: Namespace, name: str, driver: str | None) -> dict[str, Any
 
 
 def _faults(namespace: Namespace, frame: HealthFrame, report: HealthReport) -> list[dict[str, Any]]:
-    """Every sensor with a fault, and the evidence."""
     source = frame.source
     with DriverReader(source.driver, namespace=namespace, announce=False) as reader:
         structure = reader.structure

@@ -46,7 +46,6 @@ def overwrite(text: str, *, err: bool = False) -> None:
 
 
 def repaint(lines: list[str]) -> None:
-    """Print lines in the place of all that is on the terminal."""
     if click.get_current_context().color is False:
         lines = [click.unstyle(line) for line in lines]
     text = "".join(f"{shown(line)}\x1b[K\n" for line in lines)
@@ -77,6 +76,3 @@ class Formatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """See :class:`logging.Formatter`."""
         return shown(super().format(record))
-
-
-__all__ = ["Formatter", "echo", "json_text", "overwrite", "print_json", "repaint", "shown", "style"]

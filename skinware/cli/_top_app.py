@@ -151,7 +151,6 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def compose(self) -> ComposeResult:
-        """Lay the screen out."""
         yield self._head
         with self._nothing:
             yield self._why
@@ -169,7 +168,6 @@ class SkinTop(App[None]):
         yield Footer()
 
     def on_mount(self) -> None:
-        """Start to look."""
         for column, title in enumerate(COLUMNS):
             self._table.add_column(_cell(title, column), key=title, width=_WIDTHS[column])
         loop = asyncio.get_running_loop()
@@ -183,7 +181,6 @@ class SkinTop(App[None]):
             self.set_timer(self._duration_s, self.exit)
 
     def on_unmount(self) -> None:
-        """Let go of the drivers."""
         for number in _ENDING_SIGNALS:
             asyncio.get_running_loop().remove_signal_handler(number)
         self._bridges.close()
@@ -193,16 +190,13 @@ class SkinTop(App[None]):
     # -- what the person does -----------------------------------------------------------------------------------
 
     def action_choose(self, step: int) -> None:
-        """Go up or down in the list."""
         self._missed = None
         self._table.move_cursor(row=self._table.cursor_row + step)
 
     def action_scroll(self, pages: int) -> None:
-        """Scroll a picture that is higher than its window."""
         self._heat_map.scroll_relative(y=pages * max(1, self._heat_map.size.height - 1), animate=False)
 
     def action_next_type(self) -> None:
-        """Draw another type of sensors."""
         row = self._chosen
         driver = self._drivers.get(row.key.driver) if row else None
         if driver is not None:
@@ -210,16 +204,13 @@ class SkinTop(App[None]):
             self._must_draw = True
 
     def action_next_scale(self) -> None:
-        """Change what the colours mean."""
         self._picture.next_scale()
         self._must_draw = True
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
-        """Whether a key does something."""
         return self._has_regions or action != "next_region"
 
     def action_next_region(self) -> None:
-        """Draw the sensors of another region only."""
         self._picture.next_region()
         self._must_draw = True
 
@@ -229,7 +220,6 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def action_wipe_test(self) -> None:
-        """Begin a wipe test, or end it."""
         self._picture.wipe_test()
         self._must_draw = True
 
@@ -250,11 +240,9 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def on_data_table_row_selected(self) -> None:
-        """A row was clicked."""
         self._missed = None
 
     def on_heat_map_pointed(self, event: HeatMap.Pointed) -> None:
-        """Say what the mouse points at."""
         self._pointed = event.sensor
         self._must_draw = True
 
@@ -351,7 +339,6 @@ class SkinTop(App[None]):
 
 
 def _say(line: Static, text: str | Text) -> None:
-    """Change a line of text, if it is another one."""
     text = _printable(text)
     if line.content != text:
         line.update(text)

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.structure import Structure
 from skinware.views.health import (
     DEAD,
@@ -171,7 +172,6 @@ def counters_text(counters: dict[str, int], *, besides: tuple[str, ...] = ()) ->
 
 
 def plain_line(health: SkinHealth) -> str:
-    """One driver on one line, for pipes."""
     if health.life == STARTING:
         return f"{health.name}  starting, no frame yet  sensors {health.sensors}"
     life = {
@@ -192,7 +192,6 @@ def plain_line(health: SkinHealth) -> str:
 
 
 def as_data(health: SkinHealth, contacts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One driver as JSON prints it, with its contacts."""
     return {
         "driver": health.name,
         "state": health.life,

@@ -254,5 +254,4 @@ _MODES = {
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

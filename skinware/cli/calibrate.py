@@ -40,8 +40,6 @@ _PRESS = "press the skin at known places; hold each for a moment"
 
 
 def _options(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
-    """Several options as one decorator, in their order."""
-
     def decorate(command: _Decorated) -> _Decorated:
         for option in reversed(options):
             command = option(command)
@@ -337,7 +335,6 @@ def _opened(
 
 
 def _shapes(structure: Structure, type_name: str, layout: Path) -> Mapping[int, Shape]:
-    """The shapes of the modules, from a geometry."""
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.shapes import shapes_of
 
@@ -377,5 +374,4 @@ def _tell_done(as_json: bool, told: Mapping[str, Any], words: str) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

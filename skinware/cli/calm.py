@@ -192,5 +192,4 @@ def _tell_status(service: CalmService) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

@@ -146,5 +146,4 @@ def _selection(
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -23,9 +23,11 @@ from skinware.cli._terminal import echo, print_json
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from skinware.driver_service import DriverFrame, DriverReader
+    from skinware._columns import Index
+    from skinware.driver_frame import DriverFrame
+    from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
-    from skinware.structure import Index, Structure
+    from skinware.structure import Structure
 
 _LOOK_EVERY_S = 0.1
 
@@ -189,7 +191,6 @@ def _only_driver(namespace: Namespace, end_s: float) -> str:
 
 
 def _drivers(namespace: Namespace) -> dict[str, bool]:
-    """Name of every driver, and whether it lives."""
     from skinware.driver_service import KIND
     from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
     from skinware.memory.ring import Frame
@@ -264,5 +265,4 @@ def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> I
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

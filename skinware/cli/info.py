@@ -133,7 +133,6 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
 
 
 def _table(titles: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> list[str]:
-    """A table that fits the terminal when it is indented."""
     width = terminal_width()
     return table(titles, rows, left=left, width=None if width is None else width - _INDENT)
 
@@ -178,7 +177,6 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
 
 
 def _path_lines(driver: dict[str, Any]) -> list[str]:
-    """Which way frames take, and how long they may wait."""
     path = driver["data_path"]
     if path in (None, "not_told"):
         return []
@@ -270,7 +268,6 @@ def _reason(bus: dict[str, Any]) -> str | None:
 
 
 def _duration(bus: dict[str, Any]) -> str | None:
-    """For how long its state has been so."""
     age_s = bus.get("state_age_s")
     return None if age_s is None else age_text(age_s * 1e9)
 
@@ -404,5 +401,4 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -119,7 +119,6 @@ def _in_words(nearest: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)
 
 

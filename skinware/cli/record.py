@@ -180,7 +180,6 @@ class _Report:
             echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
-        """How it goes, once a second."""
         self._news()
         messages = self._recorder.messages
         if self._as_json:
@@ -201,7 +200,6 @@ class _Report:
             echo(f"saved {path}")
 
     def _news(self) -> None:
-        """Report what happened to the clocks of the machine."""
         for event in self._recorder.news():
             if self._as_json:
                 with contextlib.suppress(BrokenPipeError):
@@ -232,7 +230,6 @@ class _Report:
 
 
 def _text_of(event: dict[str, Any]) -> str:
-    """What happened to the clocks of the machine, for people."""
     if event["event"] == "unreadable":
         return f"{event['service']} is not recorded: {event['why']}"
     if "for_ns" in event:
@@ -241,5 +238,4 @@ def _text_of(event: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

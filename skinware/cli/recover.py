@@ -49,5 +49,4 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

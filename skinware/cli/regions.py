@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from skinware.driver_service import DriverFrame, DriverReader
+    from skinware.driver_frame import DriverFrame
+    from skinware.driver_service import DriverReader
 
 _TELL_EVERY_S = 1.0
 
@@ -128,7 +129,6 @@ def paint(
 
 
 def _refuse_early(file: Path, name: str, force: bool) -> None:
-    """What could not be written should not be painted."""
     from skinware.errors import ConfigurationError
     from skinware.tactile.region_files import read_regions
 
@@ -198,5 +198,4 @@ class _Painter:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -176,5 +176,4 @@ def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

@@ -97,7 +97,6 @@ def command(
 
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
-    """Print a line per driver each second, until the time is over."""
     from skinware.views.bridges import LiveBridges
     from skinware.views.live import LiveDrivers
     from skinware.views.touches import live_contacts
@@ -156,5 +155,4 @@ def _print_bridges(bridges: LiveBridges) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -171,7 +171,6 @@ def _why(error: OSError) -> str:
 
 
 def _address(host: str, port: int) -> str:
-    """Where a browser on this machine finds the page."""
     name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
     return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
 
@@ -182,5 +181,4 @@ def _has_screen() -> bool:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

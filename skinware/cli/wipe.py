@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from skinware.driver_service import DriverFrame, DriverReader
+    from skinware.driver_frame import DriverFrame
+    from skinware.driver_service import DriverReader
 
 _TELL_EVERY_S = 1.0
 
@@ -97,7 +98,6 @@ class _Wipe:
         self._is_redrawing = not as_json and sys.stdout.isatty()
 
     def go_on(self, duration_s: float | None) -> None:
-        """Until everything has answered, or for so long."""
         from skinware.cli._driver_frames import after
         from skinware.views.rest import SETTLING_S
         from skinware.views.wiping import threshold
@@ -148,7 +148,6 @@ class _Wipe:
         return len(self._tested())
 
     def _tested(self) -> npt.NDArray[np.int64]:
-        """Positions in a frame of the sensors of the type that are not switched off."""
         import numpy as np
 
         from skinware.status import Status
@@ -185,7 +184,6 @@ class _Wipe:
             echo(self._progress())
 
     def _why(self, status: int) -> str:
-        """What the driver itself says of a sensor."""
         from skinware.status import Status
 
         said = ", ".join(str(bit.name).lower().replace("_", " ") for bit in Status if status & bit)
@@ -193,5 +191,4 @@ class _Wipe:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -32,14 +32,12 @@ class Cdr:
         return self
 
     def text(self, text: str) -> Cdr:
-        """A string."""
         data = text.encode() + b"\0"
         self.numbers("I", len(data))
         self._append(data)
         return self
 
     def texts(self, texts: Sequence[str]) -> Cdr:
-        """A sequence of strings."""
         self.numbers("I", len(texts))
         for text in texts:
             self.text(text)
@@ -64,7 +62,6 @@ class Cdr:
         return self.numbers("i", time_ns // NS_PER_S).numbers("I", time_ns % NS_PER_S).text(frame)
 
     def done(self) -> bytes:
-        """The message."""
         return b"".join(self._parts)
 
     def _align(self, to: int) -> None:

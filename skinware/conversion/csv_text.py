@@ -49,7 +49,6 @@ def write_csv(source: Source, folder: Path) -> None:
 
 
 def csv_without(_: Source) -> list[str]:
-    """What a folder of texts does not have of a recording."""
     return ["counters, histograms and events are left out: csv does not hold them"]
 
 
@@ -101,7 +100,6 @@ class _Text:
         self._file.write(_line(["time_s", *labels]))
 
     def add(self, times: Sequence[str], rows: npt.NDArray[Any]) -> None:
-        """Add lines, each after its time."""
         parts = [_texts(leaf, rows) for leaf in self._leaves]
         self._file.writelines(",".join(line) + "\n" for line in zip(times, *parts, strict=True))
 

@@ -50,12 +50,10 @@ class Description(msgspec.Struct, frozen=True):
     clock: list[dict[str, Any]] = []
 
     def to_json(self) -> bytes:
-        """As it stands in a file."""
         return msgspec.json.encode(self)
 
 
 def described(source: Source, units: Sequence[dict[str, str]]) -> Description:
-    """Of a source, and of the units of the arrays of each of its tables."""
     tables = [TableText(table.name, table.service, of) for table, of in zip(source.tables, units, strict=True)]
     return Description(FORMAT, VERSION, source.start_ns, tuple(tables), source.events, source.clock)
 

@@ -45,7 +45,6 @@ class _File:
         self.failure: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """All of it, or nothing any more."""
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
@@ -56,43 +55,36 @@ class _File:
         return size
 
     def readinto(self, buffer: Any) -> int:
-        """What was written, zeros where nothing could be."""
         into = memoryview(buffer).cast("B")
         into[:] = bytes(len(into))
         self._file.readinto(into)
         return len(into)
 
     def read(self, size: int) -> bytes:
-        """Likewise."""
         data = bytearray(size)
         self.readinto(data)
         return bytes(data)
 
     def truncate(self, size: int) -> None:
-        """As of a file."""
         try:
             self._file.truncate(size)
         except OSError as error:
             self.failure = self.failure or OSError(error.errno, error.strerror, str(self._path))
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As of a file."""
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
-        """As of a file."""
         return self._file.tell()
 
     def flush(self) -> None:
         """Nothing waits."""
 
     def check(self) -> None:
-        """Raise what has failed."""
         if self.failure is not None:
             raise self.failure
 
     def close(self) -> None:
-        """As of a file."""
         self._file.close()
 
 
@@ -175,7 +167,6 @@ class Hdf5Source(StoredSource):
         super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
-        """Likewise."""
         self._file.close()
 
     def _description(self) -> bytes:
@@ -209,7 +200,6 @@ class _Arrays:
             return None
 
     def pieces(self, formats: Mapping[str, ArrayFormat], rows: int) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
-        """Likewise."""
         datasets = {name: self._file[f"{self._table}/{name}"] for name in formats}
         total = min(dataset.shape[0] for dataset in datasets.values())
         for first in range(0, total, rows):

@@ -26,7 +26,6 @@ class Leaf(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Numbers in a row."""
         return math.prod(self.shape)
 
     def of(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -42,7 +41,6 @@ class Leaf(NamedTuple):
         rows[...] = numbers.reshape(rows.shape)
 
     def name(self, array: str) -> str:
-        """A name for it, after that of the array."""
         return ".".join([array, *self.path])
 
 

@@ -70,7 +70,6 @@ class NpzSource(StoredSource):
         super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
-        """Likewise."""
         self._archive.close()
 
     def _description(self) -> bytes:
@@ -109,7 +108,6 @@ class _Arrays:
         return shape[0] if ArrayFormat(shape[1:], dtype) == each else None
 
     def pieces(self, formats: Mapping[str, ArrayFormat], rows: int) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
-        """Likewise."""
         begun = {name: self._begun(name) for name in formats}
         try:
             total = min(shape[0] for _, shape, _ in begun.values())
@@ -123,7 +121,6 @@ class _Arrays:
                 file.close()
 
     def _begun(self, name: str) -> tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]:
-        """A member behind its header, and the shape and dtype of its array."""
         member = self._archive.getinfo(f"{self._table}/{name}.npy")
         file: IO[bytes] | None = None
         try:

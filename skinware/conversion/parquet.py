@@ -85,7 +85,6 @@ def _type(arrow: Any, leaf: Leaf) -> Any:
 
 
 def _column(arrow: Any, leaf: Leaf, rows: npt.NDArray[Any]) -> Any:
-    """The numbers of a leaf in m rows, as arrow has them."""
     numbers = np.ascontiguousarray(leaf.of(rows)).reshape(-1)
     if _is_plain(leaf):
         items = arrow.array(numbers)
@@ -109,7 +108,6 @@ class ParquetSource(StoredSource):
         super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
-        """Likewise."""
         for file in self._files:
             file.close()
 
@@ -157,7 +155,6 @@ class _Arrays:
         return rows
 
     def pieces(self, formats: Mapping[str, ArrayFormat], rows: int) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
-        """Likewise."""
         arrow = pyarrow()
         columns = [leaf.name(name) for name, each in formats.items() for leaf in leaves(each)]
         try:
@@ -168,7 +165,6 @@ class _Arrays:
 
 
 def _rows(batch: Any, name: str, each: ArrayFormat) -> npt.NDArray[Any]:
-    """An array's rows in a batch, put together from its leaves."""
     rows = np.zeros((len(batch), *each.shape), each.dtype)
     for leaf in leaves(each):
         items = batch.column(batch.schema.get_field_index(leaf.name(name)))

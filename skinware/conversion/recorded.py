@@ -74,18 +74,15 @@ class RecordedSource:
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """Likewise."""
         return self._in_span(self._recording.clock)
 
     @property
     def problems(self) -> list[str]:
-        """Likewise."""
         cut = [] if self._recording.is_whole else ["cut off or damaged: converted as far as it is whole"]
         wires = ["what went over wires is left out: candump and pcapng have it"] * bool(self._recording.wires)
         return [f"{self.path}: {problem}" for problem in [*cut, *self._recording.problems, *wires]]
 
     def close(self) -> None:
-        """Likewise."""
         self._recording.close()
 
     def _in_span(self, told: list[dict[str, Any]]) -> list[dict[str, Any]]:

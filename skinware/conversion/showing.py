@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Schema
 
+from skinware._columns import Index
 from skinware._names import distinct
 from skinware.conversion import definitions
 from skinware.conversion.cdr import Cdr
@@ -21,7 +22,7 @@ from skinware.matrices import rows_and_columns
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import BusState, PatchState
-from skinware.structure import Index, Structure
+from skinware.structure import Structure
 from skinware.views.shapes import shape_of
 
 _FLOAT32, _UINT8 = 7, 2
@@ -70,7 +71,6 @@ class Showing:
 
     @property
     def topics(self) -> dict[str, Schema]:
-        """Of its point clouds and images, with what their messages are."""
         return {each.topic: each.schema for each in self._shown}
 
     def messages(self, frame: DriverFrame, time_ns: int) -> Iterator[Message]:

@@ -60,6 +60,3 @@ def sensors(structure: Structure, names: Sequence[str], generation: int, time_ns
     for axis in range(3):
         cdr.array(places[:, axis])
     return cdr.done()
-
-
-__all__ = ["acquired_ns", "sensors", "skin_frame"]

@@ -54,11 +54,9 @@ class Span(NamedTuple):
         return Span(begin_ns, 1 << 63 if end_s is None else recording_begin_ns + round(end_s * NS_PER_S))
 
     def has(self, time_ns: int) -> bool:
-        """Whether a time is in it."""
         return self.begin_ns <= time_ns < self.end_ns
 
     def rows_of(self, block: Block) -> Block:
-        """The rows of a block that are in it, from the first to the last of them."""
         wanted = np.flatnonzero((block[TIME] >= self.begin_ns) & (block[TIME] < min(self.end_ns, (1 << 63) - 1)))
         rows = slice(int(wanted[0]), int(wanted[-1]) + 1) if len(wanted) else slice(0)
         return {name: array[rows] for name, array in block.items()}
@@ -77,7 +75,6 @@ class ArrayFormat(NamedTuple):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row."""
         return self.dtype.itemsize * math.prod(self.shape)
 
 
@@ -108,7 +105,6 @@ class Table(ABC):
 
     @property
     def origin(self) -> Generation:
-        """One of the generations."""
         return self.generations[0]
 
     @property
@@ -118,7 +114,6 @@ class Table(ABC):
 
     @cached_property
     def arrays(self) -> dict[str, ArrayFormat]:
-        """What a row of each array is, but for those in which there is nothing."""
         formats = {name: ArrayFormat((), dtype) for name, dtype in OF_FRAMES.items()}
         for name, (shape, dtype, _) in self.origin.columns.items():
             formats[COLUMNS + name] = ArrayFormat(shape, dtype)
@@ -126,12 +121,10 @@ class Table(ABC):
 
     @cached_property
     def sensor_names(self) -> list[str]:
-        """Of each sensor of a driver, as people know it."""
         return [] if self.structure is None else sensor_names(self.structure)
 
 
 def sensor_names(structure: Structure) -> list[str]:
-    """Name of each sensor of a structure, as people know it."""
     names = np.zeros(structure.n_sensors, object)
     for sensor_type in structure.types:
         names[structure.index(sensor_type.name)] = structure.sensor_names(sensor_type.name)
@@ -182,16 +175,13 @@ class DerivedSource:
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """Likewise."""
         return self._source.clock
 
     @property
     def problems(self) -> list[str]:
-        """Likewise."""
         return self._source.problems
 
     def close(self) -> None:
-        """Likewise."""
         self._source.close()
 
 
@@ -230,7 +220,6 @@ def outputs(table: Table) -> list[Output]:
 
 
 def cannot_hold(format_name: str, table: Table, what: str) -> ConfigurationError:
-    """What a format cannot hold of a table, and what to do then."""
     service = repr(table.service)
     return ConfigurationError(
         f"{format_name} cannot hold {what} of {service}: choose another format, or leave {service} out"

@@ -31,7 +31,6 @@ class TimedFrame(NamedTuple):
 
 
 def timed_frames(tables: Sequence[Table]) -> Iterator[TimedFrame]:
-    """All frames of several tables, by time."""
     return heapq.merge(*map(_of_table, tables), key=lambda each: each.time_ns)
 
 

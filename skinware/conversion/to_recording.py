@@ -91,7 +91,6 @@ class _Writer:
         self._frames_size = 0  # of the chunk, decoded
 
     def add_frame(self, timed: TimedFrame) -> None:
-        """A frame of a service."""
         stream = self._streams.get(timed.service)
         if stream is None or stream.generation is not timed.generation:
             stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
@@ -103,7 +102,6 @@ class _Writer:
         self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
 
     def add_json(self, told: _Told) -> None:
-        """An event, or what the clocks were."""
         channel, schema = self._channels.of_all(told.topic)
         self._chunk.add(channel, schema, 0, told.time_ns, json.dumps(told.data).encode())
 
@@ -115,7 +113,6 @@ class _Writer:
             self._begun_ns = time_ns
 
     def close_chunk(self) -> None:
-        """End the chunk at hand."""
         if not self._chunk.is_empty:
             self._file.add(self._chunk.close(), self._heads)
             self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0

@@ -43,7 +43,6 @@ def write_foxglove(source: Source, path: Path) -> None:
 
 
 def viewers_without(source: Source) -> list[str]:
-    """What viewers are not shown of a recording."""
     notes = []
     for table in source.tables:
         structure = table.structure
@@ -82,7 +81,6 @@ def write_ros2(source: Source, folder: Path) -> None:
 
 
 def ros2_without(source: Source) -> list[str]:
-    """What a bag does not have of a recording."""
     return [*viewers_without(source), "counters, histograms and events are left out: ros2 does not hold them"]
 
 
@@ -121,7 +119,6 @@ class _Writer:
         self._begin_ns, self._end_ns = 1 << 63, 0
 
     def add(self, message: Message, time_ns: int) -> None:
-        """A message."""
         channel, schema = self._channels.of(message.topic, message.encoding, message.schema)
         self._types[channel.id] = message.topic, schema.name
         self._begin_ns, self._end_ns = min(self._begin_ns, time_ns), max(self._end_ns, time_ns)
@@ -130,7 +127,6 @@ class _Writer:
             self._close_chunk()
 
     def finish(self) -> None:
-        """Complete the file. Idempotent."""
         try:
             self._close_chunk()
         finally:

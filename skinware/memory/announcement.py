@@ -90,7 +90,6 @@ class Announcement:
             os.pwrite(self._descriptor.fd, b"%08x " % zlib.crc32(text) + text, 0)
 
     def close(self) -> None:
-        """Take the announcement back. Idempotent."""
         if self._descriptor is None or self._descriptor.fd < 0:
             return  # never made, closed, or a fork's: the file is the parent's
         with contextlib.suppress(OSError):

@@ -178,7 +178,6 @@ class Layout:
 
 
 def aligned(offset: int, to: int = ALIGNMENT) -> int:
-    """The next multiple of ``to``."""
     return -(-offset // to) * to
 
 
@@ -240,7 +239,6 @@ def _checked(column: Column) -> Column:
 
 
 def column_table(layout: Layout) -> npt.NDArray[np.void]:
-    """The column table of a new file."""
     rows: Sequence[tuple[Column, int]] = [(c, 0) for c in layout.static] + [(c, 1) for c in layout.slot]
     table = np.zeros(len(rows), COLUMN)
     for row, (column, in_slot) in zip(table, rows, strict=True):

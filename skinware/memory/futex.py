@@ -81,7 +81,6 @@ class Word:
 
     @property
     def value(self) -> int:
-        """What stands in it."""
         return ctypes.c_uint32.from_address(self.address).value
 
     def wake_all(self) -> None:

@@ -86,7 +86,6 @@ class Look(Generic[FrameT]):
 
 
 def look_at(rings: Sequence[RingReader[FrameT]]) -> Look[FrameT] | None:
-    """A look at these rings, None where there is no C for it."""
     library = native.core()
     natives = [ring for ring in rings if isinstance(ring, NativeRingReader)]
     if library is None or len(natives) < len(rings) or not 1 <= len(rings) <= futex.MAX_WORDS:

@@ -101,17 +101,14 @@ class NativeRingReader(RingReader[FrameT]):
 
     @property
     def turns_address(self) -> int:
-        """Of its ``skinware_native_turns``."""
         return ctypes.addressof(self._turns)
 
     def copy(self, sequence: int | None = None) -> FrameT | None:
-        """As in Python."""
         (frame,), _, memory = self._pool.free()
         wanted = _NEWEST if sequence is None else ctypes.c_uint64(sequence)
         return self._copied(self._copy_call(self._request_at, wanted, memory), frame)
 
     def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
-        """As in Python."""
         (frame,), _, memory = self._pool.free()
         request = self._request
         request.wake_count, request.known = wake_count, latest
@@ -139,18 +136,15 @@ class NativeRingReader(RingReader[FrameT]):
 
     @property
     def begun_ns(self) -> int:
-        """As in Python."""
         return int(self._turns.begun_ns)
 
     def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> bool:
-        """As in Python."""
         state = self._turns
         state.last, state.until_ns = last, until_ns
         state.acquired_ns, state.taken_ns = turn or (0, 0)
         return True
 
     def settle_turns(self) -> Turns | None:
-        """As in Python."""
         state = self._turns
         if not (state.frames or state.noted):
             return None
@@ -159,7 +153,6 @@ class NativeRingReader(RingReader[FrameT]):
         return told
 
     def end_turn(self) -> tuple[int, int] | None:
-        """As in Python."""
         state = self._turns
         taken_ns, state.taken_ns, state.last = state.taken_ns, 0, 0
         return (state.acquired_ns, taken_ns) if taken_ns else None
@@ -189,7 +182,6 @@ class NativeRingWriter(RingWriter):
         self.native_address = ctypes.addressof(self._state)
 
     def wake(self) -> None:
-        """As in Python."""
         self._wake_call(self._state_at)
 
     def _take_next(self) -> None:

@@ -31,7 +31,6 @@ class Process(NamedTuple):
 
 
 def this_process() -> Process:
-    """Return the process that asks."""
     return Process(os.getpid(), _start_ticks("self"), _pid_namespace())
 
 
@@ -72,7 +71,6 @@ class ProcessWatch(Descriptor):
 
     @property
     def fd_for_c(self) -> int:
-        """Its pidfd, ``UNKNOWN`` or ``ENDED``."""
         return ENDED if self._has_ended else self._fd
 
 

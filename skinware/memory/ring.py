@@ -211,7 +211,6 @@ class RingReader(Generic[FrameT]):
 
     @property
     def frame_size(self) -> int:
-        """Bytes of a copied frame."""
         return self.segment.layout.slot_stride
 
     def frame_in(self, data: bytearray, start: int) -> FrameT:
@@ -220,12 +219,10 @@ class RingReader(Generic[FrameT]):
 
     @property
     def slot_count(self) -> int:
-        """Slots in the ring."""
         return self._count
 
     @property
     def state(self) -> int:
-        """``STATE_*`` bits."""
         return self._half_words[STATE]
 
     @property
@@ -330,7 +327,6 @@ class RingReader(Generic[FrameT]):
 
     @property
     def missed_periods(self) -> int:
-        """Periods that the writer missed."""
         return self._words[MISSED_PERIODS]
 
     def publication_times_ns(self) -> list[int]:

@@ -98,7 +98,6 @@ class RingWriter:
 
     @property
     def _next(self) -> int:
-        """The sequence of the next frame."""
         return self.sequence + 1 + self._skipped
 
     def _take_next(self) -> None:
@@ -159,7 +158,6 @@ class RingWriter:
         return sequence
 
     def wake(self) -> None:
-        """Wake everybody who waits for this generation."""
         fence()  # who sees the new word sees what it is about; the system call itself orders the word
         self._half_words[WAKE_WORD] = (self._half_words[WAKE_WORD] + 1) & 0xFFFF_FFFF
         self._wake_word.wake_all()
@@ -190,7 +188,6 @@ class RingWriter:
             words[first + 2] += value_ns
 
     def set_state(self, bits: int, on: bool = True) -> None:
-        """Set ``STATE_*`` bits, or clear them, and wake everybody."""
         state = self._half_words[STATE]
         self._half_words[STATE] = state | bits if on else state & ~bits
         self.wake()

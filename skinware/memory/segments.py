@@ -66,17 +66,14 @@ class Segment:
 
     @property
     def generation(self) -> int:
-        """Unique per creation, growing."""
         return int(self.header["generation"])
 
     @property
     def published_before(self) -> int:
-        """Frames that the generations before this one published."""
         return int(self.header["published_before"])
 
     @property
     def published(self) -> int:
-        """Frames that this generation and those before it published."""
         return self.published_before + int(self.view(file_layout.LATEST_OFFSET, np.dtype("<u8"), 1)[0])
 
     @property
@@ -85,17 +82,14 @@ class Segment:
         return self.data[: self.layout.slot_offset].tobytes()
 
     def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
-        """(shape, dtype, offset in the slot) of every column of a slot, by name."""
         columns = self.schema.columns
         return {c.name: (columns[c.name].shape, columns[c.name].dtype, c.offset) for c in self.layout.slot}
 
     def static_columns(self) -> dict[str, npt.NDArray[Any]]:
-        """Views of the static columns, by name."""
         tables = self.schema.tables
         return {c.name: self.view(c.offset, tables.get(c.name, c.dtype), c.count) for c in self.layout.static}
 
     def view(self, offset: int, dtype: np.dtype[Any], count: int) -> npt.NDArray[Any]:
-        """A typed view of a range of the file."""
         return self.data[offset : offset + dtype.itemsize * count].view(dtype)
 
     def writer_lives(self) -> bool:
@@ -300,7 +294,6 @@ def publish(segment: Segment, namespace: Namespace, name: str) -> None:
 
 
 def discard(segment: Segment) -> None:
-    """Remove a generation that was created and not published."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(segment.path)
     segment.close()

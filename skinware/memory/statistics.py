@@ -36,7 +36,6 @@ class Spread(msgspec.Struct):
         return self.total_ns / self.count if self.count else 0.0
 
     def add(self, value_ns: int) -> None:
-        """Count one."""
         if value_ns > self.worst_ns:
             self.worst_ns = value_ns
         if value_ns < self.best_ns or not self.count:
@@ -56,11 +55,9 @@ class Histogram(msgspec.Struct):
 
     @property
     def total(self) -> int:
-        """How many were counted."""
         return sum(self.counts)
 
     def add(self, value_ns: int) -> None:
-        """Count one."""
         self.counts[bucket_of(value_ns)] += 1
 
     def quantile_ns(self, fraction: float) -> int | None:
@@ -98,7 +95,6 @@ class WriterStatistics(msgspec.Struct):
 
 
 def read_statistics(data: npt.NDArray[np.uint8]) -> WriterStatistics:
-    """The statistics in a mapped service file."""
     words = (
         data[file_layout.STATISTICS_OFFSET :][: file_layout.STATISTICS.itemsize].view(file_layout.STATISTICS)[0].copy()
     )

@@ -68,7 +68,6 @@ class TimeAxis:
         return monotonic_ns + self._origin_ns
 
     def wall_ns(self, monotonic_ns: int) -> int:
-        """Return the wall clock, as it was set when it was read last."""
         return monotonic_ns + self.clocks.realtime_ns - self.clocks.monotonic_ns
 
     def look(self) -> list[dict[str, Any]]:

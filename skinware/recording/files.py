@@ -111,7 +111,6 @@ class RecordingFile:
         self.file.add(chunk)
 
     def finish(self) -> None:
-        """Complete the file. Idempotent."""
         told, self._told = list(self._told), {}
         try:
             self._tell(told, self._last_ns)
@@ -149,17 +148,14 @@ class Files:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that are there now."""
         return [file.path for file in self._all if file.is_there]
 
     @property
     def size(self) -> int:
-        """Bytes of them."""
         return sum(file.size for file in self._all)
 
     @property
     def counts(self) -> Counter[int]:
-        """Messages of each channel in them."""
         counts: Counter[int] = Counter()
         for file in self._all:
             counts += file.counts
@@ -167,7 +163,6 @@ class Files:
 
     @property
     def is_full(self) -> bool:
-        """Whether the only file has its size."""
         return self._max_size is not None and self._split_size is None and self.size >= self._max_size
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
@@ -219,12 +214,10 @@ class Past:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that were written, and are still there."""
         return [file.path for file in self._saved if file.is_there]
 
     @property
     def size(self) -> int:
-        """Bytes that are kept."""
         return sum(len(chunk.record) for chunk, _ in self._chunks)
 
     @property
@@ -239,7 +232,6 @@ class Past:
 
     @property
     def is_full(self) -> bool:
-        """Never."""
         return False
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
@@ -263,7 +255,6 @@ class Past:
             file.finish()
 
     def finish(self) -> None:
-        """Save it for the last time."""
         if not self._finished:
             self._finished = True
             self.save()

@@ -82,7 +82,6 @@ class ChunkPlace:
 
     @property
     def end(self) -> int:
-        """Where the record ends in the file."""
         return self.compressed_at + self.compressed_size
 
 
@@ -149,7 +148,6 @@ class McapSource:
 
     @property
     def size(self) -> int:
-        """Bytes of the file."""
         return len(self._map)
 
     @property
@@ -224,7 +222,6 @@ class McapSource:
         return places
 
     def _whole_ones(self) -> Iterator[ChunkPlace]:
-        """The chunks that are undamaged, wherever they are."""
         at = 0
         while (signature := self._map.find(_SIGNATURE, at)) >= 0:
             at = signature + 1  # of one that is damaged, the length may be too: others may begin within it
@@ -241,7 +238,6 @@ class McapSource:
                 yield _as_it_is(place, contents)
 
     def _chunk_at(self, offset: int, channel_ids: frozenset[int] | None = None) -> ChunkPlace | None:
-        """A chunk, if there is one that is complete."""
         if not 0 <= offset <= len(self._data) - _CHUNK.size:
             return None
         opcode, length, start_ns, end_ns, size, crc, name_length, name, compressed_size = _CHUNK.unpack_from(

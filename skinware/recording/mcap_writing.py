@@ -71,7 +71,6 @@ class ClosedChunk:
 
     @property
     def end_ns(self) -> int:
-        """Time of its last message."""
         return int(self.index.message_end_time)
 
 
@@ -121,16 +120,13 @@ class OpenChunk:
         self._append(data)
 
     def has(self, channel: Channel) -> bool:
-        """Whether a message of a channel is in it."""
         return channel.id in self._places
 
     @property
     def is_empty(self) -> bool:
-        """Whether no message is in it."""
         return not self._places
 
     def close(self) -> ClosedChunk:
-        """Compress it."""
         data = b"".join(self._parts)
         times = [time_ns for places in self._places.values() for time_ns, _ in places]
         compressed = zstandard.ZstdCompressor(level=_LEVEL).compress(data)
@@ -208,7 +204,6 @@ class McapFile:
 
     @property
     def is_there(self) -> bool:
-        """Whether the file is still where it was made."""
         try:
             info = os.stat(self.path)
         except OSError:
@@ -325,7 +320,6 @@ class McapFile:
         yield MAGIC
 
     def _append(self, parts: Iterable[bytes]) -> None:
-        """All of it, or nothing."""
         size = self.size
         try:
             for part in parts:
@@ -355,11 +349,9 @@ class _Spool:
 
     @property
     def size(self) -> int:
-        """Bytes in it."""
         return self._saved + len(self._waiting)
 
     def add(self, record: bytes) -> None:
-        """Add a record."""
         self._waiting += record
 
     def save(self) -> None:
@@ -380,7 +372,6 @@ class _Spool:
         self._waiting = bytearray()
 
     def parts(self) -> Iterator[bytes]:
-        """All records, in pieces."""
         if self._file is not None:
             self._file.seek(0)
             for begin in range(0, self._saved, _SPOOL_BYTES):
@@ -388,7 +379,6 @@ class _Spool:
         yield bytes(self._waiting)
 
     def close(self) -> None:
-        """Let go of them. Idempotent."""
         if self._file is not None:
             self._file.close()
         self._file, self._waiting, self._saved = None, bytearray(), 0

@@ -124,12 +124,10 @@ class Recorder:
 
     @property
     def services(self) -> list[str]:
-        """Names of those that were found so far."""
         return self._collector.services
 
     @property
     def messages(self) -> dict[str, int]:
-        """Messages of each channel that are written."""
         names = self._coder.channels.names()
         return {names[channel]: count for channel, count in sorted(self._target.counts.items())}
 
@@ -188,12 +186,10 @@ class Recorder:
         self._jobs.put(_Began(service, head))
 
     def took(self, service: str, frame: Frame) -> None:
-        """Likewise."""
         self._bytes_given += len(frame.slot)
         self._jobs.put(_Took(service, frame))
 
     def happened(self, event: dict[str, Any]) -> None:
-        """Likewise."""
         self._jobs.put(_Happened(event))
 
     @property
@@ -390,7 +386,6 @@ def _wires_of(segment: segments.Segment) -> _WireStream | None:
 
 
 def _texts_disguised(data: Any, disguise: Callable[[str], str]) -> Any:
-    """The same data, with all texts disguised that are no names of its parts."""
     if isinstance(data, str):
         return disguise(data)
     if isinstance(data, list):

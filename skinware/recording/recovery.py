@@ -69,7 +69,6 @@ def recover(source: Path, target: Path) -> Recovered:
 
 
 def _again(contents: ChunkContents) -> OpenChunk:
-    """The same messages in a chunk of their own, which has their channels and schemas too."""
     chunk = OpenChunk()
     for message in contents.messages:
         channel = contents.channels.get(message.channel_id)

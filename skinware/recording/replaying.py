@@ -100,7 +100,6 @@ class Replayer:
 
     @property
     def _last_s(self) -> float:
-        """Where it ends."""
         return min(self._end_s, self._recording.duration_s)
 
     @property
@@ -322,7 +321,6 @@ class Replayer:
         self._show(changed)
 
     def _show(self, services: Collection[str]) -> None:
-        """Make some services what they were at the timeline's place."""
         so_far = self._timeline.so_far(services)
         for name in services:
             self._jumped.add(name)

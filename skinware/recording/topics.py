@@ -81,11 +81,9 @@ class Channels:
         return self.of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
 
     def of_all(self, topic: str) -> tuple[Channel, Schema]:
-        """The channel of events, or of the clock."""
         return self.of(topic, "json", SCHEMAS[topic])
 
     def of_wire(self, driver: str, bus: str) -> tuple[Channel, Schema]:
-        """The channel of what went over a bus of a driver."""
         return self.of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
 
     def of_about(self, driver: str) -> tuple[Channel, Schema]:
@@ -93,7 +91,6 @@ class Channels:
         return self.of(f"/wire/{driver}", "json", SCHEMAS[ABOUT], {"driver": driver})
 
     def names(self) -> dict[int, str]:
-        """Topics by number."""
         return {channel.id: topic for topic, channel in self._channels.items()}
 
     def of(

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import as_index
+from skinware._columns import Index, as_index
 from skinware.errors import BadRecording, StructureError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import ChunkContents
 from skinware.recording.series import Series
-from skinware.structure import Index, Structure
+from skinware.structure import Structure
 from skinware.transfer.codec import HEADER, Run, runs
 from skinware.transfer.frames import RecordedFrame, frames_of
 from skinware.transfer.generation import PER_SENSOR, Generation
@@ -220,7 +220,6 @@ class Track:
             yield from self._decodable(contents)
 
     def _decodable(self, contents: ChunkContents) -> Iterator[_PartOfChunk]:
-        """The frames of this service in a chunk, as far as their generation is known."""
         messages = [message for message in contents.messages if message.channel_id == self.channel]
         left = LIMITS.frames_size
         for number, which in runs([message.data for message in messages]):
@@ -273,7 +272,6 @@ class _PartOfChunk(NamedTuple):
     time_s: npt.NDArray[np.float64]
 
     def column(self, number: int, rows: slice) -> npt.NDArray[Any]:
-        """(n, ...) some rows of a column."""
         coded = self.generation.coded[number]
         shape, dtype, _ = self.generation.columns[coded.name]
         words = np.empty((len(self.time_s), coded.count), coded.words)
@@ -283,7 +281,6 @@ class _PartOfChunk(NamedTuple):
 
 
 def _nothing(asked: _Asked) -> Series:
-    """Columns of no frames."""
     formats = asked.origin.columns
     columns = {name: np.zeros((0, *formats[name][0]), formats[name][1]) for name in asked.columns}
     return Series(asked.origin, np.zeros(0, HEADER), np.zeros(0), columns)

@@ -155,7 +155,6 @@ def _export(
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that was not there, and is not there if something fails."""
     with path.open("xb") as file:
         try:
             yield file
@@ -165,7 +164,6 @@ def _new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _named(recording: Recording) -> _Wires:
-    """The wires, each with the name of an interface that no other has."""
     named: _Wires = []
     used: Counter[str] = Counter()
     for wire in recording.wires:
@@ -215,6 +213,3 @@ def _packet(number: int, item: WireItem) -> bytes:
     head = struct.pack("<IIIII", number, item.epoch_ns >> 32, item.epoch_ns & 0xFFFF_FFFF, len(data), len(data))
     options = _option(_FLAGS, struct.pack("<I", _OUTBOUND if item.is_sent else _INBOUND)) + struct.pack("<HH", 0, 0)
     return _block(_PACKET, head + _filled_up(data) + options)
-
-
-__all__ = ["SERIAL", "SERIAL_HEADER", "SOCKETCAN", "Chosen", "Exported", "export_candump", "export_pcapng"]

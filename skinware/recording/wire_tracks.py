@@ -220,6 +220,3 @@ def _items(piece: WirePiece) -> Iterator[WireItem]:
     for place, (time_ns, epoch_ns, identifier, length, flags) in enumerate(zip(times, epochs, *columns, strict=True)):
         data = payloads[place, :length].tobytes()
         yield WireItem(time_ns, epoch_ns, piece.is_sent, identifier, flags, data)
-
-
-__all__ = ["FRAME", "WireItem", "WirePiece", "WireTrack", "message_of"]

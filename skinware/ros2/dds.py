@@ -110,13 +110,11 @@ class DdsNode:
         self._tell()
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
-        """See the protocol."""
         writer = self._writer(f"rt{topic}", message_type, qos)
         self._tell()
         return writer
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
-        """See the protocol."""
         with self._lock:
             reader = self._made(
                 lambda: DataReader(
@@ -143,7 +141,6 @@ class DdsNode:
         return end
 
     def close(self) -> None:
-        """Leave the graph. Idempotent."""
         with self._lock:
             if self._worker is not None:
                 self._worker.close()
@@ -196,7 +193,6 @@ class DdsNode:
                 self._tell()
 
     def _tell(self) -> None:
-        """All of the graph which endpoints are of this node."""
         with self._lock:
             if self._participant is not None:
                 readers = [service.id for service in self._services]
@@ -216,13 +212,11 @@ class _Writer:
 
     @property
     def is_wanted(self) -> bool:
-        """See the protocol."""
         if self._writer is None:
             return False
         return self._is_latched or self._writer.get_publication_matched_status().current_count > 0
 
     def publish(self, message: Cdr) -> bool:
-        """See the protocol."""
         writer = self._writer
         if writer is None:
             return False
@@ -245,7 +239,6 @@ class _Writer:
         return self._words
 
     def close(self) -> None:
-        """See the protocol."""
         if self._writer is not None:
             self._writer = None  # which deletes it
             self._closed(self)
@@ -262,7 +255,6 @@ class _Service:
         worker.attach(self._condition, self.answer)
 
     def answer(self) -> None:
-        """All that was asked so far."""
         if self._reader is None:
             return
         try:

@@ -46,7 +46,6 @@ _OF_BUS = {int(BusState.LIVE): Level.OK, int(BusState.CONNECTING): Level.WARN, i
 
 
 def statuses(driver: LiveDriver) -> Iterator[Status]:
-    """How a driver and its buses are."""
     health, frame = driver.health(), driver.frame
     yield Status(
         _level(health, frame), f"skin: {driver.name}", _in_words(health), driver.reader.driver_type, _values(health)
@@ -97,6 +96,3 @@ def _values(health: SkinHealth) -> dict[str, str]:
         values["age_ms"] = f"{health.age_ns / NS_PER_S * 1e3:.1f}"
     told = {**health.statuses, **{f"patches {state}": n for state, n in health.patches.items()}, **health.counters}
     return values | {name: str(count) for name, count in told.items() if count}
-
-
-__all__ = ["Level", "Status", "message", "statuses"]

@@ -34,6 +34,3 @@ def entities(identity: Identity, participant: bytes, readers: Sequence[bytes], w
         for each in ids:
             cdr.numbers("B", *each.ljust(size, b"\0"))
     return cdr.done()
-
-
-__all__ = ["PARTICIPANT_DATA", "TOPIC", "endpoint_data", "entities"]

@@ -207,7 +207,6 @@ class _Publisher:
         return True
 
     def close(self) -> None:
-        """End it. Idempotent."""
         if self._is_open:
             self._is_open = False
             _undeclare(self._token, self._publisher)
@@ -288,6 +287,3 @@ def _as_bridge_error(what: str) -> Iterator[None]:
         yield
     except zenoh.ZError as error:
         raise BridgeError(f"{what}: {error}") from None
-
-
-__all__ = ["ROUTER", "ZenohNode"]

@@ -136,7 +136,6 @@ def gid(token: str) -> bytes:
 
 
 def _of_node(identity: Identity) -> tuple[str, str, str]:
-    """Its enclave (the usual one), namespace and name."""
     return "%", _mangled(identity.namespace), identity.name
 
 
@@ -146,6 +145,3 @@ def _mangled(name: str) -> str:
 
 def _hash(identity: Identity, of_type: MessageType | ServiceType) -> str:
     return _NO_HASH if identity.distro is Distro.HUMBLE else of_type.hash
-
-
-__all__ = ["Attachment", "Kind", "endpoint_token", "gid", "key", "node_token", "qos_text"]

@@ -73,7 +73,6 @@ class _Served:
     lost: int = 0
 
     def take(self, frame: DriverFrame, *, wants_frames: bool) -> None:
-        """Go on to a newer frame."""
         before = self.frame
         if before is not None and wants_frames and self.wants_frames and frame.generation == before.generation:
             self.lost += frame.sequence - before.sequence - 1
@@ -146,7 +145,6 @@ class Ros2Server:
         self._live.close()
 
     def drivers(self) -> Mapping[str, Told]:
-        """How all drivers are that were found so far."""
         return {name: self._told(name, served) for name, served in self._served.items()}
 
     # -- frames ---------------------------------------------------------------------------------------------------
@@ -209,7 +207,6 @@ class Ros2Server:
         return served
 
     def _tell_trouble(self, text: str) -> None:
-        """Once."""
         if text not in self._troubles:
             self._troubles.add(text)
             self._trouble(text)
@@ -235,6 +232,3 @@ class Ros2Server:
         health = live.health()
         age_ms = None if health.age_ns is None else health.age_ns / 1e6
         return Told(health.life, health.rate_hz, age_ms, served.lost, topics.messages, topics.left_out)
-
-
-__all__ = ["GONE", "RATE_HZ", "Ros2Server", "Told"]

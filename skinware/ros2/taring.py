@@ -38,7 +38,6 @@ class Taring:
         return self._node.service(service, types.TRIGGER, lambda _: self._tare(driver))
 
     def stop(self) -> None:
-        """Wait for no driver any more."""
         self._stopping = True
 
     def _tare(self, driver: str) -> bytes:
@@ -61,8 +60,4 @@ class Taring:
 
 
 def response(success: bool, message: str) -> bytes:
-    """A ``std_srvs/Trigger_Response``."""
     return Cdr().numbers("?", success).text(message).done()
-
-
-__all__ = ["Taring", "response"]

@@ -45,12 +45,10 @@ class DriverTopics:
 
     @property
     def base(self) -> str:
-        """What all names begin with."""
         return f"{self._prefix}/skin/{in_topic(self._name)}"
 
     @property
     def wants_frames(self) -> bool:
-        """Whether somebody listens to every frame."""
         return self._frames.is_wanted
 
     def tell(self, frame: DriverFrame, *, with_pictures: bool, is_last: bool = False) -> None:
@@ -73,7 +71,6 @@ class DriverTopics:
                 self._send(self._pictures[message.topic], message.data)
 
     def close(self) -> None:
-        """End all topics. Idempotent."""
         for publisher in (self._frames, self._sensors, *self._pictures.values()):
             publisher.close()
 
@@ -96,6 +93,3 @@ class DriverTopics:
             self.messages += 1
         else:
             self.left_out += 1
-
-
-__all__ = ["DriverTopics"]

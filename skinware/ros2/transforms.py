@@ -39,7 +39,6 @@ class Transforms:
             self._publisher.publish(message(self._root, sorted(self._frames), time.time_ns()))
 
     def close(self) -> None:
-        """End the topic. Idempotent."""
         self._publisher.close()
 
 

@@ -169,17 +169,3 @@ class Node(Protocol):
 def _dds_name(name: str) -> str:
     package, kind, plain = name.split("/")
     return f"{package}::{kind}::dds_::{plain}_"
-
-
-__all__ = [
-    "HIGHEST_DOMAIN",
-    "Cdr",
-    "Distro",
-    "Handler",
-    "Identity",
-    "MessageType",
-    "Node",
-    "Publisher",
-    "Qos",
-    "ServiceType",
-]

@@ -82,20 +82,4 @@ OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
 
 
 def definition(message_type: MessageType) -> str:
-    """The text of a type's definition, as its ``.msg`` file has it."""
     return TEXTS[message_type.name.replace("/msg/", "/")]
-
-
-__all__ = [
-    "DIAGNOSTICS",
-    "IMAGE",
-    "OF_SCHEMAS",
-    "PARTICIPANT",
-    "POINTS",
-    "SENSORS",
-    "SKIN_FRAME",
-    "TEXTS",
-    "TRANSFORMS",
-    "TRIGGER",
-    "definition",
-]

@@ -36,7 +36,6 @@ class Accounts:
 
     @property
     def record(self) -> ReaderRecord:
-        """What was counted up to now."""
         self._add_up()
         return self._record
 
@@ -46,18 +45,15 @@ class Accounts:
         self._in_loop = True
 
     def taken(self, lost: int) -> None:
-        """A frame is about to be handed out."""
         self._record.frames += 1
         if lost:
             self._record.lost += lost
 
     @property
     def due_ns(self) -> int:
-        """When the next announcement is due."""
         return self._announced_ns + _ANNOUNCE_EVERY_NS
 
     def settle(self, turns: Turns) -> None:
-        """Count what was taken in C."""
         self._record.frames += turns.frames
         self._record.lost += turns.lost
         self._turns += turns.over
@@ -96,7 +92,6 @@ class Accounts:
         self._announced_ns, self._announced_frames = time_ns, record.frames
 
     def close(self) -> None:
-        """Take the announcement back. Idempotent."""
         self._announce_it = False
         if self._announcement is not None:
             self._announcement.close()

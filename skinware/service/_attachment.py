@@ -61,7 +61,6 @@ class Attachment(Generic[FrameT]):
 
     @property
     def generation(self) -> int:
-        """The generation that is being read."""
         return self._ring.generation
 
     @property
@@ -91,7 +90,6 @@ class Attachment(Generic[FrameT]):
 
     @property
     def missed_periods(self) -> int:
-        """Periods that the writer missed."""
         return self._ring.missed_periods
 
     def rate_hz(self) -> float | None:

@@ -160,7 +160,6 @@ class RequestClient(ForkGuard):
                 pending.deliver(answer)
 
     def forget(self, connection: socket.socket, number: int) -> None:
-        """Take a request back."""
         if self._pending.pop(number, None) is None or connection is not self._connection:
             return
         try:
@@ -172,7 +171,6 @@ class RequestClient(ForkGuard):
             self._lose()
 
     def close(self) -> None:
-        """Hang up. Idempotent."""
         self._lose()
 
     def abandon(self) -> None:

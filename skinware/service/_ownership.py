@@ -85,7 +85,6 @@ class Ownership:
 
     @property
     def generation(self) -> int:
-        """Number of the present generation."""
         return self._ring.segment.generation
 
     @property
@@ -95,12 +94,10 @@ class Ownership:
 
     @property
     def slots(self) -> int:
-        """Frames that the ring holds."""
         return self._ring.segment.layout.slot_count
 
     @property
     def position(self) -> tuple[int, int]:
-        """(generation, sequence) of the newest frame."""
         return self.generation, self.sequence
 
     @property
@@ -114,7 +111,6 @@ class Ownership:
 
     @property
     def paused(self) -> bool:
-        """Whether ``pause`` was called last."""
         return self._paused
 
     def pause(self) -> None:
@@ -260,7 +256,6 @@ class Ownership:
                 previous.close()
 
     def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int, skip: int = 0) -> None:
-        """A new generation in the place of our own."""
         own = self._ring.segment
         self._begin_generation(schema, static, period_ns, own, own.published + skip)
 

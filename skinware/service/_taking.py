@@ -43,7 +43,6 @@ class Taking(Attachment[FrameT]):
         super()._adopt(ring)
 
     def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> FrameT:
-        """The newest frame that is newer than ``known`` and young enough, as ``read`` has it."""
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
@@ -174,7 +173,6 @@ class Taking(Attachment[FrameT]):
 
     @property
     def _last(self) -> Position | None:
-        """Position of the frame that was taken last."""
         self._settle()
         return self._last_taken
 
@@ -197,7 +195,6 @@ class Taking(Attachment[FrameT]):
             self._open_turn = None
 
     def _come_back(self) -> None:
-        """The next turn is done here."""
         if self._turns_in_c:
             self._settle()
             self._open_turn = self._ring.end_turn()
@@ -211,7 +208,6 @@ class Taking(Attachment[FrameT]):
             self._accounts.settle(turns)
 
     def _end_turn(self) -> None:
-        """What was taken last is done with."""
         self._come_back()
         turn, self._open_turn = self._open_turn, None
         self._accounts.end_turn(turn)

@@ -48,7 +48,6 @@ class Tap(ServiceReader[FrameT]):
         return self._ring.period_ns * self._ring.slot_count
 
     def ring_in_c(self) -> RingReader[FrameT]:
-        """The ring, whose next turns are left to C, where there is C."""
         if not self._turns_in_c:
             self._go_round_in_c()
         return self._ring
@@ -61,7 +60,6 @@ class Tap(ServiceReader[FrameT]):
 
     @property
     def last_taken(self) -> Position | None:
-        """Position of the frame that was taken last."""
         return self._last
 
     def begin_in_order(self, *, with_first: bool) -> None:

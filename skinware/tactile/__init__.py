@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from skinware.tactile.baseline_settings import BaselineSettings
     from skinware.tactile.calm import Calm
     from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
-    from skinware.tactile.contacts import Contact, ContactKind, Contacts, ContactSet
+    from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
     from skinware.tactile.curves import Curve, CurveTable, fit_curve, read_curves
     from skinware.tactile.health import Health, HealthSettings
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from skinware.tactile.region_files import put_region, read_regions
     from skinware.tactile.regions import Box, Region, Regions
     from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Taxels
-    from skinware.tactile.tracking import TrackingSettings
+    from skinware.tactile.tracking import ContactKind, TrackingSettings
 
 __all__ = [
     "AmplifierSettings",

@@ -68,6 +68,3 @@ def _cheapest(cost: Gains) -> npt.NDArray[np.int64]:
     taken = np.flatnonzero(row_at[1:])
     found[row_at[1:][taken] - 1] = taken
     return found
-
-
-__all__ = ["assign"]

@@ -335,7 +335,6 @@ class Baseline:
         self._begin_at(taxels[begins], rest.level[begins], rest.noise[begins])
 
     def _follow_touches(self, deviation: Floats, live: Flags, passed_s: float) -> Flags:
-        """(n,) which taxels are held."""
         load = np.abs(deviation) if self._signed else deviation
         if not self._signed:
             up = self._sag.come_back(deviation, self._touches.touched & live, self._off, passed_s)
@@ -367,7 +366,6 @@ class Baseline:
             self._put(np.flatnonzero(recovers), deviation)
 
     def _put(self, taxels: npt.NDArray[np.intp], deviation: Floats) -> None:
-        """Put baselines where the values are."""
         if len(taxels):
             self._base[taxels] = self._smooth[taxels]
             self._forced[taxels] = True

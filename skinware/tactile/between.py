@@ -95,6 +95,3 @@ def _opposite(geometry: Geometry, ring: Table) -> Between:
             found.append(np.stack([middle, ring[middle, one], ring[middle, other]]))
     rows = np.concatenate(found, axis=1) if found else np.zeros((3, 0))
     return Between(*rows.astype(np.int64))
-
-
-__all__ = ["Between", "Pairs"]

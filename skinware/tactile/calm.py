@@ -33,6 +33,3 @@ class Calm:
     noise: Floats
     forced: Flags
     usable: Flags
-
-
-__all__ = ["Calm"]

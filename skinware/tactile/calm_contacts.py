@@ -154,7 +154,6 @@ class CalmContacts:
             self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
 
     def close(self) -> None:
-        """Withdraw the services. Idempotent."""
         for writer in (self._motion, self._writer):
             if writer is not None:
                 writer.close()
@@ -177,7 +176,6 @@ class CalmContacts:
         )
 
     def _follow_regions(self, structure: Structure, rate_hz: float | None) -> None:
-        """Publish the motion of the regions of another structure."""
         if self._motion is not None:
             self._motion.close()
             self._motion = None
@@ -207,6 +205,3 @@ class CalmContacts:
         """Calm values are worth more than contacts: go on without these."""
         self.close()
         log.warning("no contacts of %r: %s", self._driver, str(error))
-
-
-__all__ = ["CalmContacts", "WatchedRegions"]

@@ -102,7 +102,6 @@ class CalmHealth:
         status |= self._status
 
     def close(self) -> None:
-        """Withdraw the service. Idempotent."""
         if self._writer is not None:
             self._writer.close()
         self._writer = None
@@ -122,6 +121,3 @@ class CalmHealth:
         self.close()
         self._name = ""
         log.warning("no health of %r: %s", self._driver, str(error))
-
-
-__all__ = ["CalmHealth"]

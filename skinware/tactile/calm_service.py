@@ -288,7 +288,6 @@ class CalmService:
             self._on_ready()
 
     def _tell_refusals(self, chain: Chain) -> None:
-        """Warn, once, where many sensors have no baselines until they rest."""
         for name, baseline in chain.baselines.items():
             if baseline.refused_share and name not in self._refused:
                 log.warning(
@@ -303,7 +302,6 @@ class CalmService:
                 self._refused.discard(name)
 
     def _follow(self, frame: DriverFrame) -> None:
-        """Make chain and writer for the structure of a frame, with what was learned before."""
         assert self._reader is not None  # noqa: S101 - the frame is its
         before, known = self._chain, self._structure
         self._structure = frame.structure
@@ -383,6 +381,3 @@ class CalmService:
         if type_name is not None and type_name not in found:
             raise ConfigurationError(f"no baseline of {type_name!r}; there are: {', '.join(found) or 'none'}")
         return found if type_name is None else {type_name: found[type_name]}
-
-
-__all__ = ["CalmService"]

@@ -312,7 +312,6 @@ class Chain:
 
     @property
     def _fingerprint(self) -> str:
-        """What the values that baselines see depend on."""
         before: list[object] = []
         for name, stages in self.stages.items():
             kinds = [stage.name for stage in stages]
@@ -354,6 +353,3 @@ class Chain:
             values[index] = signal.values
             of_type = of_type | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
-
-
-__all__ = ["BaselineStageSettings", "Chain", "ChainSettings", "ChainState", "CurveSettings"]

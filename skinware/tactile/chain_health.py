@@ -34,7 +34,6 @@ class ChainHealth:
                 self._watched[name] = stage, _health(chain, driver, name, stage)
 
     def __bool__(self) -> bool:
-        """Whether there are such types."""
         return bool(self._watched)
 
     def update(self, time_ns: int) -> None:
@@ -80,7 +79,6 @@ class ChainHealth:
 
 
 def _health(chain: Chain, driver: str, type_name: str, stage: BaselineStage) -> Health:
-    """For the values that a baseline gets."""
     structure, taxels = chain.structure, stage.before
     geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
     limits = taxels.type.minimum, taxels.type.maximum
@@ -89,6 +87,3 @@ def _health(chain: Chain, driver: str, type_name: str, stage: BaselineStage) -> 
     except ConfigurationError as error:  # places without neighbours
         log.warning("%s of %r: dead and weak sensors are not found: %s", type_name, driver, error)
         return Health(taxels.module, resolution=taxels.resolution, limits=limits)
-
-
-__all__ = ["ChainHealth"]

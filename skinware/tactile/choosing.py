@@ -29,7 +29,6 @@ class SensorChoice:
     in_regions: Collection[str] = ()
 
     def __bool__(self) -> bool:
-        """Whether it takes some sensors only."""
         return bool(self.types or self.patches or self.in_regions)
 
     def unknown(self, structures: Sequence[Structure]) -> Iterator[str]:
@@ -74,6 +73,3 @@ def unknown(what: str, wanted: Collection[str], there_are: Sequence[str]) -> Ite
     for name in wanted:
         if name not in there_are:
             yield f"no {what} {name!r}; there are: {', '.join(dict.fromkeys(there_are)) or 'none'}"
-
-
-__all__ = ["SensorChoice", "unknown"]

@@ -79,6 +79,3 @@ def _forward(table: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     forward = np.full((len(table), int(count.max(initial=0))), NONE, np.int32)
     forward[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = table[row, column]
     return forward
-
-
-__all__ = ["Components"]

@@ -230,8 +230,6 @@ class Contacts:
     def _measure(
         self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
     ) -> dict[str, npt.NDArray[Any]]:
-        """What each of ``count`` contacts measures, from its taxels with a place and a value."""
-
         def total(of_taxel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
             return np.bincount(contact, of_taxel, count).astype(np.float64)  # of nothing it is integers
 
@@ -282,7 +280,6 @@ def _load(value: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
 def _largest(
     taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """The taxels of the ``MOST`` contacts with the largest loads, which are counted anew."""
     loads = np.bincount(contact, load, count)
     kept = np.sort(np.argsort(-loads, kind="stable")[:MOST])
     number = np.full(count, -1)
@@ -299,6 +296,3 @@ def _tracking(geometry: Geometry) -> TrackingSettings:
         return TrackingSettings()
     median_m = float(np.nanmedian(pitch))
     return dataclasses.replace(TrackingSettings(), reach_m=_REACH_PITCHES * median_m, fast_m=median_m)
-
-
-__all__ = ["BEYOND", "COLUMNS", "MOST", "NO_CONTACT", "Contact", "ContactKind", "ContactSet", "Contacts"]

@@ -251,9 +251,5 @@ class ContactsWriter:
 
 
 def _frame_columns(n: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """The dtype and shape of every column, for n taxels."""
     rows = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
     return rows | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", (n,))}
-
-
-__all__ = ["KIND", "NAME", "ContactsFrame", "ContactsReader", "ContactsSource", "ContactsWriter"]

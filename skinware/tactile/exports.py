@@ -113,6 +113,3 @@ def _force_n(contact: Contact, newtons_per_load: float | None) -> Vector:
 
 def _xyz(vector: npt.NDArray[Any]) -> dict[str, float]:
     return dict(zip("xyz", vector.tolist(), strict=True))
-
-
-__all__ = ["ICUB_NEWTONS_PER_COUNT", "IcubPart", "icub_contacts", "tactile_msgs_contacts"]

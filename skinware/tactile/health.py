@@ -271,7 +271,6 @@ class Health:
             self._module_touched_s[module] = np.column_stack([last[:, 1:], np.full(len(module), self._now_s)])
 
     def _weigh(self, pairs: Pairs, given: Floats, baseline: Floats, touched: Flags, usable: Flags) -> None:
-        """What taxels between touched ones show, and what they should, when each touch is at its hardest."""
         active = np.flatnonzero(touched)
         step = len(active) // _MOST_AT_ONCE + 1
         middle, one, other = pairs.around(active[self._frames % step :: step], touched)
@@ -349,6 +348,3 @@ class Health:
             median = shares[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
             around[rows[enough]] = median[enough]
         return around
-
-
-__all__ = ["Health", "HealthKind", "HealthReport", "HealthSettings"]

@@ -102,6 +102,3 @@ COLUMNS: dict[str, tuple[str, float]] = {
     **dict.fromkeys(("shown", "shown_around"), ("<f4", math.nan)),
 }
 """Arrays of a :class:`HealthReport`: dtype of each, and what stands there if nothing is known."""
-
-
-__all__ = ["COLUMNS", "HealthKind", "HealthReport"]

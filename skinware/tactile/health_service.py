@@ -191,6 +191,3 @@ def _columns(structure: Structure) -> dict[str, Column]:
     return {
         name: Column(np.dtype(dtype), (structure.n_sensors,), *_TEXTS[name]) for name, (dtype, _) in COLUMNS.items()
     }
-
-
-__all__ = ["KIND", "NAME", "RATE_HZ", "HealthFrame", "HealthReader", "HealthSource", "HealthWriter"]

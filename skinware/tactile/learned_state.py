@@ -32,7 +32,6 @@ class LearnedState:
         self._next_save_ns = now_ns() + _SAVE_EVERY_NS
 
     def state(self, chain: Chain) -> ChainState:
-        """What a chain has learned, and what is known of the health of its sensors."""
         state = chain.state()
         return state if self._health is None else replace(state, health=self._health.state())
 
@@ -92,6 +91,3 @@ class LearnedState:
 
         self._saving = threading.Thread(target=save, name="calm-state")
         self._saving.start()
-
-
-__all__ = ["LearnedState"]

@@ -123,7 +123,6 @@ def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDA
 
 
 def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], int]:
-    """The mean velocity of contacts, weighted by load, and the number of the coordinate frame it is in."""
     moving = np.flatnonzero((load > 0) & (contacts.frame >= 0))
     if not len(moving):
         return np.full(3, np.nan), -1
@@ -131,6 +130,3 @@ def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.
     moving = moving[contacts.frame[moving] == frame]
     weight = load[moving] / load[moving].sum()
     return weight @ contacts.velocity_m_s[moving], frame
-
-
-__all__ = ["COLUMNS", "MotionSet", "RegionMotion", "motion_of"]

@@ -200,6 +200,3 @@ class MotionWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-__all__ = ["KIND", "NAME", "MotionFrame", "MotionReader", "MotionSource", "MotionWriter"]

@@ -124,7 +124,6 @@ def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
 
 
 def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The rows of taxels with a place of their own, and the number of the frame of each."""
     rows = np.flatnonzero(np.isfinite(geometry.position_m).all(axis=1))
     _, frame = np.unique(geometry.frame[rows].astype(str), return_inverse=True)
     if not len(rows):
@@ -213,6 +212,3 @@ def checked(table: npt.NDArray[Any], n: int) -> Table:
         )
     row, column = np.nonzero(table != NONE)
     return neighbours_of_pairs(np.column_stack([row, table[row, column].astype(np.int64)]), n)
-
-
-__all__ = ["NONE", "Table", "area_m2", "checked", "neighbours", "neighbours_of_pairs", "pitch_m"]

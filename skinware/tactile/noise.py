@@ -98,6 +98,3 @@ class Noise:
         self._sums[:, enough] -= counted[:, enough]
         self._before_low[:, enough] = 0
         self._stays_low[:] = self._low
-
-
-__all__ = ["Noise"]

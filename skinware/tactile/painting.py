@@ -31,6 +31,3 @@ def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) 
         if not holes.any():
             return found
         found |= holes
-
-
-__all__ = ["without_holes"]

@@ -102,7 +102,6 @@ def _replaced(path: Path, text: str, number: int, region: Region) -> str:
 
 
 def _region_text(region: Region) -> str:
-    """The part of a file that is one region."""
     lines = ["[[region]]"]
     for field in msgspec.structs.fields(region):
         value = getattr(region, field.name)
@@ -124,6 +123,3 @@ def _value(value: Any, name: str) -> str:
     if isinstance(value, int | float):
         return f"{value:#x}" if name == "uid" else repr(float(value))
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
-
-
-__all__ = ["put_region", "read_regions", "regions_to_toml"]

@@ -155,7 +155,6 @@ class Regions:
 
 
 def _in_turn(regions: Sequence[Region], places: Sequence[str]) -> list[Region]:
-    """The regions, each after those that it refers to."""
     by_name: dict[str, Region] = {}
     place_of: dict[str, str] = {}
     for region, place in zip(regions, places, strict=True):
@@ -227,6 +226,3 @@ class _Sensors:
 def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:
     """Which patches or modules have one of the wanted names: that in the skin, or that of their driver alone."""
     return np.array([not each.isdisjoint(wanted) for each in names], bool)
-
-
-__all__ = ["Box", "Region", "RegionIndex", "Regions"]

@@ -66,6 +66,3 @@ class Sag:
         up = self._sunk * is_back
         self._sunk -= up
         return up
-
-
-__all__ = ["Sag"]

@@ -46,7 +46,6 @@ class SourceReader(ServiceReader[FrameT], Generic[SourceT, FrameT]):
 
     @property
     def source(self) -> SourceT:
-        """What it is of."""
         return cast(SourceT, self._ring.context)
 
     def _describe(self, attached: segments.Segment) -> SourceT:
@@ -71,6 +70,3 @@ class SourceReader(ServiceReader[FrameT], Generic[SourceT, FrameT]):
     @abstractmethod
     def _layout_of(source: SourceT) -> Mapping[str, tuple[str, tuple[int, ...]]]:
         """The dtype and shape of every column of a frame."""
-
-
-__all__ = ["SourceReader"]

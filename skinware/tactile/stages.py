@@ -304,15 +304,3 @@ class Amplifier(Stage):
         bent = values if settings.exponent == 1 else np.sign(values) * np.abs(values) ** settings.exponent
         amplified: npt.NDArray[np.floating] = settings.gain * bent + settings.offset
         return amplified
-
-
-__all__ = [
-    "NO_UNIT",
-    "AmplifierSettings",
-    "FilterSettings",
-    "ScalerSettings",
-    "Signal",
-    "Stage",
-    "StageSettings",
-    "Taxels",
-]

@@ -240,7 +240,6 @@ class Tracker:
         now.velocity_m_s[found] = before + weight * (velocity - before)
 
     def _judge(self, now: _Tracks, found: Whole, known: Whole, load: Floats, time_ns: int) -> None:
-        """What each contact that goes on is doing."""
         tracks, settings = self._tracks, self._settings
         passed_s = np.maximum(now.seen_ns[found] - tracks.seen_ns[known], 0) / NS_PER_S
         was, motion = tracks.load[known], tracks.motion_m_s[known]
@@ -272,6 +271,3 @@ def _rank(numbers: Floats | Whole) -> Floats:
     rank = np.zeros(len(numbers))
     rank[np.argsort(numbers, kind="stable")] = np.linspace(0, 1, len(numbers)) if len(numbers) else 0.0
     return rank
-
-
-__all__ = ["ContactKind", "Followed", "Places", "Tracker", "TrackingSettings"]

@@ -84,7 +84,6 @@ class CodedColumn:
         return CodedColumn(column.name, column.offset, np.dtype("u1"), column.count * dtype.itemsize, False)
 
     def words_of(self, slot: memoryview) -> Words:
-        """(count,) its words in a slot, in place."""
         return np.frombuffer(slot, self.words, self.count, self.offset)
 
 
@@ -100,7 +99,6 @@ class Encoder:
         self._before: Frame | None = None
 
     def next_is_key(self) -> None:
-        """The next frame is a key frame."""
         self._before = None
 
     def encode(self, frame: Frame) -> bytes:
@@ -142,7 +140,6 @@ def _change(words: Words, before: Words | None, is_integer: bool) -> Words:
 
 
 def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
-    """The code of a column, and its bytes."""
     greatest = int(change.max(initial=0))
     if not greatest:
         return 0, b""

@@ -106,7 +106,6 @@ class Collector:
 
     @property
     def services(self) -> list[str]:
-        """Names of the services that were found so far."""
         return sorted(self._sources)
 
     @property
@@ -160,7 +159,6 @@ class Collector:
         self._stopping = True
 
     def close(self) -> None:
-        """Let go of all services. Idempotent."""
         for source in self._sources.values():
             source.reader.close()
         if self._wish is not None:
@@ -253,7 +251,6 @@ class Collector:
         self._tell("found", name)
 
     def _look_at(self, name: str, source: _Source) -> None:
-        """Tell how a service is, if that has changed."""
         reader = source.reader
         if self._has_more(source):
             return  # a newer generation would take their place
@@ -271,7 +268,6 @@ class Collector:
         self._listener.happened({"event": event, "service": service, "time_ns": now_ns(), **more})
 
     def _tell_trouble(self, name: str, text: str) -> None:
-        """That a service cannot be read, once."""
         if self._trouble.get(name) != text:
             self._trouble[name] = text
             self._tell(UNREADABLE, name, why=text)

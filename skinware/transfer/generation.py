@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import driver_service
+from skinware._columns import Index
 from skinware.errors import BadRecording, BadServiceFile, StructureError
 from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.schema import STATIC_NAME, Schema
-from skinware.structure import OF_GROUPS, Index, Structure
+from skinware.structure import OF_GROUPS, Structure
 from skinware.transfer.codec import CodedColumn
 
 _SHORTEST_NS = 10_000
@@ -87,7 +88,6 @@ class Generation:
 
     @property
     def generation(self) -> int:
-        """Its number."""
         return self._segment.generation
 
     @property
@@ -97,7 +97,6 @@ class Generation:
 
     @property
     def is_driver(self) -> bool:
-        """Whether it is one of a driver."""
         return self.kind == driver_service.KIND
 
     @property
@@ -112,7 +111,6 @@ class Generation:
 
     @property
     def published_before(self) -> int:
-        """Frames that the generations before it published."""
         return self._segment.published_before
 
     @property
@@ -122,17 +120,14 @@ class Generation:
 
     @property
     def slot_count(self) -> int:
-        """Slots of the ring."""
         return self._segment.layout.slot_count
 
     @property
     def slot_stride(self) -> int:
-        """Bytes of a slot."""
         return self._segment.layout.slot_stride
 
     @property
     def ring_size(self) -> int:
-        """Bytes of the slots of its ring."""
         return self.slot_count * self.slot_stride
 
     @property
@@ -141,7 +136,6 @@ class Generation:
         return self._columns
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
-        """The static columns, read-only."""
         return self._segment.static_columns()
 
 

@@ -89,7 +89,6 @@ class Republisher:
         return now_ns() - frame.published_ns
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:  # noqa: ARG002
-        """What a service offers."""
         return self._operations
 
     def publish(self, name: str, frame: RecordedFrame, generation: Generation, *, follows: bool = True) -> None:
@@ -132,7 +131,6 @@ class Republisher:
             self._apply_pause(service)
 
     def happened(self, name: str, event: str) -> None:
-        """What happened to a service in the recording happens to it now."""
         service = self._services.get(name)
         if service is None:
             return
@@ -143,7 +141,6 @@ class Republisher:
             self._remove(name, deserted=event == DEAD)
 
     def pause(self, paused: bool) -> None:
-        """Pause all services, or let them be as they were recorded."""
         self._paused = paused
         for service in self._services.values():
             self._apply_pause(service)
@@ -167,7 +164,6 @@ class Republisher:
         self._epoll.register(fd, select.EPOLLIN)
 
     def unwatch(self, fd: int) -> None:
-        """Not any more."""
         if self._calls.pop(fd, None) is not None:
             with contextlib.suppress(OSError):  # it is closed
                 self._epoll.unregister(fd)
@@ -184,7 +180,6 @@ class Republisher:
                 call()
 
     def close(self) -> None:
-        """Withdraw all that is published. Idempotent."""
         for name in list(self._services):
             self._remove(name)
         for name, generation in list(self._deserted.items()):
@@ -194,7 +189,6 @@ class Republisher:
         self._epoll.close()
 
     def _service(self, name: str, generation: Generation, count: int, follows: bool) -> Published:
-        """The service, with the generation of the frame that has a number."""
         service = self._services.get(name)
         if service is not None and service.generation is generation and service.speed == self.speed:
             return service
@@ -254,7 +248,6 @@ class Republisher:
             service.waiting.clear()
 
     def take_requests(self, name: str, service: Published) -> None:  # noqa: ARG002
-        """Carry out what was asked of a service."""
         service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
 
     def _lost_before(self, name: str, count: int) -> int:
@@ -263,7 +256,6 @@ class Republisher:
 
     @staticmethod
     def _reply(service: Published, acquired_ns: int) -> None:
-        """Answer those whose frame this is."""
         answered = [request for time_ns, request in service.waiting if time_ns <= acquired_ns]
         service.waiting = [(t, r) for t, r in service.waiting if t > acquired_ns and not r.cancelled]
         for request in answered:
@@ -280,7 +272,6 @@ class Republisher:
 
 
 def _kind_of(generation: Generation) -> tuple[str, int]:
-    """What a writer has for good."""
     return generation.kind, generation.slot_count
 
 

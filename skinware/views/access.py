@@ -84,12 +84,10 @@ class Access:
             raise Refused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
 
     def has_token(self, target: str) -> bool:
-        """Whether the token is in an address."""
         given = parse_qs(urlsplit(target).query).get("token", [""])[0]
         return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
 
     def without_token(self, target: str) -> str:
-        """The query of an address, without the token."""
         left = [(name, value) for name, value in parse_qsl(urlsplit(target).query, True) if name != "token"]
         return f"?{urlencode(left)}" if left else ""
 
@@ -100,7 +98,6 @@ class Access:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can connect to an address."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -108,7 +105,6 @@ def is_loopback(host: str) -> bool:
 
 
 def _only(headers: Mapping[str, str], name: str) -> str | None:
-    """A header that may be there once at most."""
     try:
         return headers.get(name)
     except LookupError:
@@ -121,6 +117,3 @@ def _cookie(headers: Mapping[str, str], name: str) -> str:
     except CookieError:
         return ""
     return "" if found is None else found.value
-
-
-__all__ = ["Access", "Refused", "is_loopback"]

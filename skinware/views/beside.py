@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from skinware.driver_service import DriverFrame
+from skinware.driver_frame import DriverFrame
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.tactile.contacts_service import ContactsFrame
@@ -70,7 +70,6 @@ class Beside:
         return next((frame for source in self._motion if (frame := source.of(driver)) is not None), None)
 
     def close(self) -> None:
-        """Detach from everything. Idempotent."""
         for contacts, motion in zip(self._contacts, self._motion, strict=True):
             contacts.close()
             motion.close()
@@ -79,6 +78,3 @@ class Beside:
 
     def _calm_of(self, driver: str) -> LiveDriver | None:
         return None if self._calm is None else self._calm.get(driver)
-
-
-__all__ = ["Beside"]

@@ -18,9 +18,5 @@ class LiveBridges(LiveServices[BridgeReader, BridgeFrame]):
         super().__init__(namespace, BridgeReader)
 
     def states(self) -> list[BridgeState]:
-        """How those that run are now, by name."""
         frames = [self._newest(name) for name in list(self._readers)]
         return [frame.state for frame in frames if frame is not None]
-
-
-__all__ = ["LiveBridges"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverFrame
+from skinware.driver_frame import DriverFrame
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
@@ -70,7 +70,6 @@ class Followed:
 
     @property
     def name(self) -> str:
-        """Name of the driver."""
         return self.live.name
 
     def quantity(self, name: str) -> Quantity | None:
@@ -210,7 +209,6 @@ class Follower:
         self._beside = Beside(self._live, names, calm)
 
     def get(self, number: int) -> Followed | None:
-        """The driver that viewers know by this number."""
         return next((driver for driver in self.drivers if driver.number == number), None)
 
     def take(self, period_ns: int) -> list[Followed]:
@@ -229,7 +227,6 @@ class Follower:
         return newer
 
     def close(self) -> None:
-        """Detach from everything. Idempotent."""
         self._beside.close()
         self._live.close()
         self.drivers = []
@@ -256,7 +253,6 @@ class Follower:
         return newer
 
     def _keep(self, found: list[LiveDriver]) -> None:
-        """Drivers that came and went."""
         if [driver.live for driver in self.drivers] == found:
             return
         kept = {id(driver.live): driver for driver in self.drivers}
@@ -272,6 +268,3 @@ class Follower:
         self.scene = Scene(
             {driver.name: (driver.structure, driver.quantities) for driver in self.drivers}, self.robot.poses
         )
-
-
-__all__ = ["Followed", "Follower"]

@@ -14,7 +14,8 @@ from skinware.status import BusReason, BusState, PatchState, Status
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from skinware.driver_service import DriverFrame, DriverReader
+    from skinware.driver_frame import DriverFrame
+    from skinware.driver_service import DriverReader
     from skinware.memory.ring import Frame
     from skinware.service import ServiceReader
 

@@ -48,6 +48,3 @@ def shear_of(vectors: npt.NDArray[np.floating[Any]], longest: float) -> npt.NDAr
     scaled = np.nan_to_num(vectors * np.float32(_LONGEST / longest if longest > 0 else 0.0), posinf=0.0, neginf=0.0)
     parts: npt.NDArray[np.int8] = np.clip(np.rint(scaled), -_LONGEST, _LONGEST).astype(np.int8)
     return parts
-
-
-__all__ = ["HIGHEST", "NO_VALUE", "WITHOUT_VALUE", "levels_of", "shear_of"]

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
@@ -44,7 +45,6 @@ class LiveDriver:
 
     @property
     def name(self) -> str:
-        """Name of the driver."""
         return self.reader.name
 
     @property
@@ -105,7 +105,6 @@ class LiveDriver:
         return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
 
     def health(self) -> SkinHealth:
-        """The driver in a few figures."""
         return health_of(self.reader, self.frame, self.rate_hz)
 
     def _sample(self, frame: DriverFrame) -> None:
@@ -140,7 +139,6 @@ class LiveDrivers:
         self._next_look_ns = 0
 
     def get(self, name: str) -> LiveDriver | None:
-        """The driver of this name, if it is here now."""
         return self._drivers.get(name)
 
     def look(self) -> list[LiveDriver]:
@@ -170,7 +168,6 @@ class LiveDrivers:
             return False
 
     def close(self) -> None:
-        """Detach from all drivers. Idempotent."""
         for driver in self._drivers.values():
             driver.reader.close()
         self._drivers = {}

@@ -43,7 +43,6 @@ class LiveServices(Generic[ReaderT, FrameT]):
         self._readers = dict(sorted(self._readers.items()))
 
     def close(self) -> None:
-        """Detach from all. Idempotent."""
         for name in list(self._readers):
             self._drop(name)
 
@@ -64,6 +63,3 @@ class LiveServices(Generic[ReaderT, FrameT]):
 
     def _drop(self, name: str) -> None:
         self._readers.pop(name).close()
-
-
-__all__ = ["LiveServices"]

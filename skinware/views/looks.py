@@ -205,6 +205,3 @@ class _Watched:
     def peaks(self, quantity: str, n: int) -> npt.NDArray[np.float32]:
         known = self.peak is not None and self.peak[0] == quantity
         return self.peak[1] if known and self.peak is not None else np.zeros(n, np.float32)
-
-
-__all__ = ["DEFAULT_FPS", "Look", "Mode", "Picture", "Wiped"]

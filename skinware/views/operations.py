@@ -93,19 +93,3 @@ def operation_of(text: str | bytes) -> Operation:
     except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a ValidationError is a DecodeError
         raise ConfigurationError(str(error)) from None
     return operation
-
-
-__all__ = [
-    "MOST_EXACT",
-    "Choose",
-    "Exact",
-    "Names",
-    "Next",
-    "Operation",
-    "Record",
-    "Replay",
-    "Series",
-    "Tare",
-    "Wipe",
-    "operation_of",
-]

@@ -63,6 +63,3 @@ class Past:
         times = self._time_ns[rows]
         recent: npt.NDArray[np.int64] = rows[times >= times[-1] - LENGTH_S * NS_PER_S]
         return recent
-
-
-__all__ = ["LENGTH_S", "Past"]

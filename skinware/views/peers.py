@@ -36,6 +36,3 @@ def _in_table(end: tuple[str, int]) -> str:
     address = ipaddress.ip_address(end[0]).packed
     words = [int.from_bytes(address[at : at + _WORD], sys.byteorder) for at in range(0, len(address), _WORD)]
     return "".join(f"{word:08X}" for word in words) + f":{end[1]:04X}"
-
-
-__all__ = ["account_of"]

@@ -8,9 +8,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from skinware._columns import Index
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
-from skinware.structure import Index, Structure
+from skinware.structure import Structure
 from skinware.tactile.neighbours import pitch_m
 
 
@@ -90,6 +91,3 @@ def _beside(structure: Structure, name: str, axes: tuple[str, ...]) -> npt.NDArr
         of_uid = dict(zip(structure.sensor_uid[positions].tolist(), positions, strict=True))
         columns.append([of_uid.get(one, -1) for one in uid])
     return np.array(columns, np.int64).reshape(len(axes), len(uid)).T
-
-
-__all__ = ["Quantity", "quantities_of"]

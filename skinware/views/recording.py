@@ -94,6 +94,3 @@ class Recording:
 
 async def _all_of(stream: asyncio.StreamReader | None) -> str:
     return "" if stream is None else (await stream.read()).decode(errors="replace")
-
-
-__all__ = ["Recording"]

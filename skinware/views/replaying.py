@@ -119,6 +119,3 @@ class _Asked:
         except ServiceError as error:
             self._fail(str(error))
         return True
-
-
-__all__ = ["ReplayControl"]

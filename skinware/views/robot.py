@@ -219,6 +219,3 @@ def _name(element: ElementTree.Element | None, attribute: str) -> str:
         what = "a joint" if element is None else f"<{element.tag}>"
         raise ValueError(f"{what} without {attribute!r}")
     return name
-
-
-__all__ = ["FORMAT", "VERSION", "Mesh", "Robot", "pose_of", "read_robot"]

@@ -84,7 +84,6 @@ class Scene:
             self._place(name, quantities, flat[name], corners.get(name, np.zeros(3)))
 
     def of(self, driver: str, quantity: str) -> Placed:
-        """Where the taxels of a driver's quantity are."""
         return self._placed[driver, quantity]
 
     def pose(self, driver: str, frame: str) -> Pose:
@@ -92,7 +91,6 @@ class Scene:
         return self._pose_of.get((driver, frame), np.eye(4))
 
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
-        """Give a pose to each body."""
         for body in sorted(bodies, key=lambda body: (not self._is_placed(body), body.drivers[0], body.frame)):
             pose = self._poses.get(body.frame, np.eye(4)).copy()
             corners = np.array(np.meshgrid(*zip(body.at.min(axis=0), body.at.max(axis=0), strict=True))).reshape(3, -1)
@@ -180,7 +178,6 @@ def _is_same(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> bo
 
 
 def _frames(geometry: Geometry) -> list[str]:
-    """The coordinate frames of the places that are known."""
     return list(dict.fromkeys(geometry.frame[geometry.known].tolist()))
 
 
@@ -238,7 +235,6 @@ def on_shelves(sizes: Sequence[tuple[float, float]], gap: float) -> list[tuple[f
 
 
 def _shelves(sizes: Sequence[tuple[float, float]], gap: float, longest: float) -> list[tuple[float, float]]:
-    """Likewise, in lines of a known length."""
     corners, right, top, tallest = [], 0.0, 0.0, 0.0
     for width, height in sizes:
         if right and right + width > longest:
@@ -264,6 +260,3 @@ def _size(flat: Sequence[Places]) -> tuple[float, float]:
     """Width and height of what is laid out, m."""
     places = np.concatenate(flat)
     return float(places[:, 0].max()), -float(places[:, 1].min())
-
-
-__all__ = ["ASPECT", "FLAT_PITCH_M", "Placed", "Pose", "Scene", "laid_out", "on_shelves"]

@@ -139,7 +139,6 @@ class ViewServer:
     # -- viewers ------------------------------------------------------------------------------------------------
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """One viewer, until it goes."""
         if len(self._viewers) >= _MOST_VIEWERS:
             await connection.close(1013, "too many viewers")
             return
@@ -184,7 +183,6 @@ class ViewServer:
             await connection.send(viewer.turn(self._besides()))
 
     def _wake(self) -> None:
-        """Have those who wait look whether there is news for them."""
         self._news.set()
         self._news.clear()
 
@@ -254,6 +252,3 @@ def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
 
 def _type_of(file: Path) -> str:
     return _TYPES.get(file.suffix) or mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-
-
-__all__ = ["PAGE", "ViewServer", "show"]

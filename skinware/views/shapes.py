@@ -56,7 +56,6 @@ def shape_of(kind: str, count: int) -> Shape:
 
 @cache
 def rows_of(count: int, columns: int) -> Shape:
-    """Rows of so many sensors."""
     cells = tuple((number // columns, 2 * (number % columns)) for number in range(count))
     return Shape(cells, math.ceil(count / columns), 2 * columns)
 

@@ -44,7 +44,6 @@ _STATUSES = {
 
 
 def state_of(driver: Followed) -> dict[str, Any]:
-    """One driver with its buses and patches, for programs."""
     live, frame, life = driver.live, driver.frame, driver.life
     told: dict[str, Any] = {
         "id": driver.number,
@@ -112,7 +111,6 @@ def problems_of(driver: Followed, state: dict[str, Any]) -> list[dict[str, Any]]
 
 
 def problem_of_all(text: str) -> dict[str, Any]:
-    """What is wrong with no driver alone."""
     return {"severity": ERROR, "driver": None, "text": text}
 
 
@@ -163,6 +161,3 @@ def _nonzero(counters: dict[str, int]) -> dict[str, int]:
 
 def _rounded(rate_hz: float | None) -> float | None:
     return None if rate_hz is None else round(rate_hz, 2)
-
-
-__all__ = ["problem_of_all", "problems_of", "state_of", "worst_first"]

@@ -46,7 +46,6 @@ class LiveSources(LiveServices[SourceReader[Any, FrameT], FrameT]):
 
 
 def live_contacts(namespace: Namespace) -> LiveSources[ContactsFrame]:
-    """The services of contacts in a namespace."""
     return LiveSources(namespace, ContactsReader)
 
 

@@ -45,7 +45,6 @@ class Blobs:
         return at
 
     def under(self, header: dict[str, Any]) -> bytes:
-        """The whole turn."""
         text = msgspec.json.encode(header)
         text += b" " * (-(4 + len(text)) % _ALIGNMENT)
         return b"".join([len(text).to_bytes(4, "little"), text, *self._parts])
@@ -83,12 +82,10 @@ class Viewer:
         self._see_all_again()
 
     def tare(self) -> None:
-        """Take what comes next for rest."""
         self.look.tare()
         self._see_all_again()
 
     def wipe(self, on: bool) -> None:
-        """Begin a wipe test, or leave it."""
         self.look.wipe(on)
         self._see_all_again()
 
@@ -97,7 +94,6 @@ class Viewer:
         self._exact, self._asked = sensors, True
 
     def ask(self, question: operations.Names | operations.Series) -> None:
-        """Answer in the next turn."""
         if len(self._questions) == _MOST_QUESTIONS:
             self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
         else:
@@ -111,7 +107,6 @@ class Viewer:
 
     @property
     def has_news(self) -> bool:
-        """Whether there is something that this viewer has not seen."""
         return (
             self._asked
             or bool(self._questions)
@@ -213,7 +208,6 @@ class Viewer:
         return told
 
     def _contacts(self, driver: Followed) -> list[dict[str, Any]]:
-        """The contacts on a driver where the viewer sees them, the oldest first."""
         quantity, frame = self.look.quantity_of(driver), driver.contacts
         if quantity is None or frame is None or frame.source.type_name != quantity.type.name:
             return []
@@ -291,7 +285,6 @@ class Viewer:
 
 
 def _regions(driver: Followed) -> list[dict[str, Any]]:
-    """What touches the regions of a driver."""
     if driver.motion is None:
         return []
     return [
@@ -380,6 +373,3 @@ def _series(driver: Followed, position: int, blobs: Blobs) -> dict[str, Any]:
         "time_s": blobs.add((times_ns - newest_ns) / NS_PER_S, "<f4"),
         "value": blobs.add(raw * of_type.scale + of_type.offset, "<f4"),
     }
-
-
-__all__ = ["PROTOCOL", "Blobs", "Viewer"]

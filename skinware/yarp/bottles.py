@@ -29,7 +29,6 @@ Value = int | str | Sequence["Value"]
 
 
 def in_text(values: Sequence[Value]) -> str:
-    """A list as a line of text."""
     return " ".join(map(_value_in_text, values))
 
 
@@ -48,7 +47,6 @@ def of_text(line: str) -> list[str]:
 
 
 def packed(values: Sequence[Value]) -> bytes:
-    """A list in binary."""
     return struct.pack("<ii", _LIST, len(values)) + b"".join(map(_packed_value, values))
 
 
@@ -108,6 +106,3 @@ def _unpacked_value(data: bytes, at: int, kind: int, deepest: int) -> tuple[Valu
             raise ValueError(f"a text of {size} bytes in a list of YARP")
         return data[at + 4 : end].decode("utf-8", "replace"), end
     return _unpacked_list(data, at, kind, deepest - 1)
-
-
-__all__ = ["Value", "Word", "in_text", "of_text", "packed", "unpacked"]

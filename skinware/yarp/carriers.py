@@ -78,7 +78,6 @@ class Message:
         self._command = f"do {count} {time_s:.6f}".encode()
 
     def of(self, carrier: Carrier) -> bytes:
-        """In a carrier."""
         return self._text if carrier.is_text else self._binary
 
     @cached_property
@@ -94,7 +93,6 @@ class Message:
 
 
 def framed(number: int) -> bytes:
-    """A number as YARP marks it."""
     return struct.pack("<2si2s", b"YA", number, b"RP")
 
 
@@ -102,6 +100,3 @@ def unframed(data: bytes) -> int | None:
     """The number of eight bytes; None if it is not marked as one."""
     begin, number, end = struct.unpack("<2si2s", data)
     return int(number) if (begin, end) == (b"YA", b"RP") else None
-
-
-__all__ = ["READ", "Carrier", "Message", "framed", "unframed"]

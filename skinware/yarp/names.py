@@ -114,7 +114,6 @@ class NameServer:
             self._ask(name, f"set {name} {key} {' '.join(carriers)}")
 
     def unregister(self, name: str) -> None:
-        """Tell that a port is no more."""
         self._ask(name, f"unregister {name}")
 
     def _ask(self, name: str, command: str) -> Contact | None:
@@ -144,6 +143,3 @@ def _contact(line: bytes) -> Contact | None:
         return None
     name, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
     return Contact(name, host, int(match["port"]), carrier)
-
-
-__all__ = ["DEFAULT_PORT", "WHO", "Contact", "NameServer", "configured_server", "is_port_name"]

@@ -104,7 +104,6 @@ class _Served:
             self.port.send(message)
 
     async def live(self) -> None:
-        """Be there, and known, until it is over."""
         number = await self.port.open(self._host)
         host = "..." if self._host in ANYWHERE else self._host
         try:
@@ -120,7 +119,6 @@ class _Served:
             await asyncio.to_thread(self._be_unknown)
 
     def end(self) -> None:
-        """In the event loop."""
         self._over.set()
 
     def _be_known(self, host: str, number: int) -> None:
@@ -179,7 +177,6 @@ class Outlet:
 
     @property
     def lost(self) -> int:
-        """Frames that could not be taken from their rings."""
         return self._collector.lost
 
     def run(self, tell: Callable[[], object] = lambda: None) -> None:
@@ -263,7 +260,6 @@ class Outlet:
                 self._tell_once(service, f"driver {served.driver} has the port {served.port.name} already")
 
     def took(self, service: str, frame: Frame) -> None:
-        """Likewise."""
         for served, vector in self._vectors.get(service, ()):
             served.offer(vector.of(frame.column("values"), frame.column("status")), frame.acquired_ns)
 
@@ -291,6 +287,3 @@ class Outlet:
             self._told[about] = why
             if why:
                 self._tell({"event": "trouble", "about": about, "why": why})
-
-
-__all__ = ["Outlet", "Wanted"]

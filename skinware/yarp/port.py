@@ -218,7 +218,6 @@ class OutputPort:
         return _WHICH_YARP
 
     async def _obey(self, command: str, reader: asyncio.StreamReader) -> list[str]:
-        """What a command says back."""
         if command[:1] in ("d", "D"):
             await _line(reader)  # data, of which we take none
             return []
@@ -239,7 +238,6 @@ class OutputPort:
         return ["Port command not understood.", "Type ? for help."]
 
     async def _administer(self, words: list[str]) -> list[Value]:
-        """What an administrative message is answered with."""
         match words:
             case ["ver", *_]:
                 return [Word("ver"), 1, 2, 3]
@@ -385,6 +383,3 @@ async def _binary_message(reader: asyncio.StreamReader) -> tuple[str, bytes]:
     if mark != b"~" or not 0 <= size <= len(data) - _COMMAND.size:
         raise ValueError("no command of YARP")
     return (text.rstrip(b"\0") if size else letter).decode("utf-8", "replace"), rest
-
-
-__all__ = ["OutputPort", "Receiver"]

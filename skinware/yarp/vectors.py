@@ -119,7 +119,6 @@ def _port_of(bus: str) -> str:
 
 
 def _places(structure: Structure, driver_type: str, sensors: Indices) -> tuple[Indices, int]:
-    """Where sensors have their values, and how many there are."""
     uid = structure.sensor_uid[sensors].astype(np.int64)
     bus, of_bus = uid >> _BUS_SHIFT, uid & (1 << _BUS_SHIFT) - 1
     if driver_type == "yarp" and len(np.unique(bus)) == 1:
@@ -136,6 +135,3 @@ def _places(structure: Structure, driver_type: str, sensors: Indices) -> tuple[I
         start = np.array([rank[each] for each in board]) * _OF_A_BOARD
         return start + triangle * _OF_A_TRIANGLE + channel, len(order) * _OF_A_BOARD
     return np.arange(len(sensors)), len(sensors)
-
-
-__all__ = ["FULL", "Vector", "vectors_of"]

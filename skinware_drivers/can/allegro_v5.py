@@ -135,7 +135,6 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
         return ZeroWatch(tables)
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Nothing is asked."""
         return False
 
 
@@ -180,11 +179,9 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         return self.patches
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:  # noqa: ARG002
-        """There is one hand on a bus, and it is known."""
         return known
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Nothing is asked."""
         return False
 
     @classmethod
@@ -257,7 +254,6 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
 def _expand(
     payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8], factor: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint16]]:
-    """Eight pads, the first with a unit of its own."""
     told = payload[:, :8].astype(np.uint16)
     value = told * np.array([factor] + 7 * [1], np.uint16)
     row, channel = np.divmod(np.arange(8 * len(length)), 8)
@@ -284,6 +280,3 @@ def _places_of_pads(side: Literal["right", "left"]) -> Geometry:
             for centre in reversed(Hand(side).down(part, [pad] * count))
         ]
     )
-
-
-__all__ = ["AllegroV5Driver", "AllegroV5Options", "AllegroV5UdpDriver"]

@@ -121,7 +121,6 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """TACT of all nodes at once."""
         return (Poll(HAND_GROUP, bytes([self.options.tact]), self.period_s),)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -144,7 +143,6 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         return await self._answers(link, patch.key)
 
     async def revive(self, link: Link, patch: Patch) -> None:
-        """Choose the format of one node."""
         value = 2 if self.options.format == "full" else 1
         await link.send(patch.key, bytes((_SET | self.options.tact, 0)) + value.to_bytes(4, "little"))
 

@@ -159,7 +159,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return self.patches
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
-        """Those that are known, and others that are there now."""
         found = {patch.key: self._found[patch.key] for patch in known}
         self._take({**found, **await self._find(link, [hand for hand in self._wanted if hand not in found])})
         return self.patches
@@ -191,7 +190,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
 
     @operation(looks=True)
     async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:
-        """Serial numbers of the hands."""
         return {patch.name: await self._serial_number(link, patch.key) for patch in patches}
 
     def _asks(self, link: Link) -> bool:
@@ -291,7 +289,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
 
 
 async def _answers(link: Link, hand: int, question: Question) -> bool:
-    """Whether a hand answers a question for touch to the end."""
     last, timeout_s = _end_of_answer(hand, question), max(_ANSWER_S, question.patience_s)
     try:
         await link.request(hand, question.payload, last, timeout_s=timeout_s, tries=_TRIES)

@@ -96,7 +96,6 @@ class Matrices(Touch):
     types = (FORCE,)
 
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        """One for each part."""
         count = self.rows * self.columns
         return [
             Module(taxels(count, first_uid=_uid(hand, part)), MATRIX + PARTS.index(part), self._kind, part)
@@ -120,13 +119,11 @@ class Matrices(Touch):
         return Layout([_other(identifier), *rows], Cycle([row.name for row in rows], maximum_age_s=_LONGEST_REPLY_S))
 
     def questions(self, parts: Sequence[str]) -> list[Question]:
-        """One for each part."""
         commands = [MATRIX + PARTS.index(part) for part in parts]
         size, last = self.rows << 4 | self.columns, self.rows - 1 << 4
         return [Question(bytes((command, size)), bytes((command, last)), 2 + self.columns) for command in commands]
 
     def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        """A grid on each part."""
         grid = Grid(self.rows, self.columns)
         uids = [range(_uid(hand, part), _uid(hand, part) + self.rows * self.columns) for part in parts]
         centres = [side.down(part, [grid])[0] for part in parts]
@@ -156,7 +153,6 @@ class RunMatrices(Touch):
     period_s = 0.1
 
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        """One for each part."""
         found = []
         for part in parts:
             rows, columns = self._size(part)
@@ -182,7 +178,6 @@ class RunMatrices(Touch):
         return questions
 
     def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        """A grid on each part."""
         found = []
         for part in parts:
             rows, columns = self._size(part)
@@ -224,7 +219,6 @@ class FingerValues(Touch):
     types = (FORCE, TANGENTIAL, DIRECTION, PROXIMITY.measured(unit="counts", minimum=0, maximum=255))
 
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        """One for each of the four."""
         fingers = [part for part in parts if part in FINGERS]
         return [
             Module([Sensor(one.name, _uid(hand, finger)) for finger in fingers], self.command + at, name=one.name)
@@ -240,19 +234,16 @@ class FingerValues(Touch):
         return Layout([_other(identifier), frame])
 
     def questions(self, parts: Sequence[str]) -> list[Question]:
-        """One for each of the four."""
         del parts
         commands = [bytes([self.command + at]) for at in range(len(self.types))]
         return [Question(command, command, 1 + len(FINGERS)) for command in commands]
 
     def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        """All four of a finger at its tip."""
         grid, names = Grid(1, 1), [one.name for one in self.types]
         fingers = [part for part in parts if part in FINGERS]
         return Geometry.joined([grid.at(side.down(f, [grid])[0], names, [_uid(hand, f)]) for f in fingers])
 
     def known(self, heard: Beginnings) -> int:
-        """Values of five or six fingers."""
         commands = range(self.command, self.command + len(self.types))
         return sum(n for (first, length), n in heard.items() if first in commands and length in (6, 7))
 
@@ -294,21 +285,3 @@ def _other(identifier: Identifier) -> Frame:
 
 def _uid(hand: int, part: str) -> int:
     return hand << 16 | PARTS.index(part) << 12
-
-
-__all__ = [
-    "DIRECTION",
-    "FORCE",
-    "MATRIX",
-    "PARTS",
-    "TANGENTIAL",
-    "TOUCH",
-    "Beginnings",
-    "FingerValues",
-    "Matrices",
-    "Question",
-    "RunMatrices",
-    "Touch",
-    "every_layout",
-    "parts_heard",
-]

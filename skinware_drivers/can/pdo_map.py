@@ -64,7 +64,6 @@ class Tpdo:
 
     @property
     def length(self) -> int:
-        """Bytes."""
         return -(-sum(entry.bits for entry in self.entries) // 8)
 
 

@@ -106,7 +106,6 @@ class PythonCanBus(Bus):
 
     @property
     def note(self) -> str:
-        """That the controller acknowledges what it hears, though nothing may be sent."""
         if not self.listen_only or self.interface in (*_LISTENING, *_WITHOUT_CONTROLLER):
             return ""
         return (
@@ -221,7 +220,6 @@ class _Messages:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, if it can be ended."""
         self._closing.set()
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
@@ -279,7 +277,6 @@ class _Messages:
 
 
 def _fd_flags(message: can.Message) -> int:
-    """As linux/can.h has them."""
     if not message.is_fd:
         return 0
     return IS_FD | (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)

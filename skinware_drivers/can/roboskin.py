@@ -40,9 +40,7 @@ from skinware_drivers.can.roboskin_options import (
     LAST_BOARD,
     NON_TACTILE,
     TRIANGLES,
-    Kind,
     RoboskinOptions,
-    SpecialBoards,
     runs_text,
     usual_kind,
 )
@@ -127,7 +125,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         await self._configure(link, self._boards)
 
     async def start(self, link: Link) -> None:
-        """Make every board send (set up the old way, boards do so by themselves)."""
         if not self.options.old_style:
             for board in self._boards:
                 await link.send(0x200 | board, START)
@@ -135,7 +132,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             await _send(link, set_up.board, set_up.inertial_start())
 
     async def stop(self, link: Link) -> None:
-        """Make every board silent."""
         for board in self._boards:
             await link.send(0x200 | board, STOP)
         for set_up in self._set_ups(self._boards):
@@ -193,7 +189,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Marks silent re-calibration."""
         return BaselineWatch(tables)
 
     # What boards are told
@@ -205,7 +200,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         return self._board_type.get(board, _MTB3_TYPE if self.options.old_style else 0) != _MTB3_TYPE
 
     def _fit_boards(self) -> None:
-        """Have layout and period fit the boards and how often they send."""
         boards = self._boards or range(FIRST_BOARD, LAST_BOARD + 1)
         periods_ms = [set_up.period_ms for set_up in self._set_ups(boards)]
         self.layout = make_layout(self.options, min(periods_ms) / 1e3)
@@ -276,7 +270,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         return (await link.request(0x200 | board, b"\x1c\x02\x00", reply, timeout_s=_REPLY_S)).payload
 
     def _tell_what_is_odd(self, link: Link) -> None:
-        """Name the triangles that stay off, and boards that are not what the options say."""
         for set_up in self._set_ups(self._boards):
             where = f"{link.bus_name}: board {set_up.board}"
             off = set(range(TRIANGLES)) - set_up.enabled
@@ -302,7 +295,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     # What there is
 
     def patches_set_up(self, boards: Iterable[int]) -> list[Patch]:
-        """What boards send once they were set up."""
         patches = []
         for set_up in self._set_ups(sorted(boards)):
             is_old = self.options.old_style and not self._is_mtb4(set_up.board)
@@ -313,7 +305,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         return patches
 
     def patches_heard(self, heard: Counter[Heard], known: Sequence[Patch]) -> list[Patch]:
-        """What a listener knows, and what it heard beside that."""
         skin: dict[tuple[int, int], set[int]] = {
             (board_of(p), p.key >> 4): {m.key for m in p.modules} for p in known if not is_inertial(p)
         }
@@ -356,6 +347,3 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 async def _send(link: Link, board: int, messages: Iterable[bytes]) -> None:
     for message in messages:
         await link.send(0x200 | board, message)
-
-
-__all__ = ["BaselineWatch", "Kind", "RoboskinDriver", "RoboskinOptions", "SpecialBoards"]

@@ -55,7 +55,6 @@ class Board:
         return BOARD_TYPES.get(self.board_type, f"type {self.board_type}")
 
     def as_data(self) -> dict[str, Any]:
-        """For JSON."""
         return {
             "type": self.type_name,
             "runs": "boot loader" if self.is_loader else "application",

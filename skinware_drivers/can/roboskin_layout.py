@@ -126,7 +126,6 @@ def _inertial_frames(options: RoboskinOptions) -> list[Frame]:
 
 
 def make_types(options: RoboskinOptions) -> tuple[SensorType, ...]:
-    """The types of a bus' sensors."""
     found: dict[str, SensorType] = {}
     for inertial in options.all_inertial:
         for sensor in inertial:
@@ -145,7 +144,6 @@ def patch_key(message_class: int, board: int) -> int:
 
 
 def board_of(patch: Patch) -> int:
-    """Address of the board that a patch is on."""
     return patch.key & 0xF
 
 
@@ -166,7 +164,6 @@ def inertial_patch(board: int, inertial: Inertial) -> Patch:
 
 
 def skin_patch(board: int, modules: Sequence[Module], message_class: int) -> Patch:
-    """The triangles of a board."""
     return Patch(f"board {board}", modules, key=patch_key(message_class, board))
 
 

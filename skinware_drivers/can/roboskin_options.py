@@ -89,7 +89,6 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def sets_board(self) -> bool:
-        """Whether the boards are told another type of skin, period or no-load value."""
         return not (self.period_ms is None and self.skin_type is None and self.no_load is None)
 
 

@@ -89,7 +89,6 @@ class BoardSetUp:
         self.wiped: frozenset[int] = frozenset(wanted - self._on - named_off)
 
     def inertial_set_up(self) -> list[bytes]:
-        """IMU_CONFIG_SET, if the board has an IMU to configure."""
         mask = self._imu_mask
         return [bytes((0x33, mask, 0, _FUSION, 0, 0, 0, 0))] if mask else []
 
@@ -101,7 +100,6 @@ class BoardSetUp:
         return [bytes((0x4F, mask, self._inertial_period_ms))] if mask else []
 
     def inertial_stop(self) -> list[bytes]:
-        """What ends it."""
         if self._imu_mask:
             return [b"\x35\x00"]
         return [b"\x4f\x00\x00"] if self.inertial else []
@@ -158,7 +156,6 @@ class BoardSetUp:
                 self.special_triangles.append(self._triangles(first, last, enabled))
 
     def _alike(self, triangles: Iterable[int]) -> list[tuple[int, int]]:
-        """First and last of runs of triangles with the same settings."""
         settings: dict[tuple[int, int], list[int]] = {}
         for triangle in sorted(set(triangles)):
             settings.setdefault((self._shift[triangle], self._cdc_offset[triangle]), []).append(triangle)

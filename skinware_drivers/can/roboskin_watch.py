@@ -50,6 +50,3 @@ class BaselineWatch(Watch):
         """The board was set up anew, so its baseline is known again; it goes on counting, unless it had restarted."""
         super().forget(patch)
         self._counts[patch] |= _ZERO
-
-
-__all__ = ["BaselineWatch"]

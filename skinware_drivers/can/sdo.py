@@ -134,7 +134,6 @@ class _Object:
         self.address = struct.pack("<HB", index, subindex)
 
     def head(self, command: int) -> bytes:
-        """The first four bytes of a request."""
         return bytes([command]) + self.address
 
     def __str__(self) -> str:

@@ -202,7 +202,6 @@ class SocketCanBus(KernelBus):
         self._ask_kernel()
 
     def reason(self, time_ns: int) -> BusReason:
-        """What the controller tells is wrong."""
         return self._health.reason(time_ns)
 
     def fileno(self) -> int:
@@ -254,7 +253,6 @@ class SocketCanBus(KernelBus):
         return True
 
     def take_back(self, source: Source) -> None:
-        """Go on with what C code did meanwhile."""
         self._stamper.state = source.offset_ns, source.last_poll_ns
         self.counters.frames += source.frames
         self.counters.lost = source.lost
@@ -280,7 +278,6 @@ class SocketCanBus(KernelBus):
             self.tap.keep_frame(sent_ns, identifier, payload, flags=flags, is_sent=True)
 
     def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
-        """``struct canfd_frame``, filled up with zeros to the next length that CAN FD has."""
         length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
         if length is None:
             raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {_FD_LENGTHS[-1]}")
@@ -288,14 +285,12 @@ class SocketCanBus(KernelBus):
         return struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(_FD_LENGTHS[-1], b"\0")
 
     def close(self) -> None:
-        """Close the socket. Idempotent."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
             self._is_bound = False
 
     def _ask_kernel(self) -> None:
-        """Learn what error frames may not have told."""
         controller = read_controller(self.channel)
         if controller is None:
             return
@@ -398,5 +393,4 @@ def _why_not_bound(interface: str, error: OSError) -> BusNotAvailable:
 
 
 def _classic_frame(identifier: int, payload: bytes) -> bytes:
-    """``struct can_frame``."""
     return struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")

@@ -65,7 +65,6 @@ class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             known |= taken
 
     def identifiers(self, first: int) -> list[int]:
-        """The identifier of each taxel of a board."""
         if self.ids == "consecutive":
             return [first + taxel for taxel in range(self.rows * self.columns)]
         return [first | row << 4 | column for column in range(self.columns) for row in range(self.rows)]

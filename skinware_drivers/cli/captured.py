@@ -105,6 +105,3 @@ def _tell(capture: Path, compared: Comparison, as_json: bool) -> None:
         echo(style("equal", fg="green"))
     else:
         echo(f"{style('different', fg='red')} {difference}")
-
-
-__all__ = ["compare_capture"]

@@ -58,7 +58,6 @@ class Capture:
             raise ConfigurationError(f"{path}: {begun.get('problem', 'nothing can be recorded')}")
 
     def end(self) -> None:
-        """Complete the file. Idempotent."""
         if self._process.stdin is None or self._process.stdin.closed:
             return
         self._process.stdin.close()
@@ -137,6 +136,3 @@ def _say(**what: Any) -> None:
 
 if __name__ == "__main__":
     _record(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
-
-
-__all__ = ["Capture", "captured"]

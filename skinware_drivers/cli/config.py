@@ -107,7 +107,6 @@ def command(
 
 
 def _owner(target: str, namespace: str) -> tuple[RunningDriver | None, str | None]:
-    """The running driver that is meant or that has the bus that is meant, and its name for that bus."""
     from skinware_drivers.finding.running import driver_on, running_drivers
 
     drivers = running_drivers()
@@ -126,7 +125,6 @@ def _through_driver(
     timeout_s: float,
     yes: bool,
 ) -> dict[str, Any]:
-    """Let a running driver do it."""
     from skinware import DriverReader
     from skinware_drivers.operations import operations_of
     from skinware_drivers.options import nearest_name
@@ -163,7 +161,6 @@ def _without_driver(
     yes: bool,
     force: bool,
 ) -> dict[str, Any]:
-    """Do it ourselves."""
     from skinware_drivers.finding.running import driver_on, running_drivers
     from skinware_drivers.finding.without_driver import carry_out
     from skinware_drivers.operations import operations_of
@@ -193,7 +190,6 @@ def _without_driver(
 def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
-    """Name and object of the driver for a bus that has none running."""
     from skinware_drivers.options.file import ConfigFile
     from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver
 
@@ -242,14 +238,12 @@ def _pair(text: str) -> tuple[str, Any]:
 
 
 def _description(method: Any) -> str:
-    """What an operation does and takes."""
     first = (inspect.getdoc(method) or "").partition("\n")[0]
     takes = ", ".join(map(str, list(inspect.signature(method).parameters.values())[_OWN_PARAMETERS:]))
     return f"{first} Takes {takes.replace(chr(39), '')}" if takes else first
 
 
 def _lines(value: dict[str, Any], indent: str = "") -> list[str]:
-    """A result for people."""
     lines = []
     for key, one in value.items():
         if isinstance(one, dict) and any(isinstance(inner, dict | None) for inner in one.values()):
@@ -263,5 +257,4 @@ def _lines(value: dict[str, Any], indent: str = "") -> list[str]:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

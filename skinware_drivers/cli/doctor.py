@@ -74,7 +74,6 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
 
 
 def as_data(evidence: Evidence, found: Examination) -> dict[str, Any]:
-    """What was found, as ``--json`` prints it."""
     import msgspec
 
     findings = [
@@ -147,5 +146,4 @@ def _progress() -> Callable[[float], None]:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -90,6 +90,3 @@ def _wrapped(text: str, first: str, following: str) -> list[str]:
         else:
             lines.append(following + word)
     return lines
-
-
-__all__ = ["as_text"]

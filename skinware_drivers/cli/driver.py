@@ -53,7 +53,6 @@ class DriverCommand(HardwareCommand):
     """A command that also takes the options of the driver it is asked to run."""
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
-        """The options of the driver that the command line or the file names."""
         from skinware_drivers.cli.of_recording import driver_of_recording
         from skinware_drivers.loading import short_name
         from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
@@ -399,5 +398,4 @@ def _read(path: Path | None) -> ConfigFile:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def tell_ready(runner: Runner, as_json: bool) -> None:
-    """Frames are being published."""
     from skinware_drivers.running.figures import path_figures
 
     if runner.generation is None:

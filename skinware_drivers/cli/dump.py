@@ -25,7 +25,6 @@ _OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "coun
 
 
 def dump(raw: str | None, **options: Any) -> None:
-    """Frames of a driver, or of a bus."""
     if raw is None:
         click.get_current_context().invoke(frames_command, **options)
         return
@@ -98,7 +97,6 @@ def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
 
 
 def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[FrameBatch]:
-    """What arrives, at once and indefinitely."""
     from skinware.errors import BusError
     from skinware_drivers.bus import FrameBatch
 
@@ -149,5 +147,4 @@ command: click.Command = click.Command(
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

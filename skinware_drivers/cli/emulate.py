@@ -29,7 +29,6 @@ class EmulateCommand(HardwareCommand):
     """The command with the options of the chosen emulator beside its own."""
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
-        """The options of the emulator that the command line names."""
         from skinware_drivers.loading import short_name
         from skinware_drivers.virtual.hardware import load_emulator
 
@@ -148,7 +147,6 @@ def _write_geometry(path: Path, hardware: PlacedHardware, driver: str) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)
 
 

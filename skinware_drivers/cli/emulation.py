@@ -44,7 +44,6 @@ class JsonReport:
         self._stream = stream
 
     def event(self, name: str, **facts: Any) -> None:
-        """Write one line at once."""
         self._stream.write(json_text({"event": name, **facts}) + "\n")
         self._stream.flush()
 
@@ -56,7 +55,6 @@ class HumanReport:
         self._stream = stream
 
     def event(self, name: str, **facts: Any) -> None:
-        """Write one line, or nothing for the status."""
         if name == "status":
             return
         if name == "ready":
@@ -94,7 +92,6 @@ class SignalWatch:
         self._writer.close()
 
     def fileno(self) -> int:
-        """Readable once a signal came."""
         return self._reader.fileno()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - a signal handler's arguments
@@ -256,12 +253,8 @@ class Emulation:
 
 
 def wait_readable(descriptors: list[int], timeout_s: float | None) -> None:
-    """Wait until one of the descriptors is readable, at most ``timeout_s``, rounded up to a millisecond."""
     poll = select.poll()
     for descriptor in descriptors:
         poll.register(descriptor, select.POLLIN)
     with contextlib.suppress(InterruptedError):
         poll.poll(None if timeout_s is None else timeout_s * 1000)
-
-
-__all__ = ["Emulation", "HumanReport", "JsonReport", "Report", "SignalWatch", "Stop", "wait_readable"]

@@ -270,5 +270,4 @@ def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

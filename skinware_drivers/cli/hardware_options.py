@@ -41,7 +41,6 @@ class HardwareCommand(click.Command):
         return super().parse_args(ctx, args)
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """The command's own options, then those of the hardware."""
         _, theirs = ctx.meta.get(_HARDWARE_OPTIONS, ("", []))
         return [*super().get_params(ctx), *theirs]
 

@@ -154,7 +154,6 @@ def _configuration(part: ImportedPart, root: str, geometry: str = "") -> str:
 
 
 def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) -> list[dict[str, str]]:
-    """Write all files or, where one is in the way, none."""
     texts: dict[Path, str] = {}
     written = []
     for part in parts:
@@ -202,5 +201,4 @@ def _report(notes: Sequence[Note], verbose: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

@@ -66,5 +66,4 @@ def command(name: str, transport: str) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

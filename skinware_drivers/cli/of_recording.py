@@ -10,7 +10,6 @@ if TYPE_CHECKING:
 
 
 def driver_of_recording(bus_names: Sequence[str]) -> str:
-    """The driver whose wire was recorded, if that is what these buses are."""
     found = (recorded.driver_type for recorded in map(_recorded, bus_names) if recorded is not None)
     return next(filter(None, found), "")
 
@@ -22,7 +21,6 @@ def only_listened(bus_names: Sequence[str]) -> bool:
 
 
 def options_of_recording(bus_name: str, driver_type: str) -> Mapping[str, Any]:
-    """The options that a driver had when its wire was recorded."""
     recorded = _recorded(bus_name)
     return recorded.options if recorded is not None and recorded.driver_type == driver_type else {}
 
@@ -34,6 +32,3 @@ def _recorded(bus_name: str) -> Recorded | None:
     from skinware_drivers.virtual.recorded import recorded_driver
 
     return recorded_driver(bus_name)
-
-
-__all__ = ["driver_of_recording", "only_listened", "options_of_recording"]

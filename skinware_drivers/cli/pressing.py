@@ -47,7 +47,6 @@ class PressingService:
         self._writer.request_server()  # from now on, not from the first turn of the loop on
 
     def fileno(self) -> int:
-        """Readable when a program asks for something."""
         return self._writer.request_server().fileno()
 
     def step(self, now_ns: int) -> int:
@@ -72,7 +71,6 @@ class PressingService:
         return {self._bus_name: self._hardware.press(pressing, clock_ns())}
 
     def close(self) -> None:
-        """Withdraw it."""
         self._writer.close()
 
     def _publish(self, now_ns: int) -> None:
@@ -82,6 +80,3 @@ class PressingService:
         for row, (point_m, force_n) in enumerate(found):
             columns["point_m"][row], columns["force_n"][row] = point_m, force_n
         self._writer.commit(now_ns)
-
-
-__all__ = ["PressingService"]

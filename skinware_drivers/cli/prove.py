@@ -302,11 +302,9 @@ class _AtTerminal:
 
     @property
     def meanwhile(self) -> str:
-        """What was asked for last, as the end of a sentence."""
         return f", while it asked: {self._asked.text}" if self._asked else ""
 
     def ask(self, step: Step) -> None:
-        """Print it."""
         self._asked = step
         if self._as_json:
             print_json({"event": "step", "wanted": step.wanted, "module": step.module, "text": step.text})
@@ -314,7 +312,6 @@ class _AtTerminal:
             echo(f"> {style(step.text, bold=True)}")
 
     def skips(self) -> bool:
-        """Whether a line says so."""
         is_skipped = False
         while self._is_there and select.select([sys.stdin], [], [], 0)[0]:
             line = sys.stdin.readline()
@@ -340,5 +337,4 @@ def _tell(proof: Proof, files: ProofFiles, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     run(command)

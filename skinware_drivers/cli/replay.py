@@ -28,7 +28,6 @@ _PAYLOAD = 64
 
 
 def replay(wire: bool, buses: tuple[str, ...], **options: Any) -> None:
-    """Services, or wires."""
     if not wire:
         if buses:
             raise click.UsageError("--bus is for --wire")
@@ -150,7 +149,6 @@ class WireSender:
             bus.open()
 
     def close(self) -> None:
-        """Close them. Idempotent."""
         for _, bus in self._pairs:
             bus.close()
 
@@ -234,5 +232,4 @@ command: click.Command = click.Command(
 
 
 def main() -> None:
-    """Entry point."""
     run(command, goes_on=True)

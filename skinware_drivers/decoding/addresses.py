@@ -69,7 +69,6 @@ class Addresses:
             self.sets[row, list(kinds)] = True
 
     def slots(self, bus: npt.NDArray[np.uint16], identifier: npt.NDArray[np.uint32]) -> Indices:
-        """(n,) slot of each frame."""
         slots: Indices = bus * np.int64(STANDARD_IDENTIFIERS) + identifier
         if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
             rows = np.flatnonzero(identifier >= STANDARD_IDENTIFIERS)
@@ -152,7 +151,6 @@ class _Form:
         self.patch_codes, self.patch_slots = _sorted(self._anyone)
 
     def look_up(self, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
-        """Fill in the slots of those of ``rows`` whose identifiers are of this form."""
         match = bus == self.bus
         match &= (identifier & EXTENDED_FLAG) != 0
         for condition in self.conditions:

@@ -202,7 +202,6 @@ class Decoder:
             cycle.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
-        """Count frames of a batch as unknown identifiers."""
         bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]
         self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
         self.keep_samples(Unused.UNKNOWN, batch.bus, batch.wire, rows)
@@ -313,7 +312,6 @@ class Decoder:
         return kind, rows
 
     def _name_known_modules(self, kind: Bytes, entry: Indices, payload: Bytes, length: Bytes) -> Flags:
-        """(n,) False for frames whose payload names a module, and one that is not known."""
         known = np.ones(len(kind), bool)
         for number, compiled in enumerate(self.kinds):
             bits = compiled.frame.module_byte
@@ -369,7 +367,6 @@ class Decoder:
         self.tell_of_haste()
 
     def tell_of_haste(self) -> None:
-        """Tell of patches that send too fast, once of each."""
         for patch in np.flatnonzero(self.haste > _MUCH_HASTE).tolist():
             self.haste[patch] = _NEVER_AGAIN
             log.warning(
@@ -388,7 +385,6 @@ class Decoder:
     def _read(
         self, assembly: Assembly, batch: FrameBatch, rows: Indices, module: Indices, whole: Flags | None = None
     ) -> tuple[Updates, Indices]:
-        """Updates, and the last row of each."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
         values = np.zeros((len(rows), self.width), self.state.values.dtype)
         status = np.zeros((len(rows), self.width), np.uint8)

@@ -39,7 +39,6 @@ class DeviceStamps:
 
     @property
     def are_told(self) -> bool:
-        """Whether there is anything to tell."""
         return bool(self._times)
 
     def tell(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
@@ -71,7 +70,6 @@ class DeviceStamps:
                 self._warn(number)
 
     def forget(self, patch: int) -> None:
-        """A patch has restarted, and its clock with it."""
         self.clocks.pop(patch, None)
 
     def _warn(self, patch: int) -> None:

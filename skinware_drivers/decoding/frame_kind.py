@@ -166,7 +166,6 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
 
 
 def _hit(flag: Sentinel | Above, raw: npt.NDArray[Any]) -> Flags:
-    """Which values a flag means."""
     if isinstance(flag, Above):
         above: Flags = raw > flag.limit
         return above

@@ -98,6 +98,3 @@ class Groups:
         first, *others = found.items()
         groups = [(first[0], np.array(sorted([*first[1], *never]), np.int64))]
         return groups + [(carried_by, np.array(own, np.int64)) for carried_by, own in others]
-
-
-__all__ = ["Carrier", "Groups"]

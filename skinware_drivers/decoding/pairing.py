@@ -152,7 +152,6 @@ class Pairing:
         return self._trust(np.flatnonzero(whole), out_of_time, doubtful)
 
     def _apart(self, starts: Indices) -> Indices:
-        """Of runs that overlap, the first."""
         if len(starts) < 2 or np.diff(starts).min() >= self._n:
             return starts
         chosen: list[int] = []

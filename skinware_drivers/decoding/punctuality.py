@@ -96,7 +96,6 @@ class Punctuality:
         self.last_ns[kind] = time_ns
 
     def forget(self, modules: Indices) -> None:
-        """These modules have restarted, and their time with them."""
         kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
         self.last_ns[kinds] = _NEVER_NS
         self.spacings_ns[kinds] = self.period_ns

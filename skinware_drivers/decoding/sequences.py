@@ -65,7 +65,6 @@ class Sequences:
         return self._by_patch(module, skipped), self._by_patch(module, step == 0), self._by_patch(module, is_back)
 
     def forget(self, patch: int) -> None:
-        """A patch has restarted, and its numbers with it."""
         self.last[self._module_patch == patch] = _NONE_YET
 
     def _by_patch(self, module: Indices, count: Indices | npt.NDArray[np.bool_]) -> Indices:

@@ -18,7 +18,6 @@ _PULLED = "how-to/two-machines.md#what-the-link-cannot-take"
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of bridges."""
     for bridge in evidence.bridges:
         yield Looked(AREA, f"robot {bridge.robot}", summary(bridge.robot, as_data(bridge)))
         if not bridge.is_up:
@@ -81,6 +80,3 @@ def _namesakes(bridge: BridgeState) -> Finding:
         "give each robot a name of its own: skin-bridge serve --robot NAME",
         see=_PAGE,
     )
-
-
-__all__ = ["check"]

@@ -185,7 +185,6 @@ _LOSSES = {
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of the buses of all drivers."""
     for driver in evidence.drivers:
         for bus in driver.buses:
             yield Looked(AREA, f"{driver.name}: {brief(bus.name)}", _as_seen(bus))
@@ -258,7 +257,6 @@ def _state(bus: BusSeen, driver: DriverSeen, evidence: Evidence) -> Iterator[Fin
 
 
 def _away_s(bus: BusSeen, end_s: float) -> float:
-    """For how long it was not there, or nothing was heard on it."""
     ends = [*(change.time_s for change in bus.changes[1:]), end_s]
     return sum(end - one.time_s for one, end in zip(bus.changes, ends, strict=True) if one in _absences(bus))
 
@@ -321,7 +319,6 @@ def _foreign(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
 
 
 def _shared(evidence: Evidence) -> Iterator[Finding]:
-    """Drivers that have one bus between them."""
     told: set[frozenset[tuple[str, str]]] = set()
     have_buses = {(one.namespace, one.name) for one in evidence.running}
     for driver in [one for one in evidence.drivers if (one.namespace, one.name) in have_buses]:
@@ -348,7 +345,6 @@ def _port(bus_name: str, evidence: Evidence) -> SerialPort | None:
 
 
 def _port_text(port: SerialPort) -> str:
-    """Who may open a port and who has it."""
     parts = [] if port.may_open else [f"this account may not open {port.path} (group {port.group or 'none'})"]
     parts += [f"{user.program} (pid {user.pid}) has it open" for user in port.users]
     return "; ".join(parts) or f"{port.path} is there"
@@ -356,6 +352,3 @@ def _port_text(port: SerialPort) -> str:
 
 def _span(seconds: float) -> str:
     return age_text(seconds * 1e9)
-
-
-__all__ = ["check"]

@@ -51,7 +51,6 @@ class _Growth:
             self.hours[hour] = self.hours.get(hour, 0) + by
 
     def counted(self, row: int, *, by_hour: bool) -> Counted:
-        """Of one bus or patch."""
         hours = sorted(self.hours.items()) if by_hour else ()
         return Counted(
             self._named(self.now[row]),
@@ -244,6 +243,3 @@ class DriverLog:
         found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
         found[self.structure.sensor_module[~is_dark]] = False
         return found if self.newest is None else found | self.newest.module_untouched
-
-
-__all__ = ["DriverLog"]

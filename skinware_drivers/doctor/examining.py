@@ -62,7 +62,6 @@ def examine(evidence: Evidence) -> Examination:
 
 
 def _clean(note: Note, evidence: Evidence) -> Note:
-    """With texts that may be printed (names come from files and devices), and commands that fit."""
     fits = bool if evidence.is_live else _is_of_any_time
     texts: dict[str, Any] = {name: printable(value) for name, value in vars(note).items() if isinstance(value, str)}
     if not isinstance(note, Looked):
@@ -86,6 +85,3 @@ def _is_of_any_time(command: str) -> bool:
 
 def _of(kind: type[_NoteT], notes: list[Note]) -> list[_NoteT]:
     return [note for note in notes if isinstance(note, kind)]
-
-
-__all__ = ["CHECKS", "Examination", "examine"]

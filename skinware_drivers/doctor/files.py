@@ -18,7 +18,6 @@ _FORGOTTEN_S = 600.0
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of files."""
     others = [one for one in evidence.namespaces if not one.is_ours and not one.problem]
     for namespace in evidence.namespaces:
         if namespace.is_ours and not namespace.problem:
@@ -69,7 +68,6 @@ def _left(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _forgotten(evidence: Evidence) -> Iterator[Finding]:
-    """Other namespaces in which nothing lives."""
     found = [
         one
         for one in evidence.namespaces
@@ -157,6 +155,3 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
             "see the events of the recording",
             see="reference/recording.md#events",
         )
-
-
-__all__ = ["check"]

@@ -75,6 +75,3 @@ class NotLooked:
 
 
 Note = Finding | Looked | NotLooked
-
-
-__all__ = ["Finding", "Looked", "NotLooked", "Note", "Severity"]

@@ -32,7 +32,6 @@ _DROPS = {
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of interfaces and ports."""
     if not evidence.is_live:
         yield NotLooked(AREA, "interfaces", "a recording does not tell of them", ("skin-doctor",))
         return
@@ -150,6 +149,3 @@ def _port(port: SerialPort, evidence: Evidence) -> Iterator[Finding]:
             (f"ps -p {user.pid} -o args",),
             _PROBLEM,
         )
-
-
-__all__ = ["check"]

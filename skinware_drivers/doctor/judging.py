@@ -50,7 +50,6 @@ class TaxelJudge:
             self._health.update(frame.acquired_ns)
 
     def seen(self) -> HealthSeen:
-        """What is known now."""
         if self._why_not or not self._health:
             return HealthSeen("", 0, (), {"health": self._why_not or "it has no such sensors"})
         faults: list[TaxelFault] = []
@@ -85,6 +84,3 @@ def _faults(
         )
         for row in np.flatnonzero(report.faulty).tolist()
     ]
-
-
-__all__ = ["TaxelJudge"]

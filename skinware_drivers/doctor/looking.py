@@ -56,6 +56,3 @@ def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
         return ()
     finally:
         live.close()
-
-
-__all__ = ["look"]

@@ -56,6 +56,3 @@ def _hours(counted: Counted, name: str, evidence: Evidence) -> str:
 
 def _span(evidence: Evidence) -> str:
     return age_text(evidence.seconds * 1e9)
-
-
-__all__ = ["Told", "lost_text"]

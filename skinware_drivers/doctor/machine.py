@@ -18,7 +18,6 @@ _GIB = 1 << 30
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of the machine."""
     machine = evidence.machine
     versions = ", ".join(f"{name} {number}" for name, number in machine.versions.items())
     if evidence.recording is not None:
@@ -112,6 +111,3 @@ def _packets(evidence: Evidence) -> Iterator[Note]:
             ("sudo sysctl net.core.netdev_max_backlog=10000",),
             "troubleshooting.md#data-is-missing",
         )
-
-
-__all__ = ["check", "circumstances"]

@@ -35,6 +35,3 @@ def _lines(bad: npt.NDArray[np.bool_]) -> list[str]:
         return []
     rows, columns = (np.flatnonzero(bad.all(axis=axis)).tolist() for axis in (1, 0))
     return [*(f"row {row}" for row in rows), *(f"column {column}" for column in columns)]
-
-
-__all__ = ["whole_lines"]

@@ -17,7 +17,6 @@ def brief(bus_name: str) -> str:
 
 
 def _placed(bus_name: str) -> str:
-    """A bus' name with only those options that say which bus it is."""
     address, _, query = bus_name.partition("?")
     placing = dict(place_of_bus(bus_name).options)
     kept = "&".join(part for part in query.split("&") if part.partition("=")[0] in placing)
@@ -50,6 +49,3 @@ def has_operation(driver_type: str, operation: str) -> bool:
         return operation in operations_of(load_driver(driver_type), alone=True)
     except ConfigurationError:
         return False
-
-
-__all__ = ["brief", "has_operation", "typed"]

@@ -45,7 +45,6 @@ _LOSSES = {
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of the patches of all drivers."""
     for driver in evidence.drivers:
         if not driver.patches:
             continue
@@ -117,7 +116,6 @@ def _states(driver: DriverSeen) -> Iterator[Finding]:
 
 
 def _asking(driver: DriverSeen, patch: PatchSeen) -> tuple[str, ...]:
-    """How to see whether it answers."""
     if has_operation(driver.driver_type, "versions"):
         return (f"skin-config {driver.name} versions",)
     return typed(("skin-info {driver}", "skin-find {name}"), patch.bus, driver.name)
@@ -144,7 +142,6 @@ def _flapping(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
 
 
 def _losses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
-    """What each patch lost, kind by kind, the patch that lost most first."""
     for name, loss in _LOSSES.items():
         told = [
             (one.is_going_on, patch.counted.grown.get(name, 0), patch, one)
@@ -244,6 +241,3 @@ def _sent(driver: DriverSeen) -> dict[str, float]:
             whole = counts.get("updates", 0) + counts.get("orphans", 0) / frames_of_one
             found[patch.name] = whole / patch.modules
     return found
-
-
-__all__ = ["check"]

@@ -12,7 +12,6 @@ _SERVICES, _REALTIME = "how-to/services-and-permissions.md", "how-to/realtime.md
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of permissions."""
     if not evidence.is_live:
         yield NotLooked(AREA, "permissions", "a recording does not tell of them", ("skin-doctor",))
         return
@@ -50,6 +49,3 @@ def check(evidence: Evidence) -> Iterator[Note]:
     locked = machine.locked_memory_bytes
     yield Looked(AREA, "locked memory", "unlimited" if locked < 0 else f"up to {locked // 1024} KiB")
     yield Looked(AREA, "groups", ", ".join(machine.groups) or "none that has a name")
-
-
-__all__ = ["check"]

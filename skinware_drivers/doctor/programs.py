@@ -26,7 +26,6 @@ class ReadersWatch:
         self._before = self._look()
 
     def seen(self) -> tuple[ReaderSeen, ...]:
-        """Those that were there all the time, and want every frame."""
         found = []
         for key, record in self._look().items():
             before = self._before.get(key)
@@ -66,6 +65,3 @@ def program_of(pid: int, proc: Path = _PROC) -> str:
         return (proc / str(pid) / "comm").read_text(errors="replace").strip()
     except OSError:
         return ""
-
-
-__all__ = ["ReadersWatch", "program_of", "publishes_again", "waiting_drivers"]

@@ -98,7 +98,6 @@ def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
 
 
 def _lost_in(event: dict[str, Any]) -> int:
-    """Frames that an event says were lost."""
     count = event.get("count")
     return count if event.get("event") == "lost" and isinstance(count, int) else 0
 
@@ -220,7 +219,6 @@ class _DriverTrack:
 
 
 def _unknown(log: DriverLog) -> Any:
-    """The status of sensors of which nothing is to be said."""
     import numpy as np
 
     return np.full(log.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
@@ -244,6 +242,3 @@ def _after(part: _PartT, earlier: _PartT) -> _PartT:
 
 def _sum(one: Counts, other: Counts) -> Counts:
     return {name: one.get(name, 0) + other.get(name, 0) for name in {*one, *other}}
-
-
-__all__ = ["look_at"]

@@ -97,6 +97,3 @@ def _counted(counted: Counted) -> str:
 
 def _some(counts: Counts) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-
-
-__all__ = ["as_markdown"]

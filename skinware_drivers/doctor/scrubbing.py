@@ -111,6 +111,3 @@ class Disguise:
 
 def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
     return sorted(of.items(), key=lambda pair: -len(pair[0]))
-
-
-__all__ = ["Disguise", "Secrets", "scrubbed"]

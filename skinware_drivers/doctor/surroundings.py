@@ -52,7 +52,6 @@ class MachineWatch:
         self._clock_s = _clock_offset_s()
 
     def seen(self) -> MachineSeen:
-        """What was seen."""
         softnet, memory = softnet_dropped(), _memory()
         total, free, problem = _shared_memory()
         return MachineSeen(
@@ -77,7 +76,6 @@ class MachineWatch:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that matter and are installed."""
     found = {"skinware": "", "Python": f"{platform.python_version()} ({platform.python_implementation()})"}
     for name in _PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
@@ -184,6 +182,3 @@ def _text(path: Path) -> str:
         return path.read_text(errors="replace").strip()
     except OSError:
         return ""
-
-
-__all__ = ["MachineWatch", "interfaces_seen", "namespaces_seen", "versions"]

@@ -50,7 +50,6 @@ _BY_STATUS = {
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of the taxels of all drivers."""
     for driver in evidence.drivers:
         told = ", ".join(f"{count_text(n)} {name.replace('_', ' ')}" for name, n in driver.statuses.items() if n)
         untouched = f"; {_only_zero(len(driver.dark))}: {_dark_names(driver)}" if _is_idle(driver) else ""
@@ -199,6 +198,3 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
                 _CALIBRATION,
             )
     yield NotLooked(AREA, swapped, "only strokes over the skin tell", by_strokes)
-
-
-__all__ = ["check"]

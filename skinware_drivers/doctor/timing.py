@@ -22,7 +22,6 @@ _SET_S = 0.1
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
-    """What is to be said of times."""
     for driver in evidence.drivers:
         yield Looked(AREA, f"driver {driver.name}", _as_seen(driver, evidence))
         yield from _life(driver)
@@ -55,7 +54,6 @@ def _as_seen(driver: DriverSeen, evidence: Evidence) -> str:
 
 
 def _nobody(evidence: Evidence) -> Iterator[Finding]:
-    """No driver has published anything."""
     elsewhere = [str(one) for one in evidence.running]
     told = f"; elsewhere: {', '.join(elsewhere)}" if elsewhere else ""
     if evidence.waiting:
@@ -75,7 +73,6 @@ def _nobody(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _readers(evidence: Evidence) -> Iterator[Note]:
-    """Programs that want every frame, and do not keep up."""
     for one in evidence.readers:
         yield Looked(AREA, f"reader {one.program}", f"{one.frames} frames of {one.driver} taken, {one.lost} missed")
         if one.lost:
@@ -226,6 +223,3 @@ def _clock(driver: DriverSeen) -> Iterator[Finding]:
             (f"skin-info {driver.name}",),
             _TIME,
         )
-
-
-__all__ = ["check"]

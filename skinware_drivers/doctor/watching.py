@@ -108,7 +108,6 @@ class _DriverWatch:
             self._judge.take(frame)
 
     def seen(self) -> DriverSeen:
-        """What came of it."""
         reader, log = self._reader, self._log
         frame = self._newest
         life = life_of(reader, frame)
@@ -158,7 +157,6 @@ class _DriverWatch:
 
 
 def _nothing() -> WriterStatistics:
-    """What a writer tells that has just begun."""
     return WriterStatistics(0, 0, 0, 0, Spread(), Spread(), Histogram(), Histogram())
 
 
@@ -195,6 +193,3 @@ def _calm_health(entry: Mapping[str, Any]) -> HealthSeen:
         missing["dead and weak taxels"] = f"nothing has touched {kinds['never_touched']:,} of {judged:,} so far"
     faults = tuple(TaxelFault(one["name"], one["kind"], one["evidence"]) for one in entry["faults"])
     return HealthSeen("skin-calm", judged, faults, missing)
-
-
-__all__ = ["watch"]

@@ -168,7 +168,6 @@ def _has_no_values(frame: Frame) -> bool:
 
 
 def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """(n,) key of the patch that each frame would be of."""
     patch: object = frame.patch
     if isinstance(patch, Bits):
         return identifier.astype(np.int64) >> patch.shift & ((1 << patch.width) - 1)
@@ -218,5 +217,4 @@ async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> S
 
 
 def likely(guesses: Iterable[Guess]) -> list[Guess]:
-    """Those that are more than a possibility."""
     return [one for one in guesses if one.likely]

@@ -91,7 +91,6 @@ class CanInterface:
 
 
 def kernel_has_can() -> bool:
-    """Whether sockets of the family CAN can be made at all."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:

@@ -80,7 +80,6 @@ class SerialPort:
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
         if self.usb is None:
             return "pseudo terminal" if Path(self.path).parent.name == "pts" else "built-in port"
         return " ".join(part for part in (self.usb.manufacturer, self.usb.product) if part) or "USB serial device"

@@ -35,7 +35,6 @@ class RunningDriver:
     buses: tuple[str, ...]
 
     def bus_named(self, bus_name: str) -> str | None:
-        """Its own name for a bus, None if it has no such bus."""
         return next((own for own in self.buses if same_bus(own, bus_name)), None)
 
     def __str__(self) -> str:
@@ -59,7 +58,6 @@ def running_drivers() -> list[RunningDriver]:
 
 
 def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver | None:
-    """The driver that has a bus."""
     return next((driver for driver in drivers if driver.bus_named(bus_name) is not None), None)
 
 

@@ -47,7 +47,6 @@ class Traffic:
         self._wire: list[npt.NDArray[Any]] = []
 
     def take(self, batch: FrameBatch) -> None:
-        """Take in what a batch holds."""
         wire = batch.wire[batch.start : batch.stop]
         self.frames += len(wire)
         if self._kept < _MOST_KEPT:
@@ -59,7 +58,6 @@ class Traffic:
         return np.concatenate(self._wire) if self._wire else FrameBatch(0).wire
 
     def classes(self) -> list[IdentifierClass]:
-        """What there was, by class of identifier."""
         identifier = self.wire()["identifier"]
         extended = (identifier & EXTENDED_FLAG) != 0
         number = np.where(extended, 1 << 11 - _CLASS_BITS, identifier >> _CLASS_BITS)

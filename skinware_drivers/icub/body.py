@@ -57,7 +57,6 @@ def read_body(
     drawings: Mapping[str, Drawing],
     notes: Notes,
 ) -> Body:
-    """Put position files and drawings, by name of the body part, on the boards of a part."""
     body = Body()
     for port in ports:
         channels = triangles_of(part, port, notes)
@@ -69,7 +68,6 @@ def read_body(
 
 
 def triangles_of(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
-    """Place of every triangle of a port, by its number in the body part."""
     order = part.host_order
     triangles: dict[int, Place] = {}
     for index in range(port.first, port.last + 1):
@@ -169,17 +167,12 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
 
 
 def places_of(part: Part, ports: Sequence[Port]) -> dict[str, set[Place]]:
-    """All places of each body part."""
     quiet = Notes()
     return {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
 
 
 def places_text(places: Sequence[Place] | set[Place]) -> str:
-    """Places as people read them."""
     boards: dict[tuple[int, int], list[int]] = {}
     for patch, board, triangle in sorted(places):
         boards.setdefault((patch, board), []).append(triangle)
     return "; ".join(f"patch {p} board {b}: {runs_text(triangles)}" for (p, b), triangles in boards.items())
-
-
-__all__ = ["Body", "Place", "check_drawings", "places_of", "places_text", "read_body", "triangles_of"]

@@ -67,7 +67,6 @@ class DeviceReader:
             yield from self._devices(root, [path.resolve()])
 
     def group_of(self, device: Element) -> Group:
-        """What is in a device."""
         group = Group(device)
         device.understood = True
         self._fill(group, device, [device.file.resolve()], [0])
@@ -187,6 +186,3 @@ def _find(target: str, near: Path) -> Path | None:
         except (OSError, ValueError):  # a name that no file can have
             return None
     return None
-
-
-__all__ = ["DeviceReader", "Group"]

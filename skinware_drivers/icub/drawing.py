@@ -99,6 +99,3 @@ def _take_sensor(drawing: Drawing, words: list[str]) -> str:
         return ""
     drawing.shapes[triangle] = _KINDS.get(words[0])
     return "" if words[0] in _KINDS else f"a module of the kind {words[0]!r}, which is not known here"
-
-
-__all__ = ["Drawing", "Shape", "is_drawing", "read_drawing"]

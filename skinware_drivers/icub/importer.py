@@ -72,7 +72,6 @@ class ImportedPart:
         return configuration_text(self.name, self.buses, "\n".join(lines), geometry)
 
     def geometry(self) -> str:
-        """The text of its geometry file."""
         lines = f"Places of the sensors of {self.name}, made by skin-import: its driver publishes them."
         return geometry_to_toml(self.groups, lines)
 
@@ -90,7 +89,6 @@ class ImportedPart:
         return yarp_configuration_text(self.name, buses, lines, geometry)
 
     def yarp_geometry(self) -> str:
-        """The text of a geometry file for that."""
         groups = [
             msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
             for bus, port in enumerate(self.yarp)
@@ -108,11 +106,9 @@ class ImportedPart:
         return regions_to_toml(regions, f"Ports of {self.name} as regions, made by skin-import.")
 
     def regions_text(self) -> str:
-        """The text of its file of regions."""
         return regions_to_toml(self.regions, f"Body parts of {self.name} as regions, made by skin-import.")
 
     def figures(self) -> dict[str, object]:
-        """For programs."""
         return {
             "name": self.name,
             "device": self.part.name,
@@ -201,7 +197,6 @@ def import_files(
 
 
 def _gather(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes) -> None:
-    """Find out what a file is, or what is in a folder."""
     if not path.is_dir():
         _take(path, reader, sources, notes)
         return
@@ -239,7 +234,6 @@ def _take(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes, *, 
 
 
 def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
-    """The skin devices, or those of them that were named."""
     found = [device for device in devices if device.attributes.get("type") in DEVICE_TYPES]
     if not found:
         raise ConfigurationError(f"no device of type {' or '.join(DEVICE_TYPES)} in what was read")
@@ -279,7 +273,6 @@ class _Wrappers:
         return wrapper.ports
 
     def name_unused(self, notes: Notes) -> None:
-        """Name the wrappers without a device, and other devices that have to do with skin."""
         for element, wrapper, _ in self._wrappers:
             if id(element) not in self._used:
                 text = f"there is no skin device {wrapper.device!r}; its ports are not used"
@@ -310,7 +303,6 @@ class _BodyFiles:
         self._used: set[Path] = set()
 
     def of_ports(self, ports: Sequence[Port]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
-        """What there is of a device's body parts."""
         positions, drawings = {}, {}
         for port in ports:
             path = self._chosen.get(port.name) or self._positions_of(port)
@@ -351,7 +343,6 @@ class _BodyFiles:
         return candidates[0] if candidates else None
 
     def _drawing_of(self, port: Port) -> Drawing | None:
-        """By what the drawing itself says."""
         found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
         self._used.update(drawing.path for drawing, _ in found)
         if len(found) > 1:
@@ -363,6 +354,3 @@ class _BodyFiles:
 
     def _note(self, port: Port, level: Level, text: str) -> None:
         self._notes.add(level, port.element.file, text, line=port.element.line, element=port.element.label)
-
-
-__all__ = ["Import", "ImportedPart", "import_files"]

@@ -52,16 +52,10 @@ class Notes:
         self._notes: dict[Note, None] = {}
 
     def add(self, level: Level, file: Path | str, text: str, *, line: int = 0, element: str = "") -> None:
-        """Note something."""
         self._notes[Note(level, shown(file), line, shown(element), shown(text))] = None
 
     def take(self, other: Notes) -> None:
-        """Add all of another's."""
         self._notes.update(other._notes)
 
     def all(self) -> list[Note]:
-        """All of them."""
         return list(self._notes)
-
-
-__all__ = ["Level", "Note", "Notes", "shown"]

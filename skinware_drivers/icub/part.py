@@ -206,7 +206,6 @@ class _PartReader(Reader):
         self.note("odd", self._part.element, f"no usable {name!r}; taken to be {value}, {_HOST_DEFAULTS}")
 
     def _sets(self, group_name: str, prefix: str, columns: str) -> list[tuple[Element, list[int]]]:
-        """The numbered sets of a group, as many as it says it has."""
         group = self._group.groups.get(group_name)
         if group is None:
             return []
@@ -271,7 +270,6 @@ class _PartReader(Reader):
                 )
 
     def _patch_of(self, element: Element, number: int) -> int:
-        """The patch that a set is for."""
         if self._part.device_type == ETHERNET:
             return number
         if self._can_device not in (None, number) and number not in self._other_patches:
@@ -345,16 +343,3 @@ def _elements_of(group: Group) -> list[Element]:
     found += [element for elements in group.lists.values() for element in elements]
     found += [element for other in group.others for element in other.walk()]
     return found
-
-
-__all__ = [
-    "CAN",
-    "DEVICE_TYPES",
-    "ETHERNET",
-    "OLD_DEFAULTS",
-    "BoardSet",
-    "OldBoard",
-    "Part",
-    "TriangleSet",
-    "read_part",
-]

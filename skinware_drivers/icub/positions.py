@@ -120,7 +120,6 @@ def _poses(body: str, line_before: int, path: Path, notes: Notes) -> list[Pose |
 
 
 def _pose(line: str) -> tuple[Pose | None, str]:
-    """The numbers of a line, or why they are none."""
     words = line.replace(",", " ").split()
     try:
         numbers = [float(word) for word in words]
@@ -141,7 +140,6 @@ def _pose(line: str) -> tuple[Pose | None, str]:
 
 
 def _fit(path: Path, frame: str, representatives: list[int], poses: list[Pose | None], notes: Notes) -> Positions:
-    """Both lists at one length, which is a whole number of triangles."""
     count = max(len(representatives), len(poses)) // CHANNELS * CHANNELS
     if not count:
         raise ConfigurationError(f"{path}: no whole triangle in taxel2Repr and [calibration]")
@@ -155,6 +153,3 @@ def _fit(path: Path, frame: str, representatives: list[int], poses: list[Pose | 
     if None in normals:
         notes.add("info", path, f"{normals.count(None)} of {len(normals)} places have no normal")
     return Positions(path, frame, tuple(tactile), tuple(poses))
-
-
-__all__ = ["Positions", "is_positions", "read_positions", "read_text"]

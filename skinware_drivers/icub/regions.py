@@ -37,6 +37,3 @@ def regions_of(
             patch_names = tuple(f"board {board}" for board in sorted(by_name))
             regions.append(Region(name, "pressure", (driver,), tuple(by_uid), patch_names))
     return regions
-
-
-__all__ = ["regions_of"]

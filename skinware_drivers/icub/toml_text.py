@@ -84,6 +84,3 @@ def _value(value: Any, name: str = "") -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(_value(item) for item in value)}]"
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
-
-
-__all__ = ["configuration_text", "yarp_configuration_text"]

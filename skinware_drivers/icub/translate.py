@@ -98,7 +98,6 @@ def translate(
 
 
 def enabled_places(buses: list[TranslatedBus]) -> set[Place]:
-    """The triangles that are switched on."""
     return {
         (bus.patch, board, triangle)
         for bus in buses
@@ -157,7 +156,6 @@ def _old_options(part: Part, patch: int, notes: Notes) -> RoboskinOptions:
 
 
 def _taken(source: object, names: Sequence[str]) -> dict[str, Any]:
-    """Options that have the same names in ``source``."""
     return {name: getattr(source, name) for name in names}
 
 
@@ -206,7 +204,6 @@ def _with_kinds(options: RoboskinOptions, patch: int, body: Body) -> RoboskinOpt
 
 
 def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, notes: Notes) -> None:
-    """Name what the files switch on in vain, and what is on without anything there."""
     for board in options.boards:
         set_up = BoardSetUp(options, board)
         if set_up.wiped:
@@ -235,6 +232,3 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
 
 def _note(notes: Notes, level: Any, part: Part, text: str) -> None:
     notes.add(level, part.element.file, text, line=part.element.line, element=part.element.label)
-
-
-__all__ = ["TranslatedBus", "enabled_places", "service_name", "translate"]

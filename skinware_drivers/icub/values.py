@@ -85,6 +85,3 @@ class Reader:
     def note(self, level: Level, element: Element, text: str) -> None:
         """Note something about an element."""
         self.notes.add(level, element.file, text, line=element.line, element=element.label)
-
-
-__all__ = ["Reader", "number", "words"]

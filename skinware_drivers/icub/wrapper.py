@@ -104,6 +104,3 @@ class _WrapperReader(Reader):
         rest += [inner.element for inner in group.groups.values()]
         rest += [e for name, elements in group.lists.items() if name not in ("ports", "networks") for e in elements]
         return rest
-
-
-__all__ = ["WRAPPER", "Port", "Wrapper", "read_wrapper"]

@@ -43,7 +43,6 @@ class Element:
 
     @property
     def name(self) -> str:
-        """Its attribute ``name``."""
         return self.attributes.get("name", "")
 
     @property
@@ -52,13 +51,11 @@ class Element:
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:
-        """The element and all within, in order."""
         yield self
         for child in self.children:
             yield from child.walk()
 
     def understand(self) -> None:
-        """Mark the element and all within as understood."""
         for element in self.walk():
             element.understood = True
 
@@ -175,6 +172,3 @@ class _Reader:
 
     def _skipped(self, name: str, _is_parameter: bool) -> None:
         self._notes.add("unknown", self._path, "an undefined entity", line=self._line, element=f"&{name};")
-
-
-__all__ = ["LARGEST_FILE", "Element", "read_bytes", "read_xml"]

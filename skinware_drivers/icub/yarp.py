@@ -79,7 +79,6 @@ def yarp_ports(
 
 
 def _modules(buses: Sequence[TranslatedBus]) -> dict[Place, Module]:
-    """The triangles that are switched on."""
     return {
         (bus.patch, board, module.key): module
         for bus in buses
@@ -91,7 +90,6 @@ def _modules(buses: Sequence[TranslatedBus]) -> dict[Place, Module]:
 
 
 def _runs(on: Mapping[int, Place], modules: Mapping[Place, Module]) -> list[Triangles]:
-    """Triangles of one board and kind together."""
     patches = Counter(board for _, board in {place[:2] for place in on.values()})
     runs: dict[tuple[object, ...], list[int]] = {}
     for number, place in sorted(on.items()):
@@ -114,6 +112,3 @@ def _groups(on: Mapping[int, Place], body: Body) -> list[GeometryGroup]:
         for group in body.groups.get(place, ())
         if group.type == "pressure"
     ]
-
-
-__all__ = ["YarpPort", "yarp_ports"]

@@ -268,7 +268,6 @@ class ModbusAdapter(Adapter[OptionsT]):
 
 
 def _refuse_twice(registers: Sequence[Registers]) -> None:
-    """A value lies in one block."""
     owners: dict[tuple[int | None, int | None, int], Registers] = {}
     for block in registers:
         for channel in (channel for run in block.runs for channel in run.channels):
@@ -280,6 +279,3 @@ def _refuse_twice(registers: Sequence[Registers]) -> None:
                     f"{owner.name} and {block.name} both have the value of channel {channel}: say which patch or module"
                     " each is of, or with `to` which channels it has"
                 )
-
-
-__all__ = ["ModbusAdapter", "ModbusException"]

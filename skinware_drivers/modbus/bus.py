@@ -139,7 +139,6 @@ class ModbusBus(KernelBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus modbus:{self.channel}"
 
     @property
@@ -309,7 +308,6 @@ class ModbusBus(KernelBus):
         return True
 
     def take_back(self, source: Source) -> None:  # noqa: ARG002
-        """Go on from where C is."""
         if isinstance(self._talk, NativeMaster):
             self._left = self._talk.take_back()
             self._wake()
@@ -338,7 +336,6 @@ class ModbusBus(KernelBus):
         self._wake()
 
     def close(self) -> None:
-        """Let go of the port. Idempotent."""
         epoll, port, timer = self._epoll, self._port, self._timer
         self._epoll = self._port = self._timer = self._talk = None  # first: a thread may close it, too
         for each in (epoll, timer, self._gateway, port):
@@ -368,6 +365,3 @@ class ModbusBus(KernelBus):
         talk, timer = self._talk, self._timer
         if talk is not None and timer is not None:
             timer.wake_at(0 if talk.rows or self._unsent or self._left else talk.due_ns)
-
-
-__all__ = ["DEFAULT_PORT", "ModbusBus", "ModbusOptions", "device_end"]

@@ -84,7 +84,6 @@ class DfrobotWatch(OrderWatch):
         self._is_told_of: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
 
     def look(self, updates: Updates) -> None:
-        """See which arrays say so."""
         super().look(updates)
         unready = np.unique(updates.module[(updates.status & Status.NOT_CONNECTED).any(axis=1)])
         for module in unready[~self._is_told_of[unready]].tolist():
@@ -177,6 +176,3 @@ def _patch(unit: int, shape: Shape) -> Patch:
 def _places(unit: int, grid: Grid) -> Geometry:
     """Nominal ones: no pitch is published, and nobody knows how two arrays lie to each other."""
     return grid.at((0.0, 0.0, 0.0), ["pressure"], _uids(unit, grid), f"unit_{unit}_nominal")
-
-
-__all__ = ["DfrobotDriver", "DfrobotOptions"]

@@ -42,7 +42,6 @@ class _Program(Guest):
 
     @property
     def interest(self) -> int:
-        """For what its descriptor should be waited."""
         is_full = len(self.waiting) >= _MOST_WAITING or self._unsent
         return (0 if is_full else select.EPOLLIN) | (select.EPOLLOUT if self._unsent else 0)
 
@@ -70,12 +69,10 @@ class _Program(Guest):
     def _frame(self, reply: Message) -> bytes: ...
 
     def tell(self, reply: Message) -> None:
-        """Write a reply."""
         self._unsent += self._frame(reply)
         self.go_on()
 
     def go_on(self) -> None:
-        """Write what could not be written before."""
         if self._unsent:
             with contextlib.suppress(OSError):  # it has gone, as reading will show
                 self._unsent = self._unsent[self._write(self._unsent) :]
@@ -210,7 +207,6 @@ class Gateway:
         self.note = f"gateway at {', '.join(listening + self._links)}"
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``serve`` has something to do."""
         return -1 if self._epoll is None else self._epoll.fileno()
 
     def serve(self, time_ns: int) -> None:
@@ -298,6 +294,3 @@ def _address(place: str, *, is_public: bool) -> Address:
             f"gateway {place}: whoever reaches it moves the device; to let other machines, say gateway_public=yes"
         )
     return address
-
-
-__all__ = ["Gateway"]

@@ -51,11 +51,9 @@ class Guests:
 
     @property
     def are_waiting(self) -> bool:
-        """Whether somebody has a question."""
         return any(guest.waiting for guest in self._guests)
 
     def come(self, guest: Guest) -> None:
-        """A program is there."""
         self._guests.append(guest)
 
     def leave(self, guest: Guest) -> None:
@@ -133,6 +131,3 @@ class Guests:
     def _refuse(self, guest: Guest, question: Message, code: int) -> None:
         if guest in self._guests:
             guest.tell(question._replace(data=bytes([question.data[0] | wire.FAILED, code])))
-
-
-__all__ = ["Guest", "Guests"]

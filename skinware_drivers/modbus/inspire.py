@@ -114,7 +114,6 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
 
 
 def _channels(matrix: _Matrix) -> list[int]:
-    """Place of each register's taxel in its matrix, row by row."""
     grid = np.arange(matrix.rows * matrix.columns).reshape(matrix.rows, matrix.columns)
     order = grid[::-1].T if matrix.part == "palm" else grid
     return [int(place) for place in order.ravel()]
@@ -149,6 +148,3 @@ def _places(hand: Hand) -> Geometry:
         for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
             found.append(grid.at(centre, ["pressure"], _uids(matrix)))
     return Geometry.joined(found)
-
-
-__all__ = ["InspireDriver", "InspireOptions"]

@@ -160,7 +160,6 @@ class Master(Talk):
         return max(self._free_ns, self._deadline_ns) if self._reads else None
 
     def say(self, time_ns: int) -> bytes:
-        """The next question, if it is time for one."""
         if self._open is not None and time_ns >= self._open.until_ns:
             self._give_up(self._open, time_ns)
         if self._open is not None or time_ns < self._free_ns:
@@ -375,7 +374,6 @@ class Listener(Talk):
 
     @property
     def due_ns(self) -> int | None:
-        """Never."""
         return None
 
     @property
@@ -384,11 +382,9 @@ class Listener(Talk):
         return self._line.pending
 
     def say(self, time_ns: int) -> bytes:  # noqa: ARG002
-        """Nothing."""
         return b""
 
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Follow what is said."""
         self._line.feed(chunk)
         while (message := self._line.next_of(self._asked)) is not None:
             asked = self._asked
@@ -403,13 +399,9 @@ class Listener(Talk):
 
 
 def _advice(code: int, read: Read) -> str:
-    """What to try, where a mistake is usual."""
     if code == wire.NO_FUNCTION:
         other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
         return f"; it was asked with function {read.function}: try {other}"
     if code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
         return "; addresses count from 0: a manual's 30001 or 40001 is 0"
     return ""
-
-
-__all__ = ["ANSWERS", "Listener", "Master", "Open", "Overheard", "Talk", "Timing"]

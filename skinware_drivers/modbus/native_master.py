@@ -47,7 +47,6 @@ class NativeMaster(Master):
         self._is_stuck = False
 
     def say(self, time_ns: int) -> bytes:
-        """Also where C could not go on."""
         self._is_stuck = False
         return super().say(time_ns)
 
@@ -127,6 +126,3 @@ class NativeMaster(Master):
             n_blocks=n_blocks,
             blocks=address,
         )
-
-
-__all__ = ["NativeMaster"]

@@ -26,7 +26,6 @@ class OrderWatch(ZeroWatch):
         self._has_told_order = False
 
     def look(self, updates: Updates) -> None:
-        """See whether values are above all that a taxel tells."""
         super().look(updates)
         is_sensor = updates.sensors < self.tables.structure.n_sensors
         if not self._has_told_order and (updates.status[is_sensor] & Status.SUSPECT).any():
@@ -36,6 +35,3 @@ class OrderWatch(ZeroWatch):
                 " registers in the other order: add byte_order=little to the options of the bus",
                 self._full_scale,
             )
-
-
-__all__ = ["OrderWatch"]

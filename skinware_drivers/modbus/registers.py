@@ -119,7 +119,6 @@ class Read:
 
     @property
     def question(self) -> bytes:
-        """As a message."""
         return question_to_read(self.function, self.address, self.count)
 
 
@@ -286,6 +285,3 @@ def _turned(data: bytes, run: Values) -> bytes:
     """The values of a run with their registers in the other order."""
     words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
     return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()
-
-
-__all__ = ["Image", "Order", "Read", "Registers", "Row", "Wanted"]

@@ -79,7 +79,6 @@ class Revo2Watch(ZeroWatch):
     _has_told = False
 
     def look(self, updates: Updates) -> None:
-        """See whether there are data."""
         super().look(updates)
         if not self._has_told and (updates.status & Status.NOT_CONNECTED).any():
             self._has_told = True
@@ -140,7 +139,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         return Revo2Watch(tables)
 
     async def configure(self, link: Link) -> None:
-        """Switch touch on, if the options want that."""
         if self.options.enable:
             await self._set(link, EDITIONS[self._said.edition].switches, _SWITCHING_S)
 
@@ -186,7 +184,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         await asyncio.sleep(takes_s)
 
     async def _find_unit(self, link: Link) -> int:
-        """The number that answers, be it with an exception."""
         if self.options.unit is not None or self.options.side is not None:
             return self._unit
         try:
@@ -204,7 +201,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         return "left" if said[0] in _LEFT_SKUS else "right"
 
     async def _look(self, link: Link) -> _Said:
-        """Ask for the edition, and the kind of its values."""
         edition = self.options.edition
         if edition is None:
             said = await self._read_or_none(link, of_hand.EDITION_AT)
@@ -244,7 +240,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             return None
 
     def _declare(self, said: _Said, side: _Side, *, with_status: bool) -> None:
-        """Registers, patches, types and places."""
         what = content(said.edition, self._unit, kind=said.kind, with_status=with_status)
         self.types: Sequence[SensorType] = what.types
         self.registers: Sequence[Registers] = what.registers
@@ -265,6 +260,3 @@ def _places(hand: Hand, modules: Sequence[Module]) -> Geometry:
         [centre] = hand.down(module.name.split()[0], [grid])
         found.append(grid.at(centre, list(dict.fromkeys(sensor.type_name for sensor in sensors)), uids))
     return Geometry.joined(found)
-
-
-__all__ = ["Revo2Driver", "Revo2Options"]

@@ -86,7 +86,6 @@ def content(edition: EditionName, unit: int, *, kind: int = 0, with_status: bool
 
 
 def _touch(unit: int, _kind: int, with_status: bool) -> Content:
-    """Forces and proximity of five fingertips, and a register of status for each of them."""
     force = FORCE_Z.measured(scale=1e-2, minimum=0)
     types = (force, _TANGENTIAL, _DIRECTION, PROXIMITY.measured(unit="counts", minimum=0))
     modules, registers = list[Module](), list[Registers]()
@@ -163,19 +162,3 @@ def _array_pressure(unit: int, _kind: int, _with_status: bool) -> Content:
         values = [Values(2 * (80 + 5 * finger), ">u2", 5)]
         registers.append(Registers(8020, 105, unit, READ_INPUT, patch=0, module=finger, flags=[cold], values=values))
     return Content(types, modules, registers)
-
-
-__all__ = [
-    "EDITIONS",
-    "EDITION_AT",
-    "FIRMWARE_AT",
-    "FORCES_AT",
-    "KIND_AT",
-    "NO_FORCE",
-    "SERIAL_AT",
-    "SIDE_AT",
-    "Content",
-    "Edition",
-    "EditionName",
-    "content",
-]

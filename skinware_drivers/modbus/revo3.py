@@ -100,7 +100,6 @@ class _Said(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For people."""
         kinds = {f"{self.type_of(pad).name} in {self.type_of(pad).unit}": None for pad in range(len(PADS))}
         what = "sums of zones" if self.has_sums else "taxels"
         return f"mapping {self.name}, {sum(self.counts)} {what}, {' and '.join(kinds)}"
@@ -187,7 +186,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         return (self._said or _unasked(self.options.mapping)).mapping
 
     async def _find_unit(self, link: Link) -> int:
-        """The number that answers, be it with an exception."""
         units = _UNITS if self.options.unit is None else (self.options.unit,)
         for unit in units[:-1]:
             try:
@@ -204,7 +202,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         return "right" if side is None or side[0] == map_of.RIGHT else "left"
 
     async def _look(self, link: Link) -> _Said:
-        """Ask what it sends."""
         name: str | None = self.options.mapping
         if name is None:
             family = await self._read_or_none(link, map_of.FAMILY_AT)
@@ -265,7 +262,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
             return None
 
     def _declare(self, said: _Said, side: _Side, points: Sequence[int]) -> None:
-        """Registers, patches, types and places."""
         counts = said.counts if said.has_sums else points or said.counts
         types = [said.type_of(pad) for pad in range(len(PADS))]
         self.types: Sequence[SensorType] = tuple({kind.id: kind for kind in types}.values())
@@ -294,7 +290,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
 
 
 def _unasked(mapping: _Name | None) -> _Said:
-    """What is taken for granted of a hand that is not asked."""
     name = mapping or "pressure"
     function = READ_INPUT if name == "pressure" else READ_HOLDING
     return _Said(name, function, False, tuple(MAPPINGS[name].counts), (_ADC,) * len(PADS))
@@ -315,6 +310,3 @@ def _geometry(said: _Said, side: _Side, modules: Sequence[Module]) -> Geometry:
             uids = [pad << 8 | n for n in range(len(modules[pad].channels))]
             found.append(grid.at(centre, [said.type_of(pad).name], uids, cells=cells))
     return Geometry.joined(found)
-
-
-__all__ = ["Revo3Driver", "Revo3Options"]

@@ -51,7 +51,6 @@ class Mapping:
     types: Sequence[SensorType]
 
     def count_fits(self, pad: int, count: int) -> bool:
-        """Whether a pad can have so many taxels."""
         return 1 <= count <= self.in_register * (self.pads[pad + 1] - self.pads[pad])
 
 
@@ -104,25 +103,3 @@ def places(mapping: str, side: str, pad: int, count: int) -> tuple[Grid, Sequenc
         return Grid(-(-count // _MATRIX_COLUMNS), _MATRIX_COLUMNS), range(count)
     columns = 1 + max(int(column) for row in rows for column in row)
     return Grid(len(rows), columns), [columns * number + int(one) for number, row in enumerate(rows) for one in row]
-
-
-__all__ = [
-    "COUNTS_OF_SUMS",
-    "FAMILY_AT",
-    "KIND_AT",
-    "MAPPINGS",
-    "MATRIX_COUNTS_AT",
-    "MATRIX_FAMILY",
-    "MODES_AT",
-    "MODE_AT",
-    "PADS",
-    "PRESSURE_COUNTS_AT",
-    "PRESSURE_FAMILY",
-    "RIGHT",
-    "SIDE_AT",
-    "SUM",
-    "SUMS_AT",
-    "VALUE_AT",
-    "Mapping",
-    "places",
-]

@@ -23,10 +23,6 @@ class Trouble:
         self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
 
     def again(self, time_ns: int) -> None:
-        """It has failed once more."""
         self.times += 1
         if self.times >= _PATIENT_TIMES:
             self.until_ns = time_ns + round(self._pauses.next_s() * NS_PER_S)
-
-
-__all__ = ["Trouble"]

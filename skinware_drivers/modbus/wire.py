@@ -78,7 +78,6 @@ def is_known(question: bytes) -> bool:
 
 
 def is_write(question: bytes) -> bool:
-    """Whether a question changes something."""
     return question[0] in _ECHOING or question[0] == _EXCHANGE
 
 
@@ -123,18 +122,15 @@ def exception_of(reply: bytes) -> int:
 
 
 def exception_text(code: int) -> str:
-    """What an exception means, for people."""
     return f"{EXCEPTIONS.get(code, 'no known reason')} (exception {code})"
 
 
 def rtu_frame(message: Message) -> bytes:
-    """A message as it is on a serial line."""
     frame = bytes([message.unit]) + message.data
     return frame + CRC16_MODBUS.to_bytes(frame)
 
 
 def tcp_frame(message: Message) -> bytes:
-    """A message as it is in a connection."""
     return _MBAP.pack(message.number, 0, len(message.data) + 1, message.unit) + message.data
 
 
@@ -177,7 +173,6 @@ class TcpMessages:
         return len(self._rest)
 
     def drop(self) -> None:
-        """Forget what was left over."""
         self._counters.skipped_bytes += len(self._rest)
         self._rest = b""
 
@@ -194,7 +189,6 @@ class RtuMessages:
         self._rest = b""
 
     def feed(self, chunk: bytes) -> None:
-        """Take what has come."""
         self._counters.bytes_in += len(chunk)
         self._rest += chunk
 
@@ -212,7 +206,6 @@ class RtuMessages:
         return len(self._rest)
 
     def drop(self) -> None:
-        """Forget what was left over."""
         self._skip(len(self._rest))
 
     def _first(self, asked: tuple[int, bytes] | None, *, also_questions: bool) -> Message | None:
@@ -254,7 +247,6 @@ class RtuMessages:
 
 @functools.lru_cache(256)
 def _beginning_of(asked: tuple[int, int] | None, also_questions: bool) -> re.Pattern[bytes]:
-    """Where a reply to what was asked (unit, function) or a question may begin, by its first two bytes."""
     beginnings = []
     if asked is not None:
         unit, function = (re.escape(bytes([number])) for number in asked)
@@ -267,7 +259,6 @@ def _beginning_of(asked: tuple[int, int] | None, also_questions: bool) -> re.Pat
 
 
 def _sizes_of_reply(here: bytes, unit: int, question: bytes) -> list[int]:
-    """Bytes of the frames that may begin here and answer a question."""
     size = reply_size(question)
     good = bytes([unit]) + question[:1]
     if question[0] in _COUNTING:
@@ -291,30 +282,3 @@ def _size_of_question(here: bytes) -> int:
     if length_at is None:
         return 0
     return length_at + 3 + (here[length_at] if len(here) > length_at else 0)
-
-
-__all__ = [
-    "ACKNOWLEDGE",
-    "BUSY",
-    "LONGEST_MESSAGE",
-    "MOST_REGISTERS",
-    "MOST_WRITTEN",
-    "READS",
-    "READ_HOLDING",
-    "READ_INPUT",
-    "WRITE_MANY",
-    "WRITE_ONE",
-    "Message",
-    "RtuMessages",
-    "TcpMessages",
-    "exception_of",
-    "exception_text",
-    "is_known",
-    "is_question",
-    "is_reply",
-    "is_write",
-    "question_to_read",
-    "reply_size",
-    "rtu_frame",
-    "tcp_frame",
-]

@@ -165,7 +165,6 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
 
 
 def _common(frame: Frame) -> np.dtype[Any]:
-    """The dtype that can hold the values of all runs of a frame."""
     return np.result_type(*(np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs))
 
 
@@ -203,7 +202,6 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
 
 
 def _compared(form: int, status: Status, number: float, values: np.dtype[Any]) -> structs.Flag:
-    """Compared as numpy compares an array of ``values`` with the number."""
     found = structs.Flag(form=form, status=int(status))
     number = number.item() if isinstance(number, np.generic) else number
     if values.kind == "f":

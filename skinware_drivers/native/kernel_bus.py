@@ -49,6 +49,3 @@ class KernelBus(Bus):
 def is_read_natively(bus: Bus) -> bool:
     """Whether C code can receive from a bus, as far as it is known."""
     return isinstance(bus, KernelBus) and bus.reads_natively
-
-
-__all__ = ["KernelBus", "is_read_natively"]

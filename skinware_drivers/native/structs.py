@@ -343,11 +343,9 @@ class Arrays:
         return array.ctypes.data
 
     def of(self, values: npt.ArrayLike, dtype: npt.DTypeLike) -> int:
-        """Address of a copy of these values."""
         return self.at(np.array(values, dtype, order="C"))
 
     def structs(self, kind: type[Any], rows: Iterable[Any]) -> tuple[int, int]:
-        """How many structures there are, and their address."""
         found = list(rows)
         memory = (kind * max(1, len(found)))(*found)
         self._kept.append(memory)

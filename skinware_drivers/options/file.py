@@ -145,7 +145,6 @@ class ConfigFile:
 
     @contextmanager
     def blamed_for(self, bus_name: str) -> Iterator[None]:
-        """Name the bus' line in this file in what is raised meanwhile, if the bus is of this file."""
         try:
             yield
         except ConfigurationError as error:
@@ -175,7 +174,6 @@ def _convert(struct: type[T], data: Mapping[str, Any]) -> T:
 
 
 def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = ()) -> None:
-    """Refuse keys that a struct does not have, with the nearest right name."""
     known = [field.encode_name for field in msgspec.structs.fields(struct)]
     for key in data if isinstance(data, Mapping) else ():
         if key not in known:

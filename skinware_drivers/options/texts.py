@@ -83,7 +83,6 @@ def option_text(value: Any) -> str:
 
 
 def plain_type(hint: Any) -> Any:
-    """The type under ``Annotated`` and beside ``None``."""
     if get_origin(hint) is Annotated:
         return plain_type(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):

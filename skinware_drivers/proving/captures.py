@@ -18,7 +18,8 @@ import msgspec
 import numpy as np
 
 import skinware.recording
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
@@ -131,7 +132,6 @@ def _driver_type(recording: Recording, about: Mapping[str, Any]) -> str:
 
 
 def _wires(recording: Recording) -> Sequence[WireTrack]:
-    """Those of the only driver."""
     if len({wire.driver for wire in recording.wires}) > 1:
         names = ", ".join(sorted({wire.driver for wire in recording.wires}))
         raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}): a capture has those of one")
@@ -139,7 +139,6 @@ def _wires(recording: Recording) -> Sequence[WireTrack]:
 
 
 def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
-    """When the recording began, CLOCK_MONOTONIC of then."""
     first = next((item for wire in wires for item in wire.items()), None)
     return 0 if first is None else first.time_ns - (first.epoch_ns - recording.start_ns)
 
@@ -186,12 +185,10 @@ class _Replay:
 
     @property
     def is_over(self) -> bool:
-        """Whether all of it was given."""
         return not self._times or (len(self._then_ns) > 0 and self._then_ns[-1] >= self._times[-1])
 
     @property
     def duration_ns(self) -> int:
-        """From the first to the last."""
         return self._times[-1] - self._times[0] if self._times else 0
 
     def _is_given(self, item: WireItem) -> bool:
@@ -223,7 +220,6 @@ class _Published:
         self._last: tuple[int, int] | None = None
 
     def look(self, runner: Runner, namespace: Namespace) -> None:
-        """Take what has been published."""
         if self._reader is None:
             if runner.writer is None or runner.writer.closed:
                 return
@@ -242,7 +238,6 @@ class _Published:
             self._frames[-1][1].append(frame)
 
     def decoding(self, replays: Sequence[_Replay], began_ns: int) -> Decoding:
-        """What was new in them, with the times of then."""
         found = Collected(began_ns)
         for structure, frames in self._frames:
             times = np.array([frame.module_time_ns for frame in frames])
@@ -253,7 +248,6 @@ class _Published:
         return found.decoding()
 
     def close(self) -> None:
-        """Let go of the reader."""
         if self._reader is not None:
             self._reader.close()
 
@@ -276,6 +270,3 @@ async def _run(
     found.look(runner, namespace)
     runner.stop()
     await running
-
-
-__all__ = ["check_capture", "decoded_now", "decoded_then", "driver_type_of", "expected_of"]

@@ -31,7 +31,6 @@ class ProofFiles:
 
     @property
     def written(self) -> list[str]:
-        """Those that are there."""
         return [str(path) for path in self._all if path.exists()]
 
     def refuse_old(self) -> None:
@@ -46,7 +45,6 @@ class ProofFiles:
             raise ConfigurationError(f"{self.written[0]}: exists already: give another name (-o), or remove it")
 
     def capture_text(self, *, is_whole: bool) -> str:
-        """What the report says of the capture."""
         beginning = "from the first byte on" if is_whole else "without what was said before skin-prove began"
         text = f"{self.capture.name}, {beginning}"
         if self.captured.get("lost"):
@@ -65,6 +63,3 @@ class ProofFiles:
                     path.unlink()  # half of it
                 wrong = wrong or OSError(error.errno, error.strerror, str(path))
         return wrong
-
-
-__all__ = ["ProofFiles"]

@@ -63,7 +63,6 @@ class Proof:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many checks have each verdict."""
         counted = Counter(check.verdict for check in self.checks)
         return {verdict.value: counted[verdict] for verdict in Verdict}
 
@@ -91,7 +90,6 @@ class Proof:
         }
 
     def as_markdown(self) -> str:
-        """The report, without secrets."""
         return scrubbed("\n".join(map(printable, self._lines())) + "\n", Secrets.of_this_machine())
 
     def _lines(self) -> Iterator[str]:
@@ -106,6 +104,3 @@ class Proof:
         for check in self.checks:
             cells = (check.verdict.value, check.what, check.where, check.seen)
             yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
-
-
-__all__ = ["Check", "Proof", "Verdict"]

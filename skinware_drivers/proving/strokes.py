@@ -136,7 +136,6 @@ def _agreement(moments: Floats, places: npt.NDArray[np.int64]) -> float:
 
 
 def _misplaced(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], places: Places) -> list[str]:
-    """Taxels that answer when those of another row or column do."""
     found: dict[int, tuple[int, int]] = {}
     at = np.stack(
         [_nearest(moments[:, axis], places[:, axis], heard, size) for axis, size in enumerate(matrix)], axis=1
@@ -166,6 +165,3 @@ def _nearest(moments: Floats, place: Places, heard: npt.NDArray[np.bool_], size:
     own = distance[np.arange(len(place)), place]
     gap = np.median(np.abs(np.diff(usual)))
     return np.where(heard & (own > 0.75 * gap), nearest, place)
-
-
-__all__ = ["Matrix", "Order", "judge"]

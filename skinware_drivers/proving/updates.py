@@ -111,7 +111,6 @@ class Collected:
                 self._parts.setdefault(tuple(structure.sensor_uid[mine].tolist()), []).append(found)
 
     def decoding(self) -> Decoding:
-        """All of them, by time, each once."""
         return {uids: _joined(parts) for uids, parts in self._parts.items()}
 
 
@@ -188,7 +187,6 @@ def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:
 
 
 def _nearest(of_ns: Times, in_ns: Times) -> Times:
-    """(len(of_ns),) the place of the nearest in a rising order."""
     after = np.clip(np.searchsorted(in_ns, of_ns), 1, max(1, len(in_ns) - 1))
     if len(in_ns) == 1:
         return np.zeros(len(of_ns), np.int64)
@@ -238,6 +236,3 @@ def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple
     for number in sorted({int(name.partition(".")[0]) for name in names}):
         uids, sensors, time_ns, values = (file[f"{number}.{what}"] for what in ("uids", "sensors", "time_ns", "values"))
         yield tuple(uids.tolist()), Updates(tuple(sensors.tolist()), time_ns, values)
-
-
-__all__ = ["Collected", "Comparison", "Decoding", "Difference", "Updates", "compare", "load", "save"]

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from skinware.cli._driver_frames import after, frames_until
 from skinware.cli._format import figure_text, plural
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
@@ -133,7 +134,6 @@ class _Walk:
         return not self._manner.only or any(word.lower() in name for word in self._manner.only)
 
     def go(self) -> None:
-        """All of it."""
         self._proof.about["sensors"] = f"{self._structure.n_sensors}, judged by {self._type.name} ({self._type.unit})"
         try:
             self._look_at_rest()
@@ -355,5 +355,3 @@ class _Walk:
 
 _LOSSES = ("lost", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
 """Counters of a bus that grow where something was lost or damaged."""
-
-__all__ = ["Manner", "Person", "Step", "walk"]

@@ -63,6 +63,3 @@ class Attention:
 def _slept_ns() -> int:
     """How long the machine has been suspended since it booted."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
-
-
-__all__ = ["Attention", "HoldUp"]

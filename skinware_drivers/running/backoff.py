@@ -24,10 +24,8 @@ class Backoff:
         return self._longest_s
 
     def next_s(self) -> float:
-        """What to wait before the next attempt."""
         pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
         return pause_s
 
     def begin_again(self) -> None:
-        """The next attempt is a first one."""
         self._next_s = self._begin_s

@@ -102,7 +102,6 @@ class Bursts:
         return updates.take(~old)
 
     def _show_the_newest(self, updates: Updates) -> None:
-        """Show updates in one frame, whatever bursts they are of."""
         of_group = np.bincount(updates.group[updates.whole], minlength=len(self._group_patch))
         skipped = np.maximum(of_group + self._state.updated - 1, 0)
         self._skip(np.bincount(self._group_patch, skipped, self._n_patches).astype(np.int64))

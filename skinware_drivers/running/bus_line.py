@@ -219,7 +219,6 @@ class BusLine:
             self.heard_ns = now_ns()
 
     def look(self, silence_ns: int) -> None:
-        """Tell a living bus from one that says nothing, is off the wire, or is gone."""
         if self.bus.fileno() < 0 or self.lost.is_set():
             return
         time_ns = now_ns()
@@ -249,14 +248,12 @@ class BusLine:
             self.lose(bus_failure(self.name, "check", error))
 
     def _become(self, state: BusState, reason: BusReason) -> bool:
-        """Returns whether it was in another state, or for another reason."""
         if (state, reason) == (self.state, self.reason):
             return False
         self.state, self.reason, self.since_ns = state, reason, now_ns()
         return True
 
     def _tell(self, state: BusState, reason: BusReason) -> None:
-        """What the change from this state and reason means."""
         if self.reason == BusReason.NOTHING_HEARD:
             if state == BusState.LIVE and self._has_spoken:
                 self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
@@ -330,7 +327,6 @@ class BusLine:
             self._is_away(error)
 
     def remove(self) -> None:
-        """Let go of the bus for good."""
         self._let_go()
         self.patches = ()
         self._become(BusState.GONE, BusReason.REMOVED)

@@ -70,7 +70,6 @@ class BusNews:
         self._kept_back = 0
 
     def tell(self, text: str) -> None:
-        """Something changed."""
         if self._untold:
             self._kept_back += 1
         self._untold = text

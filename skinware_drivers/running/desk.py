@@ -164,7 +164,6 @@ _declared = cache(operations_of)
 
 
 def _job(line: BusLine, operation: str) -> _Job | None:
-    """Who does it, None if nobody can."""
     for doer in (line.adapter, line.bus):
         found = _declared(type(doer)).get(operation)
         if found is not None:
@@ -173,7 +172,6 @@ def _job(line: BusLine, operation: str) -> _Job | None:
 
 
 def offered(lines: Sequence[BusLine]) -> dict[str, Callable[..., Any]]:
-    """What programs may ask a driver with these buses to do."""
     declared: dict[str, Operation] = {}
     for line in lines:
         declared |= _declared(type(line.bus)) | _declared(type(line.adapter))

@@ -40,7 +40,6 @@ class FlowSelector(selectors.EpollSelector):
         self.flow: Callable[[int, float | None], None] | None = None
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait as any selector does."""
         if self.flow is None or (timeout is not None and timeout <= 0):
             return super().select(timeout)
         self.flow(self.fileno(), timeout)
@@ -62,7 +61,6 @@ def flow_of(
     take: Callable[[], object],
     fail: Callable[[BaseException], None],
 ) -> Flow | None:
-    """What lets the frames of a generation flow (see ``Flow``), None if C can read none of its buses."""
     buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
     if generation.native is None or not any(is_read_natively(bus) for bus in buses):
         return None
@@ -161,7 +159,6 @@ class Flow:
             bus.take_back(source)
 
     def _heard(self) -> None:
-        """A bus that was silent is not."""
         for line, _, source in self._handed:
             line.heard_ns = source.heard_ns
         self._generation.update_bus_states()

@@ -33,12 +33,10 @@ Rows = npt.NDArray[np.int64]
 
 
 def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
-    """Room for what arrives at once on all of these."""
     return FrameBatch.for_buses(len(lines), max(line.adapter.payload_size for line in lines), headroom)
 
 
 def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:
-    """``rows`` of a batch, bus by bus."""
     bus = batch.bus[rows]
     return [rows[bus == ordinal] for ordinal in range(n_buses)]
 
@@ -114,7 +112,6 @@ class Generation:
 
     @property
     def tables(self) -> SkinTables:
-        """What is attached to the buses."""
         return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:
@@ -126,7 +123,6 @@ class Generation:
         return self.batch
 
     def digest(self, batch: FrameBatch) -> None:
-        """Decode a batch and publish what is due."""
         self.update_bus_states(settled=now_ns() >= self._look_ns)
         if self.native is not None:
             self.prepare_native()
@@ -198,22 +194,18 @@ class Generation:
 
     @property
     def data_path(self) -> DataPath:
-        """Which way frames take."""
         of_buses = set(self.publisher.bus_data_path.tolist())
         if len(of_buses) > 1:
             return DataPath.MIXED
         return DataPath.PYTHON if self.native is None else DataPath.NATIVE
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
-        """Number of a patch in the structure, None if it is not in it (any more)."""
         return self.tables.patch_key.get((line.ordinal, patch.key))
 
     def name_of(self, patch: int) -> str:
-        """Name of a patch, for people."""
         return bytes(self.tables.structure.patch_name[patch]).decode()
 
     def patches_in(self, line: BusLine, *states: PatchState) -> list[Patch]:
-        """The patches of a bus that are in one of these states."""
         if not line.patches:
             return []
         state = self.publisher.patch_state[self.tables.structure.patch_bus == line.ordinal]

@@ -59,11 +59,9 @@ class Intake:
         self._by_fd: dict[int, BusLine] = {}
 
     def start(self) -> None:
-        """Begin to listen, in the running loop."""
         asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._look)
 
     def stop(self) -> None:
-        """Listen no more."""
         asyncio.get_running_loop().remove_reader(self._epoll.fileno())
         if self._rest is not None:
             self._rest.cancel()

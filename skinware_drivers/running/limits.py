@@ -59,7 +59,6 @@ class BusLimits:
         self.load_from_ns = 0
 
     def look(self) -> None:
-        """Look at the bus, if the last look was a second ago."""
         time_ns = self._clock()
         passed_ns = time_ns - self._looked_ns
         if passed_ns < _LOOK_PAUSE_NS:

@@ -235,7 +235,6 @@ class NativePath:
         self._words.on_request = publisher.on_request
 
     def _update_dtype(self) -> np.dtype[np.void]:
-        """Rows of the updates in C."""
         width, values = self._decoder.width, self._decoder.tables.structure.dtype
         sensors_at = structs.UPDATE.itemsize
         values_at = -(-(sensors_at + 4 * width) // 8) * 8
@@ -368,7 +367,6 @@ class NativePath:
 
 
 def _view(address: int, n: int, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """(n,) elements of memory that C owns."""
     found: np.dtype[Any] = np.dtype(dtype)
     memory = memoryview((ctypes.c_char * (n * found.itemsize)).from_address(address))
     return np.ndarray(n, found, memory)

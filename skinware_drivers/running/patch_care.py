@@ -50,7 +50,6 @@ class _SetUps:
         self._not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
 
     def put_off(self) -> None:
-        """The longest pause comes first."""
         self._not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
 
 
@@ -87,7 +86,6 @@ class PatchCare:
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
     async def check_data(self) -> None:
-        """Wait for the first data of every patch, and name those that send none."""
         timer = Periodic(_DATA_CHECKS_HZ)
         silent = self._patches_in(PatchState.EXPECTED)
         for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * self._line.adapter.period_s))):
@@ -104,7 +102,6 @@ class PatchCare:
             log.warning("%s: %s no data%s%s", self._line.name, who, which, why)
 
     async def recover_silent(self) -> None:
-        """Ask silent patches whether they are there, and set up those that answer."""
         line, generation = self._line, self._generation()
         if generation is None or self._listen_only or line.lost.is_set() or line.busy.locked():
             return
@@ -136,7 +133,6 @@ class PatchCare:
         ]
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
-        """Whether a silent patch answers, and has not been set up in vain a moment ago."""
         line, set_ups = self._line, self._set_ups.get(patch.key)
         if (set_ups is not None and not set_ups.are_due) or not line.limits.knows_load_since(line.set_up_ns):
             return False
@@ -214,7 +210,6 @@ class PatchCare:
             log.warning("%s: %s; attending to it again", self._line.name, text)
 
     def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
-        """A patch says something of itself."""
         line, generation = self._line, self._generation()
         number = None if generation is None else generation.number_of(line, patch)
         if generation is None or number is None:
@@ -262,7 +257,6 @@ class PatchCare:
                     generation.watch.forget(number)
 
     async def _set_up(self, patch: Patch) -> None:
-        """Have the driver set one patch up."""
         self._begun_ns, self._error = now_ns(), ""
         try:
             with hook("revive", self._line.name):

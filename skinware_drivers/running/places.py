@@ -40,6 +40,3 @@ def _on_bus(geometry: Geometry, bus: int) -> Geometry:
     """With the uids of the whole driver, and a frame for each bus: nobody knows how two of them lie to each other."""
     frames = [f"{frame} {bus + 1}" if bus else frame for frame in geometry.frame.tolist()]
     return replace(geometry, uid=uid_on_bus(bus, geometry.uid), frame=np.array(frames, object))
-
-
-__all__ = ["put_in_place"]

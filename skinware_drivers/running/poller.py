@@ -40,13 +40,11 @@ class _Place:
         self.answered()
 
     def answered(self) -> None:
-        """The device is there."""
         self.silent_until_ns = 0
         self._missing = 0
         self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
 
     def unanswered(self) -> None:
-        """The device did not answer."""
         self._missing += 1
         if self._missing >= _PATIENT_TIMES:
             self.silent_until_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
@@ -146,7 +144,6 @@ class Poller:
             self._counters.polls_missed += 1
 
     async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
-        """In lock step."""
         extra_s, place.extra_s = (
             place.extra_s,
             place.extra_s / 2,
@@ -182,6 +179,3 @@ class Poller:
                 1e3 * late_s,
                 1e3 * poll.patience_s,
             )
-
-
-__all__ = ["Poller"]

@@ -37,9 +37,9 @@ class Desk(Protocol):
     """Who waits for frames; see :class:`skinware_drivers.running.desk.RequestDesk`."""
 
     @property
-    def wanted_ns(self) -> int: ...  # noqa: D102
+    def wanted_ns(self) -> int: ...
 
-    def published(self, oldest_ns: int, position: tuple[int, int]) -> None: ...  # noqa: D102
+    def published(self, oldest_ns: int, position: tuple[int, int]) -> None: ...
 
 
 class Publisher:
@@ -112,7 +112,6 @@ class Publisher:
 
     @property
     def sequence(self) -> int:
-        """Of the newest frame."""
         return self._writer.sequence
 
     @property
@@ -138,7 +137,6 @@ class Publisher:
         return max(self._not_before_ns, min(self._due_ns, idle_ns) if self._due_ns else idle_ns)
 
     def take(self, updates: Updates) -> None:
-        """Show updates, publishing as often as needed for none to be overwritten unseen, up to ``most_at_once``."""
         if not len(updates):
             return
         time_ns = now_ns()
@@ -177,7 +175,6 @@ class Publisher:
             self.publish()
 
     def publish(self) -> None:
-        """Publish what there is."""
         state, time_ns = self._state, now_ns()
         if self._wanted(time_ns):
             self._write(time_ns)

@@ -59,7 +59,6 @@ class Serving:
         self._join_requested = asyncio.Event()
 
     def begin(self, line: BusLine) -> None:
-        """Serve a bus from now on."""
         task = asyncio.get_running_loop().create_task(self._serve(line))
         task.add_done_callback(self._done)
         self._tasks[line] = task
@@ -173,7 +172,6 @@ class Serving:
 
 @contextmanager
 def _first_failure() -> Iterator[None]:
-    """Raise what was first raised in a group of tasks, and no group."""
     try:
         yield
     except BaseExceptionGroup as failures:

@@ -80,6 +80,3 @@ def _kinds_of_identifier(layout: Layout, samples: Sequence[Sample]) -> Iterator[
 
 def _identifier(sample: Sample) -> int:
     return int(sample["identifier"]) | (EXTENDED_FLAG if sample["extended"] else 0)
-
-
-__all__ = ["why_unused"]

@@ -149,7 +149,6 @@ class Wires:
         return self._writer
 
     def _about(self) -> dict[str, object]:
-        """What whoever decodes it again has to know."""
         options = [msgspec.to_builtins(line.adapter.options) for line in self._lines]
         return {
             "driver_type": self._driver_type,

@@ -114,11 +114,9 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """The question that moves nothing."""
         return (Poll(self.options.address, _READ_TOUCH, self.period_s),)
 
     async def attend(self, link: Link) -> None:
-        """Say once why there is no touch, if the hand answers another program that asks for none."""
         with link.follow(_WITHOUT_TOUCH) as heard:
             await heard.get()
         log.warning(
@@ -135,7 +133,6 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
 
 
 def _places(hand: Hand, type_name: str) -> Geometry:
-    """Nominal places of all sensors."""
     found = []
     for number, finger in enumerate(_FINGERS):
         [(x, y, z)] = hand.down(finger, [Grid(1, 1)])
@@ -151,12 +148,8 @@ def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:
 
 
 def _expand(payload: _Bytes, length: _Bytes, newton: Any) -> tuple[Any, Any, npt.NDArray[np.float32]]:
-    """Of each pair of sensors, three bytes."""
     pairs = payload[:, :_FINGER_BYTES].astype(np.int64).reshape(-1, _N // 2, 3)
     low, middle, high = pairs[..., 0], pairs[..., 1], pairs[..., 2]
     counts = np.stack([low | (middle & 0xF) << 8, middle >> 4 | high << 4], axis=2).ravel()
     row, channel = np.divmod(np.arange(len(length) * _N), _N)
     return row, channel, newton(counts)
-
-
-__all__ = ["AbilityHandDriver", "AbilityHandOptions"]

@@ -73,7 +73,6 @@ class SerialAdapter(Adapter[OptionsT]):
 
 
 def _may_be(frame: Frame, answer: Match) -> bool:
-    """Whether a frame of this kind can be this answer."""
     conditions = [condition for condition in frame.when if isinstance(condition, Identifier)]
     return all((c.value ^ answer.value) & c.mask & answer.mask == 0 for c in conditions)
 

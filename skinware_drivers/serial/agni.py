@@ -78,7 +78,6 @@ class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def command(number: int, arguments: bytes = b"") -> bytes:
-    """A command to the device as it is sent."""
     sent = _BEGIN + bytes((0, number)) + arguments
     return sent + XOR.to_bytes(sent)
 
@@ -106,7 +105,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @property
     def payload_size(self) -> int:
-        """Of the longest message that any device may describe."""
         return _MOST_BYTES + 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -170,7 +168,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         await link.send(0, command(_START))
 
     async def stop(self, link: Link) -> None:
-        """Make it silent."""
         await link.send(0, command(_STOP))
 
     async def probe(self, link: Link, patch: Patch) -> bool:
@@ -187,7 +184,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         return False
 
     async def attend(self, link: Link) -> None:
-        """Say which errors it reports."""
         with link.follow(Match(_ERROR)) as heard:
             while True:
                 error = (await heard.get()).payload[0]
@@ -204,7 +200,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @operation(looks=True)
     async def alive(self, link: Link, patches: Sequence[Patch]) -> bool:  # noqa: ARG002
-        """Whether the device answers."""
         try:
             await link.request(0, command(_ALIVE), Match(_ALIVE), timeout_s=_TIMEOUT_S)
         except HandshakeTimeout:

@@ -63,6 +63,3 @@ class Answers:
                 f"the {self.device}'s answer to command {command:#04x} has {len(result)} bytes instead of {size}"
             )
         return result
-
-
-__all__ = ["Answers", "Refused"]

@@ -158,7 +158,6 @@ class SerialBus(KernelBus):
         return True
 
     def take_back(self, source: Source) -> None:  # noqa: ARG002
-        """Go on with what C code did meanwhile."""
         if self._handed is not None:
             self._handed[0].count()
             self._handed = None
@@ -190,7 +189,6 @@ class SerialBus(KernelBus):
         self.counters.sent += 1
 
     def close(self) -> None:
-        """Let go of the port. Idempotent."""
         if self._epoll is not None:
             self._epoll.close()
             self._epoll = None
@@ -225,7 +223,6 @@ class SerialBus(KernelBus):
             self._hear(chunk, now_ns())
 
     def _hear(self, chunk: bytes, time_ns: int) -> None:
-        """What was read at this time."""
         self.tap.keep_bytes(time_ns, chunk)
         self._stream.add(chunk, time_ns)
 
@@ -298,6 +295,3 @@ def _split_options(channel: str, options: dict[str, str]) -> tuple[dict[str, str
     own = set(SerialOptions.__struct_fields__)
     query = "&".join(f"{key}={text}" if text else key for key, text in options.items() if key not in own)
     return {key: text for key, text in options.items() if key in own}, f"?{query}" if query else ""
-
-
-__all__ = ["PtyBus", "SerialBus"]

@@ -161,7 +161,6 @@ class Crc(Checksum):
         return _reflected_table(self) if self.reflected_in else _normal_table(self)
 
     def _after(self, data: bytes, state: int) -> int:
-        """The register after some bytes."""
         table = self.table
         if self.reflected_in:
             for byte in data:

@@ -141,6 +141,3 @@ class DelimitedFramer(Framer):
             self.counters.skipped_bytes += rest
             return 0
         return rest
-
-
-__all__ = ["Delimited", "DelimitedFramer"]

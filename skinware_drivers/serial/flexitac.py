@@ -173,7 +173,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return HeardSize(len(body), _SIZES.get(len(body)))
 
     def _agreed(self, link: Link, heard: HeardSize) -> tuple[int, int]:
-        """The size that is heard and that the options say, or allow."""
         wanted, known = self.options.shape, heard.shape
         is_exact = self.options.firmware == "text"
         if wanted and (wanted == known if is_exact else math.prod(wanted) == heard.cells):
@@ -200,6 +199,3 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
 def _in_words(shapes: Iterable[tuple[int, int]]) -> str:
     return ", ".join(f"{rows}x{columns}" for rows, columns in shapes)
-
-
-__all__ = ["FlexiTacDriver", "FlexiTacOptions", "HeardSize"]

@@ -75,7 +75,6 @@ class _Steps(Framer):
 
     @property
     def is_lost(self) -> bool:
-        """Whether questions do not help."""
         return self._vain >= _MOST_IN_VAIN
 
     def asked(self) -> None:
@@ -112,6 +111,3 @@ class _Steps(Framer):
         self._is_in_step = False
         self.counters.refused += 1
         self.counters.skipped_bytes += skipped
-
-
-__all__ = ["LengthFirst"]

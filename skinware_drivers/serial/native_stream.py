@@ -199,16 +199,13 @@ class NativeStream(Stream):
 
     @property
     def is_behind(self) -> bool:
-        """Whether the batch was full."""
         return bool(self._stream.is_behind)
 
     @property
     def pending(self) -> int:
-        """Bytes that are not decided."""
         return int(self._stream.size - self._stream.place)
 
     def add(self, chunk: bytes, time_ns: int) -> None:
-        """Put it behind what is not decided yet."""
         if len(chunk) > CHUNK or self.is_behind:
             raise ValueError(f"{len(chunk)} bytes more than there is room for")
         size, time = ctypes.c_int64(len(chunk)), ctypes.c_int64(time_ns)
@@ -227,7 +224,6 @@ class NativeStream(Stream):
         return taken
 
     def take_damaged(self) -> bytes:
-        """The chunk, or nothing."""
         stream = self._stream
         if not stream.is_damaged or stream.is_good or stream.is_behind:
             return b""
@@ -245,7 +241,6 @@ class NativeStream(Stream):
         return ctypes.addressof(self._stream)
 
     def count(self) -> None:
-        """Take over what C has counted."""
         counters, stream = self.counters, self._stream
         counters.frames = stream.frames
         counters.refused += stream.too_long - self._too_long  # the bus itself may refuse something, too
@@ -256,6 +251,3 @@ class NativeStream(Stream):
 
     def _fit(self, batch: FrameBatch) -> None:
         self._stream.payload_size = min(self._payload_size, batch.payload_size)
-
-
-__all__ = ["NativeStream", "can_compile", "stream_of"]

@@ -159,6 +159,3 @@ def group_that_may(info: os.stat_result) -> grp.struct_group | None:
 def _known_ports(ports: list[Any]) -> str:
     known = [f"{port.device} ({port.description})" if port.vid else port.device for port in ports]
     return f"there are: {', '.join(known)}" if known else "there is none at all"
-
-
-__all__ = ["DEFAULT_BAUDRATE", "SerialOptions", "find_port", "group_that_may", "open_port"]

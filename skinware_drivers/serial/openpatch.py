@@ -132,14 +132,12 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         return [self._patch]
 
     async def configure(self, link: Link) -> None:
-        """Tell the patch its period and which modules are off."""
         if self._wanted_us:
             await self._set_period(link, self._wanted_us)
         for module in sorted(self._disabled):
             await self._ask(link, ENABLE, bytes((module, 0)))
 
     async def start(self, link: Link) -> None:
-        """Start the patch, if it still is the one that was described."""
         self._n_samples = None
         try:
             await self._ask(link, START, self._crc.to_bytes(4, "little"))
@@ -149,7 +147,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
             raise
 
     async def stop(self, link: Link) -> None:
-        """Make it silent."""
         await self._ask(link, STOP)
 
     @classmethod

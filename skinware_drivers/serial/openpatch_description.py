@@ -137,12 +137,10 @@ class Kind:
 
     @property
     def n_values(self) -> int:
-        """Number of values."""
         return sum(map(len, self.taxels))
 
     @property
     def has_sensors(self) -> bool:
-        """Whether any value means something."""
         return any(name is not None for taxel in self.taxels for name in taxel)
 
 
@@ -170,7 +168,6 @@ class Description:
 
     @property
     def name(self) -> str:
-        """Name of the patch."""
         both = f"{self.product} {self.serial_number}".strip()
         return both if len(both.encode()) <= MAX_NAME_BYTES else self.serial_number
 
@@ -193,7 +190,6 @@ class Description:
 
     @property
     def layout(self) -> Layout:
-        """How its data messages are read."""
         return Layout([_frame(number, kind) for number, kind in enumerate(self.kinds)])
 
 

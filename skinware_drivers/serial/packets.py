@@ -358,6 +358,3 @@ def _prefixes(pattern: Sequence[Sequence[int]]) -> bytes:
         return b""
     rest = _prefixes(pattern[1:])
     return _one_of(pattern[0]) + (b"(?:\\Z|" + rest + b")" if rest else b"")
-
-
-__all__ = ["Length", "LengthTable", "Packet", "PacketFramer", "Pattern"]

@@ -150,11 +150,9 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return f"Paxini high-speed board {await _ask_high_speed(link)}"
 
     async def start(self, link: Link) -> None:
-        """Have it send, if it can."""
         await self._described.start(link)
 
     async def stop(self, link: Link) -> None:
-        """Make it silent."""
         if self._board is not None:
             await self._board.stop(link)
 

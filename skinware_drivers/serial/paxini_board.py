@@ -64,6 +64,3 @@ class Board(ABC):
     @abstractmethod
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
         """Take the present forces as zero."""
-
-
-__all__ = ["Board"]

@@ -60,24 +60,20 @@ _TIMEOUT_S, _TRIES, _TIMEOUT_OF_ZERO_S = 0.1, 3, 2.0
 
 
 def read(sensor: int, address: int, count: int) -> bytes:
-    """The request for so many bytes, as it is sent."""
     sent = b"\x55\xaa" + struct.pack("<HBBBIH", 9, sensor, 0, _READ, address, count)
     return sent + LRC.to_bytes(sent)
 
 
 def write(sensor: int, address: int, value: int) -> bytes:
-    """The request to write one byte, as it is sent."""
     sent = b"\x55\xaa" + struct.pack("<HBBBIHB", 10, sensor, 0, _WRITE, address, 1, value)
     return sent + LRC.to_bytes(sent)
 
 
 def answer(sensor: int, function: int, address: int) -> Match:
-    """The reply to it, with this function."""
     return Match(_identifier(sensor, function, address), prefix=struct.pack("<BBI", 0, function, address))
 
 
 def _identifier(sensor: int, function: int, address: int) -> int:
-    """Of a reply."""
     return (sensor | function << 16 | (address & 0xFF) << 24) & IDENTIFIER.mask
 
 
@@ -93,7 +89,6 @@ async def ask_version(link: Link, sensor: int, *, tries: int = 1) -> str:
 
 
 def version_in(reply: bytes) -> str:
-    """What is printable in the reply to the question for the version."""
     return "".join(c for c in reply[_BODY_HEADER:].decode("ascii", "replace") if c.isprintable()).strip()
 
 
@@ -106,14 +101,12 @@ class Head(NamedTuple):
 
     @staticmethod
     def of(payload: bytes) -> Head:
-        """Of the body of a frame."""
         if len(payload) < _BODY_HEADER:
             return Head(-1, -1, -1)
         function, address, _, status = struct.unpack_from("<xBIHB", payload)
         return Head(function, address, status)
 
     def in_words(self, sensor: int) -> str:
-        """For people."""
         return f"sensor {sensor} answers with function {self.function:#04x}, status {self.status}, at {self.address}"
 
 
@@ -153,7 +146,6 @@ class ConverterBoard(Board):
         return [self._ask_who(sensor) if sensor in self._silent else poll for sensor, poll in self._polls.items()]
 
     async def is_there(self, link: Link) -> bool:
-        """Whether one of its sensors answers."""
         for sensor in self._wanted or SENSORS:
             try:
                 await ask_version(link, sensor)
@@ -261,6 +253,3 @@ def _frame(sensor: int, points: int) -> Frame:
     taxels_at = _BODY_HEADER + _BEFORE_TAXELS
     where = values(points, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
     return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor, flags=SATURATED)
-
-
-__all__ = ["SENSORS", "VERSION_BYTES", "ConverterBoard", "ask_version", "read", "version_in", "write"]

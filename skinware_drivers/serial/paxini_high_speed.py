@@ -64,13 +64,11 @@ _STRANGE_IN_A_ROW, _WITHIN_NS = 3, NS_PER_S
 
 
 def request(function: int, register: int, count: int, data: bytes = b"") -> bytes:
-    """A request as it is sent."""
     sent = b"\x55\xaa\0" + struct.pack("<BHH", function, register, count) + data
     return sent + LRC.to_bytes(sent)
 
 
 def version_request() -> bytes:
-    """The question for the version."""
     return request(_READ, _VERSION, VERSION_BYTES)
 
 
@@ -146,7 +144,6 @@ class HighSpeedBoard(Board):
         return patches
 
     def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
-        """The patch of a board with modules in these slots."""
         self._slots = list(slots)
         self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
         self.layout = Layout([_frame(slot) for slot in slots])
@@ -294,6 +291,3 @@ def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | 
 def _check_status(what: str, data: bytes) -> None:
     if data[:1] not in (b"", b"\0"):
         raise Refused(f"the board refuses to {what} with status {data[0]}", data[0])
-
-
-__all__ = ["STRANGE", "VERSION_BYTES", "HighSpeedBoard", "framing_of", "request", "version_request"]

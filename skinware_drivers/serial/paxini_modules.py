@@ -140,12 +140,10 @@ class Slot:
 
     @property
     def is_on_finger(self) -> bool:
-        """Whether it is none of the palm's."""
         return self.number < len(FINGERS) * len(_PLACES)
 
     @property
     def place(self) -> str:
-        """On the finger, or the number on the palm."""
         if self.is_on_finger:
             return _PLACES[self.number % len(_PLACES)]
         return str(self.number - len(FINGERS) * len(_PLACES) + 1)
@@ -179,17 +177,3 @@ def _from_the_end(slot: Slot) -> int:
 def _block(points: int) -> Grid:
     columns = math.isqrt(points - 1) + 1
     return Grid(-(-points // columns), columns)
-
-
-__all__ = [
-    "MOST_POINTS",
-    "POINTS_OF_PART",
-    "SATURATED",
-    "TAXEL",
-    "TYPES",
-    "Slot",
-    "model_of",
-    "module",
-    "nominal_places",
-    "values",
-]

@@ -81,7 +81,6 @@ class DescriptorPort(Port):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
 
     def fileno(self) -> int:
-        """The descriptor itself."""
         return self._fd
 
     def read(self, size: int) -> bytes:
@@ -110,7 +109,6 @@ class DescriptorPort(Port):
         return _write_some(self._fd, data)
 
     def close(self) -> None:
-        """Let go of it."""
         if self._serial is not None:
             if self._is_tty:
                 with contextlib.suppress(OSError):
@@ -144,7 +142,6 @@ class ThreadedPort(Port):
             thread.start()
 
     def fileno(self) -> int:
-        """An eventfd."""
         return self._event
 
     def read(self, size: int) -> bytes:
@@ -266,11 +263,9 @@ class PtyPort(Port):
             self.note += f", {link}"
 
     def fileno(self) -> int:
-        """The master's descriptor."""
         return self._fd
 
     def read(self, size: int) -> bytes:
-        """What programs have written to the port."""
         try:
             return os.read(self._fd, size)
         except BlockingIOError:
@@ -283,7 +278,6 @@ class PtyPort(Port):
         return _write_some(self._fd, data)
 
     def close(self) -> None:
-        """Take the port away."""
         if self._fd < 0:
             return
         if self._link and os.path.islink(self._link) and os.readlink(self._link) == self.path:
@@ -301,7 +295,6 @@ def _write_some(fd: int, data: bytes) -> int:
 
 
 def _set_up(fd: int, hang_up: bool) -> None:
-    """Set what pyserial has no name for."""
     with contextlib.suppress(termios.error):
         settings = termios.tcgetattr(fd)
         if not hang_up:
@@ -309,6 +302,3 @@ def _set_up(fd: int, hang_up: bool) -> None:
         # a read of nothing fails rather than return nothing, which then means that the device is gone
         settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
         termios.tcsetattr(fd, termios.TCSANOW, settings)
-
-
-__all__ = ["DescriptorPort", "Port", "PtyPort", "ThreadedPort"]

@@ -86,6 +86,3 @@ class _RecurringFramer(Framer):
                     break
             else:
                 return distance
-
-
-__all__ = ["Recurring"]

@@ -84,11 +84,9 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
         )
 
     async def start(self, link: Link) -> None:
-        """Start all patches."""
         await link.send(0, _START)
 
     async def stop(self, link: Link) -> None:
-        """Stop all patches."""
         await link.send(0, _STOP)
 
 

@@ -74,21 +74,17 @@ class _Splitter(Framer):
 
     @property
     def position(self) -> int:
-        """Of the whole frames."""
         return self._whole.position
 
     @property
     def pending(self) -> int:
-        """Of the whole frames."""
         return self._whole.pending
 
     @property
     def is_lost(self) -> bool:
-        """As for the whole frames."""
         return self._whole.is_lost
 
     def asked(self) -> None:
-        """As for the whole frames."""
         self._whole.asked()
 
     def feed(self, chunk: bytes) -> list[Framed]:
@@ -103,6 +99,3 @@ class _Splitter(Framer):
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         raise NotImplementedError  # the framer of the whole frames finds
-
-
-__all__ = ["Part", "Split", "Splitting", "by_length"]

@@ -81,20 +81,16 @@ class PythonStream(Stream):
 
     @property
     def pending(self) -> int:
-        """As the framer holds back."""
         return self._framer.pending
 
     @property
     def is_lost(self) -> bool:
-        """As the framer says."""
         return self._framer.is_lost
 
     def asked(self) -> None:
-        """Tell the framer."""
         self._framer.asked()
 
     def add(self, chunk: bytes, time_ns: int) -> None:
-        """Find the frames that it completes."""
         framer, counters = self._framer, self.counters.framing
         known = framer.position
         damaged = counters.checksum_errors + counters.refused
@@ -110,7 +106,6 @@ class PythonStream(Stream):
         self._forget_reads()
 
     def fill(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append what was found."""
         taken = 0
         while self._backlog and batch.free:
             framed, time_ns = self._backlog[0]
@@ -128,7 +123,6 @@ class PythonStream(Stream):
         return taken
 
     def take_damaged(self) -> bytes:
-        """The chunk, or nothing."""
         damaged, self._damaged = self._damaged, b""
         return damaged
 
@@ -147,6 +141,3 @@ class PythonStream(Stream):
             self._reads.clear()
         while self._reads and self._reads[0][0] <= undecided:
             self._reads.pop(0)
-
-
-__all__ = ["CHUNK", "PythonStream", "Stream"]

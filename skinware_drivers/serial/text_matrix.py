@@ -113,6 +113,3 @@ class _TextMatrixFramer(Framer):
         if max(map(max, numbers)) > 0xFF:
             return None
         return bytes((len(numbers), *columns, *(number for row in numbers for number in row)))
-
-
-__all__ = ["TextMatrix"]

@@ -100,6 +100,3 @@ class WeissAdapter(SerialAdapter[OptionsT]):
             command, arguments, Match(command), timeout_s=cls.timeout_s, tries=cls.tries if tries is None else tries
         )
         return cls.answers.result(command, reply.payload, size)
-
-
-__all__ = ["WeissAdapter", "weiss_answers", "weiss_packet"]

@@ -83,7 +83,6 @@ class _Matrix(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """How many."""
         return self.columns * self.rows
 
     @property
@@ -149,12 +148,10 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         return f"Weiss DSA controller with {len(matrices)} matrices"
 
     async def start(self, link: Link) -> None:
-        """Have it send, as fast as it can."""
         flags = _ON | (0 if self.options.rle_offset is None else _RLE)
         await self._ask(link, _ACQUIRE, struct.pack("<BH", flags, 30))
 
     async def stop(self, link: Link) -> None:
-        """Make it silent."""
         try:
             await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
         except Refused as error:
@@ -162,7 +159,6 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
 
     @operation(looks=True)
     async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002
-        """Serial number, hardware and software of the controller."""
         answer = await self._ask(link, _CONTROLLER, size=7)
         serial_number, hardware, software = struct.unpack_from("<IBH", answer)
         return {"serial_number": serial_number, "hardware": hardware, "software": software}
@@ -177,7 +173,6 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         return Split(_WHOLE, self._split)
 
     def _split(self, identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
-        """Data become a frame for each matrix, with the time."""
         if identifier != _DATA or len(body) < _HEADER:
             return [(identifier, body)]
         cells = body[_HEADER:]
@@ -211,6 +206,3 @@ def _expanded(coded: bytes) -> bytes:
     """Run lengths: how often in the upper four bits of each u16, what in the lower twelve."""
     units = np.frombuffer(coded[: len(coded) // 2 * 2], "<u2")
     return np.repeat(units & _FULL, units >> 12).astype("<u2").tobytes()
-
-
-__all__ = ["WeissDsaDriver", "WeissDsaOptions"]

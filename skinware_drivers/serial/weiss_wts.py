@@ -111,12 +111,10 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Its matrix, which it tells also while it sends."""
         columns, rows, *_ = await cls._ask_cells(link)
         return f"WTS with {columns} x {rows} cells"
 
     async def start(self, link: Link) -> None:
-        """Have it send by itself."""
         await self._ask(link, _START, struct.pack("<BH", _RLE if self.options.rle else 0, self.options.period_ms))
 
     async def stop(self, link: Link) -> None:
@@ -128,12 +126,10 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Take the present values as zero."""
         await self._ask(link, _TARE, bytes.fromhex(self.options.tare_payload))
 
     @operation(looks=True)
     async def temperature(self, link: Link, patches: Sequence[Patch]) -> float:  # noqa: ARG002
-        """Temperature of the sensor in degrees Celsius."""
         answer = await self._ask(link, _TEMPERATURE, size=2)
         return int.from_bytes(answer[:2], "little", signed=True) / 10
 

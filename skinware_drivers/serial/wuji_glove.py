@@ -124,16 +124,13 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         return f"Wuji {patch.name}"
 
     async def configure(self, link: Link) -> None:
-        """Set the rate, if the options want one."""
         if self._wanted_hz:
             await self._set_rate(link, self._wanted_hz)
 
     async def start(self, link: Link) -> None:
-        """Have it send."""
         await self._ask(link, _STREAM, bytes([self._on]))
 
     async def stop(self, link: Link) -> None:
-        """Make it silent."""
         await self._ask(link, _STREAM, b"\0")
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
@@ -154,7 +151,6 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     @operation()
     async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:  # noqa: ARG002
-        """Have the board send, or be silent."""
         await self._ask(link, _STREAM, bytes([on]))
         self._on = on
 

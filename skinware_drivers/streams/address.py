@@ -78,7 +78,6 @@ def unknown_name(address: Address, error: socket.gaierror) -> BusNotAvailable:
 
 
 def reason_of(error: OSError) -> str:
-    """Why, without what Python adds to it."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
@@ -98,6 +97,3 @@ def _mistake(channel: str) -> str:
 
 def _flags(host: str) -> int:
     return 0 if host else socket.AI_PASSIVE
-
-
-__all__ = ["Address", "Resolved", "parse_address", "reason_of", "unknown_name"]

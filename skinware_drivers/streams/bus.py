@@ -35,7 +35,6 @@ class NetworkBus(SerialBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus {self.scheme}://{self.channel}"
 
     @property
@@ -117,6 +116,3 @@ class ServerBus(SerialBus):
     def _hear(self, chunk: bytes, time_ns: int) -> None:
         self._heard_ns = time_ns
         super()._hear(chunk, time_ns)
-
-
-__all__ = ["NetworkBus", "ServerBus", "ServerOptions"]

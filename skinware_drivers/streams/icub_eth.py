@@ -76,7 +76,6 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
 
     @property
     def payload_size(self) -> int:
-        """That of CAN."""
         return self.payload_bytes
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -91,7 +90,6 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
         return patches
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
-        """Add what is heard now."""
         return self._boards.patches_heard(await link.listen(self.options.learn_s), known)
 
     async def revive(self, link: Link, patch: Patch) -> None:
@@ -99,8 +97,4 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Marks silent re-calibration."""
         return RoboskinDriver.watch(tables)
-
-
-__all__ = ["IcubEthDriver", "IcubEthOptions"]

@@ -64,5 +64,3 @@ _FRAMES = Packet(
     trailer=(0x21, 0x43, 0x65, 0x87),
     header=_HEADER,
 )
-
-__all__ = ["rops"]

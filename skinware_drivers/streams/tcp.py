@@ -84,15 +84,12 @@ class ListeningPort(Port):
 
     @property
     def caller(self) -> socket.socket | None:
-        """Who is there."""
         return self._caller
 
     def fileno(self) -> int:
-        """An epoll's descriptor."""
         return self._epoll.fileno()
 
     def read(self, size: int) -> bytes:
-        """What the caller has sent."""
         self._answer_callers()
         if self._caller is None:
             return b""
@@ -122,7 +119,6 @@ class ListeningPort(Port):
         return written
 
     def close(self) -> None:
-        """Hang up, and listen no more."""
         self._hang_up()
         self._epoll.close()
         self._listener.close()
@@ -236,6 +232,3 @@ def _has_gone(connection: socket.socket) -> bool:
         return False
     except OSError:
         return True
-
-
-__all__ = ["ListeningPort", "TcpBus", "TcpOptions", "TcpPort", "TcpServerBus", "connect", "keep_alive"]

@@ -94,7 +94,6 @@ class _Tip(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes that a finger sends."""
         return np.dtype(self.dtype).itemsize * self.values
 
 
@@ -166,7 +165,6 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """The one question."""
         what = _EVERYTHING if self.options.ask == "everything" else bytes([_FINGERTIPS])
         return [Poll(_ASK, what, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
 
@@ -210,7 +208,6 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return f"Tesollo {_MODELS[hand.model].name}"
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and still is what it was."""
         if await self._ask_version(link, tries=1) == self._hand:
             return True
         self.tell(patch, Notice.CHANGED)
@@ -253,7 +250,6 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return types, [axis.name if axis.name in names else None for axis in _AXES]
 
     def _order(self, tip: _Tip) -> Sequence[int]:
-        """Channel of each value as it is sent."""
         if tip.grid is None or self.options.cells == "by_row":
             return range(tip.values)
         rows, columns = tip.grid.rows, tip.grid.columns
@@ -297,6 +293,3 @@ def _geometry(model: _Model, tip: _Tip, fitted: Sequence[int], type_names: Seque
         [centre] = Hand(model.side).down(FINGERS[finger], [grid])
         places.append(grid.at(centre, type_names, [finger << 8 | cell for cell in range(grid.rows * grid.columns)]))
     return Geometry.joined(places)
-
-
-__all__ = ["TesolloDriver", "TesolloOptions"]

@@ -76,7 +76,6 @@ class UdpPort(Port):
             self.note = f"port {self._socket.getsockname()[1]} of this computer"
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def read(self, size: int) -> bytes:
@@ -109,7 +108,6 @@ class UdpPort(Port):
             return self._socket.sendto(data, self.peer)
 
     def close(self) -> None:
-        """Let go of the port."""
         self._socket.close()
 
     def _is_heard(self, sender: tuple[str, int]) -> bool:
@@ -182,6 +180,3 @@ class UdpBus(NetworkBus):
         if self._udp is not None:
             self.counters.refused += self._udp.foreign
             self._udp.foreign = 0
-
-
-__all__ = ["UdpBus", "UdpOptions", "UdpPort"]

@@ -80,7 +80,6 @@ class WebSocketBus(ServerBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus websocket:{self.channel}"
 
     def open(self) -> None:
@@ -122,7 +121,6 @@ class WebSocketBus(ServerBus):
         return self._web
 
     def _read(self, port: Port) -> None:
-        """One message."""
         if message := port.read(0):
             self._hear(message, now_ns())
 
@@ -134,6 +132,3 @@ class WebSocketBus(ServerBus):
         if not self._unusable:
             log.warning("%s: messages that are too long, or broke off, are left out (logged once)", self.name)
         self._unusable += 1
-
-
-__all__ = ["WebSocketBus", "split_url"]

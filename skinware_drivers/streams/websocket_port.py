@@ -65,7 +65,6 @@ class WebSocketPort(Port):
 
     @property
     def waiting(self) -> int:
-        """Messages that have come and were not read."""
         return len(self._messages)
 
     def fileno(self) -> int:
@@ -83,7 +82,6 @@ class WebSocketPort(Port):
         return self._messages.popleft() if self._messages else b""
 
     def write(self, data: bytes) -> int:
-        """Nothing can be written."""
         raise OSError(f"{self._url} is only read ({len(data)} bytes)")
 
     def close(self) -> None:
@@ -94,7 +92,6 @@ class WebSocketPort(Port):
         self._socket.close()
 
     def _greet(self) -> None:
-        """Ask for a websocket, as HTTP."""
         protocol, deadline_s = self._protocol, time.monotonic() + _GREETING_S
         protocol.send_request(protocol.connect())
         try:
@@ -171,6 +168,3 @@ class WebSocketPort(Port):
         self.unusable += bool(self._parts)
         self._parts = []
         return BusNotAvailable(f"{self._url}: the connection is lost ({error.strerror or error})")
-
-
-__all__ = ["LONGEST", "WebSocketPort"]

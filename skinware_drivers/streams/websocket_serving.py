@@ -40,7 +40,6 @@ class ServingPort(Port):
         self.note = self._line.note
 
     def fileno(self) -> int:
-        """That of the one that listens."""
         return self._line.fileno()
 
     def read(self, size: int) -> bytes:
@@ -58,7 +57,6 @@ class ServingPort(Port):
         return b""
 
     def write(self, data: bytes) -> int:
-        """Send each line as a message, if there is somebody to send it to."""
         if self._protocol.state is State.OPEN and self._line.caller is not None and len(self._unsent) < _MOST_UNSENT:
             for line in data.splitlines():
                 self._protocol.send_text(line)
@@ -66,7 +64,6 @@ class ServingPort(Port):
         return len(data)
 
     def close(self) -> None:
-        """Hang up, and listen no more."""
         self._line.close()
 
     def _send(self) -> None:
@@ -93,11 +90,7 @@ class WebSocketServerBus(SerialBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus websocket:{self.channel}"
 
     def _open_port(self) -> Port:
         return ServingPort(self._address, self._options.patience_s)
-
-
-__all__ = ["ServingPort", "WebSocketServerBus"]

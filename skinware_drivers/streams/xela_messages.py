@@ -38,7 +38,6 @@ class XelaMessages(Framing):
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
     def framer(self) -> Framer:
-        """Takes messages apart."""
         return _Messages()
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
@@ -140,6 +139,3 @@ def _counts(sensor: dict[str, Any]) -> list[int] | None:
     except (TypeError, ValueError):
         return None
     return values if fit else None
-
-
-__all__ = ["MOST_SENSORS", "MOST_TAXELS", "RAW", "Seen", "XelaMessages"]

@@ -103,7 +103,6 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
 
     @property
     def payload_size(self) -> int:
-        """Of a sensor with as many taxels as there can be."""
         return -(-self.framing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -138,7 +137,6 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         return f"XELA's server with {', '.join(patch.name for patch in patches)}"
 
     async def attend(self, link: Link) -> None:
-        """Notice when the server has other sensors."""
         with link.follow(_STRUCTURE) as told:
             while True:
                 seen = _read(await told.get())
@@ -187,6 +185,3 @@ def _read(told: object) -> Seen:
 def _of_model(model: str) -> tuple[int, int]:
     match = _GRID_OF.fullmatch(model)
     return (int(match[1]), int(match[2])) if match else (0, 0)
-
-
-__all__ = ["XelaServerDriver", "XelaServerOptions"]

@@ -68,11 +68,9 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     thermal: tuple[Annotated[int, Meta(ge=0, lt=CHANNELS)], ...] | None = None
 
     def places(self) -> list[tuple[int, int]]:
-        """(triangle, place of its first value)."""
         return [(triangle, self.first + CHANNELS * triangle) for triangle in self.triangles]
 
     def non_tactile(self) -> Sequence[int]:
-        """Channels that feel no touch."""
         return NON_TACTILE[self.kind] if self.thermal is None else self.thermal
 
 
@@ -225,6 +223,3 @@ class YarpDriver(SerialAdapter[YarpOptions]):
         if channel not in run.non_tactile():
             return Sensor("pressure", first + channel)
         return Sensor("temperature", first + channel) if self.options.values == "raw" else None
-
-
-__all__ = ["Triangles", "YarpDriver", "YarpOptions"]

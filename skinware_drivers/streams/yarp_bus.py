@@ -151,7 +151,6 @@ class YarpBus(ServerBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus yarp://{self.channel}"
 
     def _open_port(self) -> Port:
@@ -186,6 +185,3 @@ def _whole_messages(pile: bytes) -> tuple[bytes, bytes]:
         return pile[:at], pile[at:]
     cut = next((n for n in range(len(BEGIN) - 1, 0, -1) if pile.endswith(BEGIN[:n])), 0)
     return pile[: len(pile) - cut], pile[len(pile) - cut :]
-
-
-__all__ = ["YarpBus", "YarpPort", "split_channel"]

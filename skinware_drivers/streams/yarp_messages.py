@@ -64,7 +64,6 @@ class YarpMessages(Framing):
     maximum_body: int = field(default=4 + 4 * VALUES_OF_A_FRAME, init=False)
 
     def framer(self) -> Framer:
-        """Takes messages apart."""
         return _Messages(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
@@ -215,16 +214,3 @@ def _time_ms(envelope: bytes) -> int | None:
     if match is None:
         return None
     return int(float(match["time"]) * 1e3) & _U32 or None
-
-
-__all__ = [
-    "BEGIN",
-    "LENGTH",
-    "LONGEST",
-    "MOST_VALUES",
-    "PLAIN",
-    "TIMED",
-    "VALUES_OF_A_FRAME",
-    "YarpMessages",
-    "message_size",
-]

@@ -38,7 +38,6 @@ class _Conversation:
         self._heard = b""
 
     def lines(self) -> list[bytes]:
-        """The lines that have come."""
         *lines, self._heard = self._hear().split(b"\n")
         return [line.strip() for line in lines]
 
@@ -90,7 +89,6 @@ class ServedPort(Port):
         self.note = f"listens on {self._server.line.address}"
 
     def fileno(self) -> int:
-        """An epoll's descriptor."""
         return self._epoll.fileno()
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
@@ -105,14 +103,12 @@ class ServedPort(Port):
         return b""
 
     def write(self, data: bytes) -> int:
-        """Send it to who reads."""
         self._forget_reader()
         if self._is_read and len(self._port.unsent) < _MOST_UNSENT:
             self._port.say(data)
         return len(data)
 
     def close(self) -> None:
-        """Hang up, and listen no more."""
         self._epoll.close()
         self._server.line.close()
         self._port.line.close()
@@ -169,11 +165,7 @@ class YarpServerBus(SerialBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus yarp://{self.channel}"
 
     def _open_port(self) -> Port:
         return ServedPort(self._address, self._port_name, self._options.patience_s)
-
-
-__all__ = ["ServedPort", "YarpServerBus"]

@@ -92,8 +92,6 @@ class Pair:
         self.do(take)
 
     def feed_rows(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
-        """A batch of rows as the only bus wrote them."""
-
         def take(way: Way) -> None:
             way.empty()
             rows = slice(way.batch.stop, way.batch.stop + len(wire))
@@ -121,7 +119,6 @@ class Pair:
         return self.numpy.publisher.deadline_ns
 
     def do(self, action: Callable[[Way], object]) -> None:
-        """Do something with both, and compare what came of it."""
         before = self.numpy.publisher.sequence
         told: list[list[str]] = []
         for way in self._both:
@@ -172,7 +169,6 @@ def _listening() -> Iterator[list[str]]:
 
 @contextmanager
 def hand_clock(begin_ns: int = 0) -> Iterator[HandClock]:
-    """A clock that the whole package is on, and that begins there at the earliest."""
     clock = HandClock()
     clock.now_ns = max(clock.now_ns, begin_ns)
     with package_on(clock):
@@ -208,6 +204,3 @@ def require_same(
 def why_python() -> str:
     """Why there is nothing to compare with on this machine; empty if there is."""
     return native.why_python() or skinware.native.why_python()
-
-
-__all__ = ["Pair", "hand_clock", "require_same", "why_python"]

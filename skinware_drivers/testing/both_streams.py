@@ -41,21 +41,17 @@ class BothStreams(Stream):
 
     @property
     def is_behind(self) -> bool:
-        """Whether one of them is."""
         return self._python.is_behind or self._native.is_behind
 
     @property
     def pending(self) -> int:
-        """As both hold back."""
         return self._python.pending
 
     def add(self, chunk: bytes, time_ns: int) -> None:
-        """To both."""
         self._python.add(chunk, time_ns)
         self._native.add(chunk, time_ns)
 
     def fill(self, batch: FrameBatch, ordinal: int) -> int:
-        """By both, each into rows of its own."""
         other, first = deepcopy(batch), batch.stop
         taken = self._python.fill(batch, ordinal)
         found = self._native.fill(other, ordinal)
@@ -71,7 +67,6 @@ class BothStreams(Stream):
         return taken
 
     def take_damaged(self) -> bytes:
-        """As both say, once they are through."""
         if self._native.is_behind:
             return b""
         damaged = self._python.take_damaged()
@@ -130,6 +125,3 @@ def made(
         return PythonStream(framing, payload_size, counters)
     in_c = kind(library, framing, payload_size, deepcopy(counters))
     return BothStreams(in_c, framing, payload_size, counters)
-
-
-__all__ = ["BothStreams", "both_streams", "made"]

@@ -48,6 +48,3 @@ class CaptureTests:
         compared, _ = check_capture(capture, self.driver, self.driver_options)
         require(compared.then, f"{capture}: nothing was decoded then; look at what is now, and save it (skin-prove)")
         require(compared.difference is None, f"{capture}: {compared.difference}")
-
-
-__all__ = ["CaptureTests"]

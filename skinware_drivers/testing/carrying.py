@@ -107,6 +107,3 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
     require(not thread.is_alive(), "the emulated patch did not stop")
     if control.failure is not None:
         raise control.failure
-
-
-__all__ = ["emulated_on", "emulated_on_a_pty", "emulated_over_tcp"]

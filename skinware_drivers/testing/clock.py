@@ -132,6 +132,3 @@ def _where(thread: threading.Thread) -> str:
 
 def _short_trace(error: BaseException) -> str:
     return "".join(traceback.format_exception(error)[-5:])
-
-
-__all__ = ["run_in_its_time"]

@@ -80,7 +80,6 @@ class Comparison:
         return [update for update in self.updates if update.burst is None]
 
     def bursts_shown(self, module: int) -> list[int]:
-        """Of its device, in the order in which they were shown."""
         return [u.burst for u in self.updates if u.module == module and u.burst is not None]
 
     def require_right(self, because: str = "") -> None:
@@ -119,7 +118,6 @@ class Comparison:
             )
 
     def _whose(self, module: int) -> int | None:
-        """The other module whose values a module shows, if nearly all of its updates do."""
         frames = [update.frame for update in self.updates if update.module == module]
         if len(frames) < _FEWEST_UPDATES or self.bursts_shown(module):
             return None
@@ -226,7 +224,6 @@ class Comparison:
         return int(np.searchsorted(self._felt_ns[device], self.rig.record.times_ns[frame], side="right")) - 1
 
     def _explain(self, sensor: int) -> str:
-        """What a sensor shows instead of what it feels."""
         structure, n = self.structure, self.rig.truth.n_values
         module = int(structure.sensor_module[sensor])
         device = self._device[module]
@@ -311,6 +308,3 @@ def transforms(bits: int) -> list[tuple[str, str, Callable[[Values], Values]]]:
 
 def _signed(v: Values, bits: int) -> Values:
     return np.where(v >= 1 << (bits - 1), v - (1 << bits), v)
-
-
-__all__ = ["Comparison", "Update"]

@@ -43,6 +43,3 @@ class DriverConformance(SilenceTests, PathTests, TornTests, FaultTests, LifeTest
         driver_options: options of the driver, as in a configuration file.
         emulator_options: options of the emulator, beside what the tests need.
     """
-
-
-__all__ = ["DriverConformance"]

@@ -16,6 +16,3 @@ def require(condition: object, what: str) -> None:
     """Fail the test unless something holds."""
     if not condition:
         defect(what)
-
-
-__all__ = ["defect", "require"]

@@ -210,6 +210,3 @@ def emulated_skin(
         driving = running.enter_context(driving_lines([(adapter, line)], name))
         reader = running.enter_context(DriverReader(name, timeout_s=_LONGEST_S))
         yield EmulatedSkin(driving, reader, line, hardware)
-
-
-__all__ = ["Driving", "EmulatedSkin", "driving_lines", "emulated_skin"]

@@ -110,6 +110,3 @@ class FaultTests(Suite):
         rig.wire.fault = None
         await rig.sleep(4 * rig.adapter.period_s)
         require(len(rig.wire.damages) >= _DAMAGES // 2, "the emulated devices send too little to test faults with")
-
-
-__all__ = ["FaultTests"]

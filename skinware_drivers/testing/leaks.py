@@ -42,6 +42,3 @@ def _descriptors() -> set[tuple[str, str]]:
         if not target.startswith(("/proc", "/dev/null", "pipe:[")):  # pytest's own capturing and multiprocessing's
             found.add((number, target))
     return found
-
-
-__all__ = ["Belongings", "files_left"]

@@ -49,8 +49,6 @@ class LifeTests(Suite):
     """Description, handshakes, stop, listening, leaks."""
 
     def test_the_description_is_valid_complete_and_stable(self) -> None:
-        """The structure holds every sensor of the devices once, and is the same at every `describe`."""
-
         async def scenario(clock: HandClock) -> None:
             async with self.handshakes(clock) as rig:
                 first = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
@@ -166,8 +164,6 @@ class LifeTests(Suite):
         play(scenario)
 
     def test_devices_are_silent_again_after_stop(self) -> None:
-        """Devices that were silent before a driver started them are silent after it has stopped."""
-
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
             async with rig:
@@ -220,8 +216,6 @@ class LifeTests(Suite):
         require(not left, f"left behind {when}: {', '.join(left)}: what `start` opens, `stop` must close")
 
     def test_memory_does_not_grow(self) -> None:
-        """Data indefinitely, in the same memory."""
-
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
             rig.record.keep = False
@@ -243,8 +237,6 @@ class LifeTests(Suite):
         play(scenario)
 
     def test_a_listener_sends_nothing(self) -> None:
-        """With `--listen-only` nothing is sent, and nothing is even tried, whatever the devices do."""
-
         async def scenario(clock: HandClock, streaming: bool) -> None:
             async with self.running(clock, listen_only=True, streaming=streaming) as rig:
                 await rig.sleep(_LISTEN_S)
@@ -260,7 +252,6 @@ class LifeTests(Suite):
 
 
 def _pieces() -> int:
-    """Pieces of memory that are in use."""
     gc.collect()
     return sys.getallocatedblocks()
 
@@ -279,6 +270,3 @@ async def _where_it_grows(rig: Running) -> str:
     ours = [tracemalloc.Filter(False, f"*/skinware_drivers/{part}/*") for part in ("testing", "virtual")]
     first, second = (snapshot.filter_traces(ours) for snapshot in snapshots)
     return str(max(second.compare_to(first, "lineno"), key=lambda change: change.count_diff).traceback)
-
-
-__all__ = ["LifeTests"]

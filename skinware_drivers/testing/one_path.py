@@ -74,7 +74,6 @@ class Asking:
         return min(self.waiting, default=NOBODY_WAITS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
-        """A frame was published."""
         self.answered.append((oldest_ns, position[1]))
         self.waiting = [time_ns for time_ns in self.waiting if time_ns > oldest_ns]
 
@@ -87,7 +86,6 @@ class Marking(Watch):
         self.seen: list[bytes] = []
 
     def look(self, updates: Updates) -> None:
-        """Mark the modules of flagged values."""
         self.module_status[updates.module[updates.status.any(axis=1)]] |= np.uint8(Status.SUSPECT)
         parts = updates.module, updates.whole, updates.status, updates.oldest_ns, updates.newest_ns, updates.sensors
         self.seen.append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
@@ -99,7 +97,6 @@ class MarkingAll(Marking):
     sees_all = True
 
     def look(self, updates: Updates) -> None:
-        """Mark, and have enough some time."""
         super().look(updates)
         self.sees_all = len(self.seen) < 10
 
@@ -158,15 +155,12 @@ class Way:
         raise NotImplementedError
 
     def publish_if_due(self, read_ns: int) -> None:
-        """Publish if the time has come."""
         raise NotImplementedError
 
     def inside(self) -> Arrays:
-        """What only this path keeps in its own way."""
         raise NotImplementedError
 
     def arrays(self) -> Arrays:
-        """Everything that is known."""
         decoder, state, publisher = self.decoder, self.decoder.state, self.publisher
         found: Arrays = {name: getattr(state, name) for name in _OF_STATE}
         found |= {name: getattr(publisher, name) for name in _OF_PUBLISHER}
@@ -196,7 +190,6 @@ class Way:
         return found | self.inside()
 
     def frame(self, sequence: int) -> Arrays:
-        """One of the newest frames."""
         frame = self.reader._ring.copy(sequence)
         if frame is None:
             defect(f"frame {sequence} is not in the ring")
@@ -204,7 +197,6 @@ class Way:
         return found | {"acquired_ns": frame.acquired_ns}
 
     def close(self) -> None:
-        """Let go of the ring."""
         self.reader.close()
         self.writer.close()
 
@@ -271,6 +263,3 @@ class NativeWay(Way):
             "newest_ns": int(words.newest_ns),
             "deadline_ns": self._path.deadline_ns,
         }
-
-
-__all__ = ["Marking", "MarkingAll", "Publishing", "Way"]

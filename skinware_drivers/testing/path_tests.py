@@ -75,6 +75,3 @@ class PathTests(Suite):
                 return heard, rig
 
         return play(scenario)
-
-
-__all__ = ["PathTests"]

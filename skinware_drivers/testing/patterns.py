@@ -55,6 +55,3 @@ def extreme(emulator: Any) -> Pattern:
         return np.clip(moments[which % len(moments)], lowest, highest)
 
     return feel
-
-
-__all__ = ["extreme", "limits", "lively"]

@@ -73,7 +73,6 @@ class Trouble:
     until_ns: int = 0
 
     def in_words(self, recording: Recording) -> str:
-        """For people."""
         words = f"{self.lost} frames in a row were lost, from frame {self.first % recording.size + 1} of a burst on"
         if self.held is None:
             return words
@@ -208,7 +207,6 @@ def _troubles_at(recording: Recording, first: int, step: int) -> Iterator[Troubl
 
 
 def _suffer(recording: Recording, troubles: Sequence[Trouble]) -> tuple[Indices, Indices]:
-    """Rows of the recording that arrive, one trouble after the other, and when they do."""
     row, span_ns = np.arange(len(recording.wire)), _span_ns(recording)
     rows, times_ns = [], []
     for number, trouble in enumerate(troubles):
@@ -237,12 +235,8 @@ def _decode(decoder: Decoder, wire: npt.NDArray[Any], time_ns: Indices) -> Updat
 
 
 def _marks(updates: Updates, n_sensors: int) -> Indices:
-    """(n,) a number for the module and the values of each update, another one for each other."""
     values = np.where(updates.sensors == n_sensors, 0, updates.values).astype(updates.values.dtype)
     data = np.ascontiguousarray(values).view(np.uint8).reshape(len(updates), -1).astype(np.int64)
     factors = np.random.default_rng(3).integers(1, 1 << 62, data.shape[1])
     marks: Indices = data @ factors + updates.module * 0x9E37_79B9_7F4A_7C1
     return marks
-
-
-__all__ = ["BURSTS", "Outcome", "Recording", "Trouble", "counter_values", "find_torn", "record", "try_troubles"]

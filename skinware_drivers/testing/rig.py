@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.realtime import NS_PER_S
 from skinware.samples import sample_report, sample_text
@@ -26,7 +27,6 @@ from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import (
     EmulatedBus,
-    EmulatedSerialBus,
     Interference,
     Pattern,
     Truth,
@@ -58,7 +58,6 @@ class Case:
     shown: Callable[[Sequence[int]], Sequence[int]]
 
     def adapter(self) -> AnyAdapter:
-        """The driver's object for one bus."""
         adapter = self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
         try:
             adapter.check()
@@ -92,7 +91,6 @@ class Recorder:
         self._clock = clock
 
     def look(self, runner: Runner) -> None:
-        """Take what was published."""
         if self.reader is None:
             if runner.writer is None or runner.writer.closed:
                 return
@@ -117,7 +115,6 @@ class Recorder:
             self.times_ns.append(self._clock.now_ns)
 
     def close(self) -> None:
-        """Let go of the reader."""
         if self.reader is not None:
             self.reader.close()
 
@@ -155,7 +152,6 @@ class Rig:
 
     @property
     def n_values(self) -> int:
-        """Of all devices."""
         return self.truth.n_values * len(self.numbers)
 
 
@@ -175,12 +171,10 @@ class Handshakes(Rig):
         self.close()
 
     def open(self) -> None:
-        """Open the bus."""
         self.bus.open()
         asyncio.get_running_loop().add_reader(self.bus.fileno(), self._hear)
 
     def close(self) -> None:
-        """Close the bus."""
         if self.bus.fileno() >= 0:
             asyncio.get_running_loop().remove_reader(self.bus.fileno())
         self.bus.close()
@@ -217,7 +211,6 @@ class Running(Rig):
         return self
 
     def _count_answers(self, runner: Runner) -> None:
-        """Count the frames that were answers to handshakes, which no counter tells."""
         link = runner.lines[0].link
         offer = link.offer
 
@@ -372,31 +365,14 @@ def is_fresh(frame: DriverFrame) -> bool:
 
 
 def is_live(frame: DriverFrame) -> bool:
-    """Whether bus and patches are all live."""
     return bool((frame.patch_state == PatchState.LIVE).all() and (frame.bus_state == BusState.LIVE).all())
 
 
 def sensor_name(structure: Structure, sensor: int) -> str:
-    """For authors, who know their sensors by uid."""
     type_name = next(t.name for t in structure.types if t.id == structure.sensor_type[sensor])
     return f"{structure.sensor_name(sensor)} ({type_name}, uid {int(structure.sensor_uid[sensor]):#x})"
 
 
 def play(scenario: Callable[[HandClock], Coroutine[Any, Any, T]]) -> T:
-    """Run a scenario in time of its own."""
     clock = HandClock()
     return run_in_its_time(clock, lambda: scenario(clock))
-
-
-__all__ = [
-    "SHOWN_ANYWAY",
-    "Case",
-    "EmulatedSerialBus",
-    "Handshakes",
-    "Recorder",
-    "Running",
-    "is_fresh",
-    "is_live",
-    "play",
-    "sensor_name",
-]

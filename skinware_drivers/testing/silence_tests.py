@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverFrame
+from skinware.driver_frame import DriverFrame
 from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.bus import FrameBatch
@@ -93,8 +93,6 @@ class SilenceTests(Suite):
         play(scenario)
 
     def test_restarted_devices_come_back(self) -> None:
-        """A device that loses its power for a moment is set up and started anew, and disturbs no other."""
-
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock, boot_s=0.5) as rig:
                 await rig.until_fresh()
@@ -122,7 +120,6 @@ class SilenceTests(Suite):
         )
 
     async def _comes_back(self, rig: Running, after: str, within_s: float = 10.0) -> None:
-        """Everything is fresh again, and right."""
         end_ns = rig.clock.now_ns
         await rig.until(
             lambda frame: frame.acquired_ns > end_ns and is_fresh(frame) and is_live(frame),
@@ -179,6 +176,3 @@ def _show(
     found = np.zeros(decoder.tables.structure.n_sensors + 1, bool)
     found[updates.sensors[updates.whole]] = True
     return found[:-1]
-
-
-__all__ = ["SilenceTests"]

@@ -38,7 +38,6 @@ class Stumbling:
         return self._until_ns if self._held else None
 
     def pass_on(self, frames: list[WireFrame], now_ns: int) -> list[WireFrame]:
-        """What of these frames, and of those held back, goes onto the wire now."""
         self._next_ns = self._next_ns or now_ns + self._pause_ns()
         for frame in frames:
             if frame.time_ns >= self._next_ns:
@@ -65,6 +64,3 @@ class Stumbling:
 
     def _pause_ns(self) -> int:
         return round(_BETWEEN * self._period_ns * self._random.uniform(0.8, 1.6))
-
-
-__all__ = ["Stumbling"]

@@ -33,7 +33,6 @@ class Suite:
 
     @property
     def case(self) -> Case:
-        """What is tested."""
         return Case(self.driver, self.emulator, self.driver_options, self.emulator_options, self.shown)
 
     def running(self, clock: HandClock, **more: Any) -> Running:
@@ -41,12 +40,10 @@ class Suite:
         return Running(self.case, clock, more.pop("pattern", lively)(self.emulator), **more)
 
     def handshakes(self, clock: HandClock, **more: Any) -> Handshakes:
-        """The driver's handshakes alone."""
         return Handshakes(self.case, clock, lively(self.emulator), **more)
 
     @staticmethod
     def require_all_counted(rig: Running) -> None:
-        """Every frame that came in was shown, or counted as something."""
         counters = rig.counters()
         came = counters["frames"] + counters["refused"] + counters["lost"]
         if rig.adapter.medium == "can":
@@ -62,6 +59,3 @@ class Suite:
             0 <= counters["frames"] - used <= groups * (layout.cycle_length - 1),  # which may still wait for others
             f"{counters['frames']} frames came in, {used} were shown, counted, or answers to the driver: {counters}",
         )
-
-
-__all__ = ["Suite"]

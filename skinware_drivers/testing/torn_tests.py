@@ -74,7 +74,6 @@ class TornTests(Suite):
 
 
 def _require_counting(recording: Recording) -> None:
-    """A counter counts."""
     numbers = counter_values(recording)
     if len(numbers) == 1:
         defect(
@@ -137,6 +136,3 @@ class Heard:
         wire, time_ns = np.concatenate([t.wire for t in self.takes]), np.concatenate([t.time_ns for t in self.takes])
         adapter = self._rig.adapter
         return record(adapter.layout, self.tables, adapter.period_s, wire, time_ns, bursts)
-
-
-__all__ = ["Heard", "Take", "TornTests"]

@@ -123,6 +123,3 @@ def _mean_interval_s(times_ns: Sequence[int]) -> float:
     """
     intervals_ns = np.diff(times_ns)
     return float(np.mean(intervals_ns[intervals_ns < 2 * np.median(intervals_ns)])) / 1e9
-
-
-__all__ = ["ValueTests"]

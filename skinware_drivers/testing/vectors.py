@@ -140,7 +140,6 @@ def _framed(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], Frame
 
 
 def _overheard(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
-    """Likewise of a line on which Modbus is spoken."""
     counters = BusCounters()
     listener = Listener(adapter.wanted, counters)
     listener.heard(stream, NS_PER_S)
@@ -208,7 +207,6 @@ class _Nobody:
 
 
 def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[Patch]:
-    """The declared ones, or those that ``describe`` finds."""
     if type(adapter).describe is Adapter.describe:
         return adapter.patches
     clock = HandClock()
@@ -241,6 +239,3 @@ def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[
 def _bytes(data: str | bytes) -> bytes:
     """Spaces between hexadecimal digits may be anywhere, or nowhere."""
     return bytes.fromhex("".join(data.split())) if isinstance(data, str) else data
-
-
-__all__ = ["Shown", "decode_frames", "decode_stream"]

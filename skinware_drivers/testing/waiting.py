@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import ServiceTimeout
 from skinware.samples import sample_report, sample_text
 from skinware.status import Status
@@ -63,7 +64,6 @@ def read_until(
 
 
 def _in_words(reader: DriverReader, frame: DriverFrame) -> str:
-    """What is not as it should be in a frame."""
     told = [f"of the last, {np.count_nonzero(frame.status == 0)} of {len(frame.status)} sensors are fresh"]
     told += [f"{n} {bit.name}" for bit in Status if (n := np.count_nonzero(frame.status & np.uint8(bit)))]
     for bus, counters in enumerate(reader.bus_counters(frame)):
@@ -72,6 +72,3 @@ def _in_words(reader: DriverReader, frame: DriverFrame) -> str:
         samples = [sample_text(sample) for sample in sample_report(frame.bus_samples[bus])]
         told += [f"for example {', '.join(samples)}"] if samples else []
     return ", ".join(told)
-
-
-__all__ = ["read_until", "wait_until"]

@@ -74,7 +74,6 @@ class Truth:
         self._shown = shown
 
     def __call__(self, number: int, cycle: int) -> Sequence[int]:
-        """What a device feels now."""
         felt: list[int] = self.pattern(number, cycle, self.n_felt).tolist()
         if self.remember:
             burst = Burst(self._clock.now_ns, np.array(self._shown(felt)))
@@ -130,25 +129,21 @@ class Interference:
 
     @property
     def datagrams(self) -> bool:
-        """Whether the devices send datagrams."""
         return bool(getattr(self.hardware, "datagrams", False))
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        """What the driver sends."""
         if self.remember:
             self.sent.append((identifier, payload))
         if not self.silent:
             self.hardware.receive(identifier, payload, now_ns)
 
     def next_due_ns(self) -> int | None:
-        """When the next frame may come."""
         moments = [self.hardware.next_due_ns(), self.stumbling.due_ns if self.stumbling is not None else None]
         if self.foreign:
             moments.append(self._next_foreign_ns)
         return min((moment for moment in moments if moment is not None), default=None)
 
     def emit(self, now_ns: int) -> list[WireFrame]:
-        """What comes through."""
         frames = [frame for frame in self.hardware.emit(now_ns) if self.keep(frame.identifier, frame.payload)]
         if self.silent:
             return []
@@ -169,7 +164,6 @@ class Interference:
         return self.hardware.skip(now_ns)
 
     def totals(self) -> dict[str, int]:
-        """Of the devices."""
         return self.hardware.totals()
 
     def _damage(self, frame: WireFrame) -> list[WireFrame]:
@@ -240,7 +234,6 @@ class _EmulatedPort(Port):
         self._timer.close()
 
     def wake(self) -> None:
-        """Have it read at once."""
         self._timer.wake_at(0)
 
     def _wake(self) -> None:
@@ -282,7 +275,6 @@ class _OnLine(Bus):
         return self._line.open()
 
     def vanish(self) -> None:
-        """Go away, as if unplugged."""
         self._line.vanish()
 
     def come_back(self) -> None:
@@ -314,7 +306,6 @@ EmulatedBus = VirtualCanBus | EmulatedSerialBus | EmulatedModbusBus
 
 
 def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
-    """An emulated bus of the medium that a driver speaks."""
     if adapter.medium in ("can", "virtual"):
         return VirtualCanBus.with_hardware(
             hardware,
@@ -335,18 +326,3 @@ def foreign_identifiers(own: Collection[int]) -> list[int]:
     others = [i for i in range(0x7FF) if i not in own]
     extended = [EXTENDED_FLAG | 0x1234_0000 | i for i in (1, 0x710)]
     return random.Random(2).sample(others, min(40, len(others))) + [i for i in extended if i not in own]
-
-
-__all__ = [
-    "Burst",
-    "Damage",
-    "EmulatedBus",
-    "EmulatedModbusBus",
-    "EmulatedSerialBus",
-    "Fault",
-    "Interference",
-    "Pattern",
-    "Truth",
-    "foreign_identifiers",
-    "make_bus",
-]

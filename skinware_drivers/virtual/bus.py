@@ -103,7 +103,6 @@ class VirtualCanBus(Bus):
 
     @property
     def name(self) -> str:
-        """As a user writes it, for the hardware that is emulated."""
         return f"bus virtual:{self._emulated}"
 
     def fits(self, medium: str) -> bool:
@@ -111,7 +110,6 @@ class VirtualCanBus(Bus):
         return medium in ("can", "virtual")
 
     def instead(self, medium: str) -> str:
-        """Emulators of devices on that medium."""
         return emulators_instead(medium) or super().instead(medium)
 
     def open(self) -> None:
@@ -183,7 +181,6 @@ class VirtualCanBus(Bus):
     # Faults of the bus itself, for tests
 
     def fail_next_receive(self, error: BusError) -> None:
-        """Let the next ``receive`` raise ``error``, and wake whoever waits for it."""
         self._next_error = error
         self._wake_at(_AT_ONCE)
 
@@ -246,6 +243,3 @@ def _packer(payload_size: int) -> Callable[[int, int, bytes], bytes]:
     if wire_dtype(payload_size)["length"].itemsize > 1:
         return struct.Struct(f"=II{payload_size}s").pack
     return struct.Struct(f"=IB3x{payload_size}s").pack
-
-
-__all__ = ["DEFAULT_EMULATOR", "VirtualCanBus"]

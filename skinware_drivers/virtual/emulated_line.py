@@ -47,11 +47,9 @@ class _EmulatedLine(Bus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus virtual:{self.channel}"
 
     def instead(self, medium: str) -> str:
-        """Emulators of devices on that medium."""
         return emulators_instead(medium) or super().instead(medium)
 
     def _open_port(self) -> Port:
@@ -103,6 +101,3 @@ class _EmulatedPort(Port):
 
     def _wake_when_due(self) -> None:
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
-
-
-__all__ = ["VirtualModbusBus", "VirtualSerialBus"]

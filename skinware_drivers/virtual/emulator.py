@@ -23,7 +23,7 @@ from skinware_drivers.virtual import events
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
 from skinware_drivers.virtual.foreign import ForeignTraffic
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.press import Press, on_a_grid
+from skinware_drivers.virtual.press import Press
 from skinware_drivers.virtual.stage import Actor, Stage
 from skinware_drivers.virtual.wire import Transmission, Transmitter
 
@@ -303,7 +303,6 @@ class Emulator(Stage, HasOptions[OptionsT]):
         return told
 
     def _each(self, name: str) -> npt.NDArray[np.int64]:
-        """(n_values,) of what the class says of all values at once, or of each."""
         return each_value(name, getattr(self, name), self._n_values)
 
     def _delay(self, device: Device, time_ns: int) -> int:
@@ -393,6 +392,3 @@ def each_value(name: str, said: int | Sequence[int], n_values: int) -> npt.NDArr
     if numbers.shape not in ((), (n_values,)):
         raise ConfigurationError(f"{name} has {numbers.size} numbers, `places` tells of {n_values} values")
     return np.broadcast_to(numbers, n_values)
-
-
-__all__ = ["CanFrame", "Device", "Emulator", "EmulatorOptions", "Source", "on_a_grid"]

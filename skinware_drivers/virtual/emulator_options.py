@@ -50,6 +50,3 @@ class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     def __post_init__(self) -> None:
         check_options(self)
-
-
-__all__ = ["Count", "EmulatorOptions", "Probability", "Seconds"]

@@ -177,26 +177,3 @@ class JsonLinesLog:
     def close(self) -> None:
         """Close the file. Idempotent."""
         self._file.close()
-
-
-__all__ = [
-    "BoardDied",
-    "BoardRestarted",
-    "BoardSilenced",
-    "BurstDelayed",
-    "CommandReceived",
-    "ErrorReported",
-    "Event",
-    "ForeignFrame",
-    "FrameDamage",
-    "FrameFault",
-    "Half",
-    "JsonLinesLog",
-    "LostHalf",
-    "Recalibrated",
-    "TaxelOutOfRange",
-    "TriangleFault",
-    "WrongLength",
-    "damaged_cycles",
-    "spoilt_bursts",
-]

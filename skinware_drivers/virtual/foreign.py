@@ -45,11 +45,9 @@ class ForeignTraffic:
         self._next_ns += 1 + int(self._random.exponential(self._pause_ns))
 
     def next_event_ns(self) -> int:
-        """When the next frame is handed to the wire."""
         return self._next_ns
 
     def run(self, now_ns: int) -> None:
-        """Queue what is due."""
         while self._next_ns <= now_ns:
             identifier = self._identifiers[int(self._random.integers(len(self._identifiers)))]
             payload = self._random.bytes(int(self._random.integers(0, 8, endpoint=True)))
@@ -65,6 +63,3 @@ class ForeignTraffic:
             return 0
         self._next_ns = now_ns
         return 1 + int(missed_ns / self._pause_ns)
-
-
-__all__ = ["ForeignTraffic"]

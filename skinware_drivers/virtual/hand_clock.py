@@ -49,7 +49,6 @@ class HandClock:
         self._timers: set[HandTimer] = set()
 
     def __call__(self) -> int:
-        """The time."""
         return self.now_ns
 
     @property
@@ -64,16 +63,13 @@ class HandClock:
         return timer
 
     def forget(self, timer: HandTimer) -> None:
-        """Called by a timer that is closed."""
         self._timers.discard(timer)
 
     def next_timer_ns(self) -> int | None:
-        """When the next of the timers will be due. Those that are due already are their readers' affair."""
         due_ns = [timer.due_ns for timer in self._timers if timer.due_ns is not None and timer.due_ns > self.now_ns]
         return min(due_ns, default=None)
 
     def pass_to(self, time_ns: int) -> None:
-        """Let time pass."""
         for action in self.before_passing:
             action()
         self.now_ns = max(self.now_ns, time_ns)
@@ -100,7 +96,6 @@ class HandTimer:
         self.look()
 
     def look(self) -> None:
-        """Whether it is time."""
         due = self.due_ns is not None and self.due_ns <= self._clock.now_ns
         if due and not self._is_readable:
             os.eventfd_write(self._fd, 1)
@@ -109,7 +104,6 @@ class HandTimer:
         self._is_readable = due
 
     def close(self) -> None:
-        """Give the descriptor back. Idempotent."""
         if self._fd >= 0:
             self._clock.forget(self)
             os.close(self._fd)
@@ -126,7 +120,6 @@ class _PassingTime(selectors.EpollSelector):
         self._naps = 0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """What is ready, after time has passed until something is."""
         self._clock.turns += 1
         self._turns_now += 1
         if self._turns_now > _TURNS_AT_ONE_MOMENT:
@@ -160,7 +153,6 @@ class HandLoop(asyncio.SelectorEventLoop):
         super().__init__(_PassingTime(clock))
 
     def time(self) -> float:
-        """As the clock says, s."""
         return self._hand_clock.now_ns / 1e9
 
 
@@ -189,6 +181,3 @@ def package_on(clock: HandClock) -> Iterator[None]:
         time.sleep = real_sleep
         for module in users:
             vars(module)["now_ns"] = real_now_ns
-
-
-__all__ = ["HandClock", "HandLoop", "HandTimer", "NeverEnds", "package_on"]

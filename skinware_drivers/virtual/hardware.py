@@ -184,19 +184,3 @@ def load_emulator(name: str) -> HardwareFactory:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
     return cast("HardwareFactory", load(_EMULATOR, name))
-
-
-__all__ = [
-    "EMULATORS",
-    "EmulatedHardware",
-    "EventLog",
-    "HardwareFactory",
-    "PlacedHardware",
-    "Point",
-    "Pressing",
-    "WireFrame",
-    "emulators_instead",
-    "load_emulator",
-    "medium_of",
-    "next_read",
-]

@@ -25,6 +25,3 @@ def virtual_bus(
     has_places = isinstance(emulator, type) and issubclass(emulator, PlacedHardware)
     can = PlacedCanBus if has_places else VirtualCanBus
     return can(channel, options, payload_size=payload_size, listen_only=listen_only)
-
-
-__all__ = ["virtual_bus"]

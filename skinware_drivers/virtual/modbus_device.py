@@ -172,6 +172,3 @@ def _crc(data: bytes) -> bytes:
         for _ in range(8):
             remainder = remainder >> 1 ^ (0xA001 if remainder & 1 else 0)
     return remainder.to_bytes(2, "little")
-
-
-__all__ = ["ModbusEmulator"]

@@ -19,7 +19,6 @@ class PlacedCanBus(VirtualCanBus):
 
     @property
     def geometry(self) -> Geometry | None:
-        """Where the emulated sensors are."""
         return self.hardware.geometry()
 
     @operation()
@@ -38,6 +37,3 @@ class PlacedCanBus(VirtualCanBus):
             ValueError: the numbers make no sense, or nothing of the skin would feel it.
         """
         return self.hardware.press(Pressing.of(at_m, force_n, radius_m, seconds), self._clock())
-
-
-__all__ = ["PlacedCanBus"]

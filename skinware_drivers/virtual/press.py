@@ -50,6 +50,3 @@ def on_a_grid(count: int, columns: int, each: int = 1) -> npt.NDArray[np.float64
     rows = -(-count // columns)
     places = np.stack([(number % columns + 0.5) / columns, (number // columns + 0.5) / rows], axis=1)
     return np.repeat(places, each, axis=0)
-
-
-__all__ = ["Press", "on_a_grid"]

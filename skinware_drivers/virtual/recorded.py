@@ -82,7 +82,6 @@ class ReplayedCanBus(VirtualCanBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus {self._name}"
 
 
@@ -98,7 +97,6 @@ class ReplayedSerialBus(SerialBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus {self._name}"
 
     def _open_port(self) -> Port:
@@ -106,7 +104,6 @@ class ReplayedSerialBus(SerialBus):
         return self._recorded
 
     def _read(self, port: Port) -> None:
-        """One read, with its own time."""
         chunk = port.read(0)
         if chunk and self._recorded is not None:
             self._hear(chunk, self._recorded.read_ns)
@@ -226,6 +223,3 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     of_driver = f" of {driver}" if driver else ""
     what = "which bus?" if found else f"no bus {bus}{of_driver};"
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")
-
-
-__all__ = ["Clock", "Recorded", "ReplayOptions", "first_of", "medium_of", "recorded_driver", "replayed_bus", "wire_of"]

@@ -44,7 +44,6 @@ class Conversation:
         self._waiting: list[Message] = []
 
     def heard(self, chunk: bytes, time_ns: int, *, is_sent: bool) -> None:
-        """Take what was sent, or received, then."""
         if self._line is not None:
             self._follow(self._line, chunk, time_ns)
             return
@@ -118,17 +117,14 @@ class ReplayedModbusBus(ModbusBus):
 
     @property
     def name(self) -> str:
-        """As a user writes it."""
         return f"bus {self._name}"
 
     @property
     def asks(self) -> bool:
-        """No."""
         return False
 
     @property
     def reads_natively(self) -> bool:
-        """No."""
         return False
 
     def use(self, wanted: Wanted, *timing: Any) -> None:
@@ -137,7 +133,6 @@ class ReplayedModbusBus(ModbusBus):
         self._conversation = Conversation(self._wanted, self.counters, over_tcp=self._over_tcp)
 
     def open(self) -> None:
-        """Begin, or go on."""
         if self._recorded is None:
             self._recorded = self._begin_port()
 
@@ -146,7 +141,6 @@ class ReplayedModbusBus(ModbusBus):
         return -1 if self._recorded is None else self._recorded.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames of what is due."""
         port, talk = self._recorded, self._conversation
         if port is None:
             raise BusNotAvailable(f"{self!r} is not open")
@@ -172,7 +166,6 @@ class ReplayedModbusBus(ModbusBus):
         port.wake()
 
     def close(self) -> None:
-        """Stop. Idempotent."""
         port, self._recorded = self._recorded, None
         if port is not None:
             port.close()
@@ -186,6 +179,3 @@ def was_over_tcp(items: Iterable[WireItem]) -> bool:
     except ValueError:
         return False
     return bool(messages) and wire.is_question(messages[0].data)
-
-
-__all__ = ["Conversation", "ReplayedModbusBus", "was_over_tcp"]

@@ -68,7 +68,6 @@ class RecordedWire:
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        """Take a question."""
         self._counts["commands"] += 1
         self._asked_ns = now_ns
         self._asked.setdefault(identifier, deque(maxlen=1000)).append((now_ns, payload))
@@ -89,7 +88,6 @@ class RecordedWire:
         return asked[0][0] if is_early else max(due_ns, asked[0][0])
 
     def emit(self, now_ns: int) -> list[WireFrame]:
-        """What is due."""
         found: list[WireFrame] = []
         self._looked_ns = now_ns
         while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._is_hurried(item, now_ns)):
@@ -117,11 +115,9 @@ class RecordedWire:
 
     @property
     def is_over(self) -> bool:
-        """Whether all of it was given."""
         return self._is_over
 
     def totals(self) -> dict[str, int]:
-        """Frames that were given, and questions that were asked."""
         return dict(self._counts)
 
     def _due_ns(self, item: WireItem) -> int:
@@ -203,7 +199,6 @@ class RecordedWire:
 
 
 def _kind(item: WireItem) -> int:
-    """What questions are told apart by."""
     return item.identifier or 0
 
 
@@ -233,16 +228,13 @@ class RecordedPort(Port):
         self._wake_when_due()
 
     def fileno(self) -> int:
-        """The timer's descriptor."""
         return self._timer.fileno()
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """As much as was read at once then."""
         frame = self.next_frame()
         return b"" if frame is None else frame.payload
 
     def next_frame(self) -> WireFrame | None:
-        """The next one that is due."""
         self._reads += self._wire.emit(self._clock())
         frame = self._reads.popleft() if self._reads else None
         self._wake_when_due()
@@ -251,21 +243,15 @@ class RecordedPort(Port):
         return frame
 
     def write(self, data: bytes) -> int:
-        """A question."""
         self._wire.receive(0, data, self._clock())
         self._wake_when_due()
         return len(data)
 
     def wake(self) -> None:
-        """Be readable at once."""
         self._timer.wake_at(0)
 
     def close(self) -> None:
-        """Give the timer back."""
         self._timer.close()
 
     def _wake_when_due(self) -> None:
         self._timer.wake_at(0 if self._reads else self._wire.next_due_ns())
-
-
-__all__ = ["SENT", "Note", "RecordedPort", "RecordedWire"]

@@ -9,7 +9,8 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
 
 _HEARD = "heard"  # in the memory of a device: the beginning of a command whose end it did not hear yet, and when
 _LONGEST_PAUSE_NS = 200_000_000
@@ -124,6 +125,3 @@ def cut_packets(heard: bytes, begin: bytes, total: Callable[[bytes], int]) -> tu
         found.append(heard[:length])
         heard = heard[length:]
     return found, heard[max(0, len(heard) - len(begin) + 1) :]
-
-
-__all__ = ["SerialEmulator", "SerialEmulatorOptions", "cut_packets"]

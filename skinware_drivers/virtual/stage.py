@@ -169,7 +169,6 @@ class Stage(ABC):
         self._event_ns = min(times_ns, default=None)
 
     def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
-        """Have something done at a moment."""
         self._scheduled.append(_Scheduled(time_ns, action))
         self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
 
@@ -184,6 +183,3 @@ class _Unlogged:
 
     def append(self, event: msgspec.Struct) -> None:
         """Forget the event."""
-
-
-__all__ = ["Actor", "Stage"]

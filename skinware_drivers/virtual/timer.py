@@ -27,11 +27,11 @@ class _Itimerspec(ctypes.Structure):
 class Timer(Protocol):
     """A descriptor that becomes readable at a moment."""
 
-    def fileno(self) -> int: ...  # noqa: D102
+    def fileno(self) -> int: ...
 
-    def wake_at(self, time_ns: int | None) -> None: ...  # noqa: D102
+    def wake_at(self, time_ns: int | None) -> None: ...
 
-    def close(self) -> None: ...  # noqa: D102
+    def close(self) -> None: ...
 
 
 class MonotonicTimer:
@@ -73,10 +73,6 @@ class MonotonicTimer:
             raise OSError(ctypes.get_errno(), f"timerfd_settime: {os.strerror(ctypes.get_errno())}")
 
     def close(self) -> None:
-        """Give the descriptor back. Idempotent."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-
-__all__ = ["MonotonicTimer", "Timer"]

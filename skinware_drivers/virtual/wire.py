@@ -74,7 +74,6 @@ class Transmitter:
         self.queue: deque[Transmission] = deque()
 
     def __len__(self) -> int:
-        """Frames that wait."""
         return sum(map(len, self.queue))
 
 
@@ -96,16 +95,13 @@ class Wire:
 
     @property
     def bit_rate(self) -> int:
-        """Bit/s."""
         return self.speed * _NS_PER_S // _BIT_NS
 
     @property
     def bits(self) -> float:
-        """That went over it so far."""
         return self._busy_ns * self.speed / _BIT_NS
 
     def attach(self) -> Transmitter:
-        """A new device on the wire."""
         transmitter = Transmitter()
         self.transmitters.append(transmitter)
         return transmitter
@@ -134,7 +130,6 @@ class Wire:
                 queue.popleft()
 
     def _send(self, transmission: Transmission, start_ns: int, until_ns: int) -> None:
-        """Send the next frame, and those behind it that begin before ``until_ns``."""
         identifiers, payloads, first = transmission.identifiers, transmission.payloads, transmission.sent
         starts: Sequence[int]
         if transmission.usual:
@@ -163,6 +158,3 @@ def _next_in_arbitration(queue: deque[Transmission]) -> int:
     if identifier & _EXTENDED_FLAG:
         return (identifier & 0x1FFF_FFFF) << 1 | 1
     return identifier << 19
-
-
-__all__ = ["Transmission", "Transmitter", "Wire", "frame_time_ns"]

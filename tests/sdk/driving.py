@@ -11,10 +11,12 @@ from unittest import mock
 import msgspec
 
 from skinware import freshness
-from skinware.driver_service import DriverFrame, DriverReader
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
-from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.running.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until

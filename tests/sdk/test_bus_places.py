@@ -10,7 +10,8 @@ import pytest
 from skinware import DriverReader
 from skinware.errors import RequestFailed, RequestRefused
 from skinware.geometry import Geometry
-from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.testing.driving import driving_lines

@@ -23,7 +23,8 @@ from skinware.errors import DriverError
 from skinware.status import DataPath
 from skinware_drivers import native
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_watch import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.emulation import Emulation, JsonReport

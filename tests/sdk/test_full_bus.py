@@ -9,7 +9,8 @@ import msgspec
 import pytest
 
 from skinware import DriverReader
-from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp, tell_what_fits
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link

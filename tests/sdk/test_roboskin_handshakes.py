@@ -10,7 +10,7 @@ import pytest
 
 from skinware import DriverReader, PatchState, Status
 from skinware_drivers.can import roboskin
-from skinware_drivers.can.roboskin import Kind
+from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import BoardSilenced

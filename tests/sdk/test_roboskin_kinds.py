@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware import Structure
-from skinware_drivers.can.roboskin import Kind, RoboskinOptions
+from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp, tell_of_chips
 from tests.sdk.test_roboskin_wire import Rig
 

@@ -9,7 +9,7 @@ import pytest
 
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError, RequestFailed
-from skinware_drivers.can.roboskin import Kind, RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves

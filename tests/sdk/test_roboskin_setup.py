@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError
-from skinware_drivers.can.roboskin import Kind, RoboskinDriver, RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.virtual.rig import Rig

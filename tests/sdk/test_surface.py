@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +25,30 @@ def test_every_name_that_is_listed_is_there(place: str) -> None:
         assert getattr(module, name) is not None
 
 
-@pytest.mark.parametrize("place", [*PLACES, "skinware", "skinware.aio", "skinware.recording", "skinware.tactile"])
+FACES = [*PLACES, "skinware", "skinware.aio", "skinware.recording", "skinware.tactile"]
+
+
+def undocumented(place: str) -> Iterator[str]:
+    module = importlib.import_module(place)
+    for name in module.__all__:
+        thing = getattr(module, name)
+        if not (inspect.isclass(thing) or inspect.isfunction(thing)) or not thing.__module__.startswith("skinware"):
+            continue
+        if not inspect.getdoc(thing):
+            yield name
+        for member, value in vars(thing).items() if inspect.isclass(thing) else ():
+            if member.startswith("_") or not (inspect.isroutine(value) or isinstance(value, property | classmethod)):
+                continue
+            if not inspect.getdoc(getattr(thing, member)):
+                yield f"{name}.{member}"
+
+
+@pytest.mark.parametrize("place", FACES)
+def test_every_public_name_has_a_docstring(place: str) -> None:
+    assert list(undocumented(place)) == []
+
+
+@pytest.mark.parametrize("place", FACES)
 def test_completion_offers_every_name_before_it_is_imported(place: str) -> None:
     code = f"import {place} as place; assert set(place.__all__) <= set(dir(place)), dir(place)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

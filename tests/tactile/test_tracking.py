@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skinware.tactile.contacts import ContactKind, Contacts, ContactSet
+from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
+from skinware.tactile.tracking import ContactKind
 from tests.tactile.skins import PITCH_M, placed, pressed, triangles
 
 FLAT = triangles(30, 40)

@@ -18,8 +18,9 @@ from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import emulated_line, line
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.emulated_line import VirtualSerialBus
-from skinware_drivers.virtual.emulator import CanFrame, Device, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 

@@ -34,7 +34,8 @@ from skinware import DriverReader, DriverWriter, Namespace
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.recvmmsg import rows_of
-from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble

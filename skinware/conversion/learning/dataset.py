@@ -91,7 +91,6 @@ class DatasetWriter:
         self._rows, self._count = self._rows + done, self._count + 1
 
     def close(self) -> None:
-        """Close its files, complete or not. Idempotent."""
         self._data.close()
         self._episodes.close()
 
@@ -190,13 +189,11 @@ class _Files:
         return self._place
 
     def write(self, arrays: Sequence[Any]) -> None:
-        """Some rows."""
         table = pyarrow().Table.from_arrays(list(arrays), schema=self.schema)
         assert self._writer is not None  # noqa: S101, there is a place for them
         self._writer.write_table(table, row_group_size=len(table))
 
     def close(self) -> None:
-        """Complete the last file. Idempotent."""
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.close()
@@ -231,7 +228,6 @@ class _FeatureStatistics:
         self._of[name].add(rows, moments)
 
     def told(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        """By feature."""
         return {name: each.told() for name, each in self._of.items()}
 
 
@@ -253,7 +249,6 @@ def _type(arrow: Any, feature: Feature) -> Any:
 
 
 def _column(arrow: Any, feature: Feature, rows: npt.NDArray[Any]) -> Any:
-    """Rows of a feature as a column."""
     kind = _type(arrow, feature)
     if feature.dtype == IMAGE:
         return arrow.array([{"bytes": png, "path": None} for png in rows], kind)
@@ -268,7 +263,6 @@ def _column(arrow: Any, feature: Feature, rows: npt.NDArray[Any]) -> Any:
 
 
 def _write_tasks(arrow: Any, tasks: Mapping[str, int], path: Path) -> None:
-    """Tasks by their text, as pandas keeps a table whose index that is."""
     table = arrow.table(
         {"task_index": arrow.array(list(tasks.values()), arrow.int64()), "task": arrow.array(list(tasks))}
     )

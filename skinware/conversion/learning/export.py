@@ -107,19 +107,16 @@ class _Recordings:
         self._opened: tuple[int, Source] | None = None
 
     def source(self, number: int) -> Source:
-        """One of them, by its number, until another is asked for."""
         if self._opened is None or self._opened[0] != number:
             self.close()
             self._opened = number, self._open_one(self.paths[number])
         return self._opened[1]
 
     def table(self, number: int, name: str) -> Table:
-        """A table of one of them, likewise."""
         (found,) = (table for table in self.source(number).tables if table.name == name)
         return found
 
     def close(self) -> None:
-        """Close the one that is open. Idempotent."""
         if self._opened is not None:
             (_, source), self._opened = self._opened, None
             source.close()
@@ -163,7 +160,6 @@ def _sets(
 
 
 def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval]]:
-    """The intervals that are asked for of each recording."""
     asked: list[list[Interval]] = [[] for _ in paths]
     for interval in wanted.intervals:
         if not interval.file and len(paths) > 1:
@@ -214,7 +210,6 @@ class _Set:
                 self._features[name] = feature
 
     def write(self, folder: Path) -> None:
-        """Write it into a folder, which is made."""
         writer = DatasetWriter(folder, self._wanted.fps, self._features, [len(each) for each in self._episodes])
         try:
             readers: dict[TimedTable, Frames] = {}
@@ -233,7 +228,6 @@ class _Set:
         return Frames(self._recordings.table(episode.recording, timed.name), timed.told_ns, window)
 
     def _window(self, name: str) -> int:
-        """Of how many frames of a driver rows have the values."""
         windows = {episode.piece.tables[name].window(self._wanted) for episode in self._episodes}
         if len(windows) > 1:
             raise ConfigurationError(f"{name} was recorded at different rates: say how many frames a row has: --window")

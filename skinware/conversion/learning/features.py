@@ -71,7 +71,6 @@ class SkinFeatures:
 
     @property
     def descriptions(self) -> dict[str, Feature]:
-        """What they are, by name."""
         described = {}
         for type_name, positions in self._types.items():
             shape: tuple[int, ...] = (len(positions),)
@@ -119,7 +118,6 @@ class SkinFeatures:
         return status
 
     def _in_rows(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(t, window, n) as rows have it."""
         return rows if self._window > 1 else rows[:, 0]
 
 
@@ -245,12 +243,10 @@ def _pixel_step(shape: tuple[int, ...]) -> int:
 
 
 def joined_rows(features: Sequence[JoinedFeature], rows: Mapping[str, npt.NDArray[np.int64]], part: slice) -> Batch:
-    """Some rows of all that was joined."""
     return {feature.name: feature.rows(rows[feature.name][part]) for feature in features}
 
 
 def _png_size(path: Path) -> tuple[bytes, int, int]:
-    """A PNG file, its width and height."""
     data = path.read_bytes()
     if data[:8] != _PNG or data[12:16] != b"IHDR" or tuple(data[24:26]) != _RGB:
         raise ConfigurationError(f"{path}: images are joined as PNG files with 8 bits of red, green and blue")

@@ -66,7 +66,6 @@ class Joined:
 
     @property
     def is_of_images(self) -> bool:
-        """Whether its rows are paths of images."""
         return bool(self.rows.ndim == 1)
 
     def times_ns(self, source: Source, *, is_only: bool) -> npt.NDArray[np.int64]:

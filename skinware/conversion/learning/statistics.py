@@ -36,14 +36,12 @@ class Moments:
 
     @classmethod
     def of(cls, rows: npt.NDArray[Any]) -> Moments:
-        """Of (m, ...) rows, at least one."""
         mean = rows.mean(axis=0, dtype=np.float64)
         difference = rows - mean
         squares = np.einsum("m...,m...->...", difference, difference)
         return cls(len(rows), rows.min(axis=0).astype(float), rows.max(axis=0).astype(float), mean, squares)
 
     def with_(self, other: Moments) -> Moments:
-        """Of both together."""
         count = self.count + other.count
         apart = other.mean - self.mean
         return Moments(

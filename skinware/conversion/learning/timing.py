@@ -87,7 +87,6 @@ class Piece:
 
     @property
     def structures(self) -> tuple[Structure, ...]:
-        """Of the drivers, by name."""
         return tuple(self.tables[name].structure for name in sorted(self.tables))
 
 
@@ -158,7 +157,6 @@ class Planner:
 
     @property
     def drivers(self) -> frozenset[str]:
-        """Names of those that are in it."""
         return frozenset(self._drivers)
 
     def episodes(self, intervals: Sequence[Interval], task: str) -> list[Episode]:
@@ -244,7 +242,6 @@ class Planner:
         return Episode(self._number, task, rows_ns, piece, frames, joined)
 
     def _rows(self, begin_ns: int, end_ns: int) -> Times:
-        """(t,) times of the rows of an episode that begins and ends then."""
         fps = self._wanted.fps
         if self._wanted.at:
             ((each, times_ns),) = [both for both in self._joined if both[0].name == self._wanted.at]
@@ -281,7 +278,6 @@ class Planner:
         return rows
 
     def _nothing(self, where: str) -> list[Episode]:
-        """What is told when there are no rows."""
         spans = [
             f"{name} from {self._seconds(int(tables[0].times_ns[0])):.3f} to"
             f" {self._seconds(int(tables[-1].times_ns[-1])):.3f} s"

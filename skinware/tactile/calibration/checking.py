@@ -233,6 +233,3 @@ def _turns(places: ArrayF) -> Iterator[tuple[bool, float, ArrayF]]:
             turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
             degrees = float(np.degrees(angle))
             yield mirrored, min(degrees, 360 - degrees), middle + image @ turn.T @ axes
-
-
-__all__ = ["MIRRORED", "OFF", "SHARED", "SWAPPED", "TURNED", "UNKNOWN", "Finding", "check_file", "check_strokes"]

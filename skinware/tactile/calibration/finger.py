@@ -87,7 +87,6 @@ class _Problem:
 
     @classmethod
     def of(cls, presses: Presses, shapes: Mapping[int, Shape], tip_m: ArrayF) -> _Problem:
-        """With poses from the guess of the tip."""
         guess = place(Presses(presses.n, _points_m(presses, tip_m), presses.press, presses.taxel, presses.load))
         known = guess.known
         weight = np.where(known, 1.0, 0.0)
@@ -166,7 +165,6 @@ class _Problem:
             self.poses[number] = Pose(_rotation(turn) @ pose.rotation, pose.origin_m + shift)
 
     def placement(self) -> Placement:
-        """Where the taxels are then."""
         n = self.presses.n
         position, normal, error = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
         residual = np.linalg.norm(self.residuals(), axis=1)
@@ -197,6 +195,3 @@ def _rotation(turn: ArrayF) -> ArrayF:
     axis = _crossing((turn / angle)[None])[0]
     rotation: ArrayF = np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
     return rotation
-
-
-__all__ = ["FingerPlacement", "place_finger"]

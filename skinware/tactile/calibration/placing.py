@@ -210,6 +210,3 @@ def _errors(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_pre
     mean = np.nansum(changes, axis=0) / np.maximum(told, 1)
     error = np.sqrt((_PARTS - 1) * mean + (_PRECISE_BIAS_M if is_precise else _BIAS_M) ** 2)
     return np.where(np.isfinite(position).all(axis=1) & (told > 0), error, np.nan)
-
-
-__all__ = ["Placement", "place"]

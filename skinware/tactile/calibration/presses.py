@@ -170,7 +170,6 @@ class PressFinder:
 
 
 def _moved_m(one: ArrayF, other: ArrayF) -> float:
-    """How far a pose has moved."""
     return float(np.linalg.norm(_origin(other) - _origin(one)))
 
 
@@ -178,6 +177,3 @@ def _origin(pose: ArrayF) -> ArrayF:
     """(3,) the point, or the origin of a frame."""
     origin: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
     return origin
-
-
-__all__ = ["Press", "PressFinder", "PressSettings", "Presses"]

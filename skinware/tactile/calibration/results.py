@@ -106,7 +106,6 @@ def unrolled_comment(topology: Topology) -> str:
 def _by_module(
     structure: Structure, type_name: str, wanted: npt.NDArray[np.bool_]
 ) -> list[tuple[int, npt.NDArray[np.int64]]]:
-    """By module, the rows among the sensors of the type that are wanted."""
     module = structure.module_of(type_name)
     return [(number, np.flatnonzero(wanted & (module == number))) for number in np.unique(module[wanted]).tolist()]
 
@@ -136,6 +135,3 @@ def _group(
 
 def _triples(rows: ArrayF) -> tuple[Triple, ...]:
     return tuple((x, y, z) for x, y, z in np.round(rows, _DIGITS).tolist())
-
-
-__all__ = ["confidence_of", "placed_comment", "placed_groups", "unrolled_comment", "unrolled_groups"]

@@ -165,6 +165,3 @@ class StrokeSession(Session):
         self.sums.products[one, other] = self.sums.products[other, one] = product
         self.sums.active[:] = active
         self.sums.frames = int(arrays["frames"])
-
-
-__all__ = ["PressSession", "Session", "StrokeSession"]

@@ -130,6 +130,3 @@ def rigid(source: ArrayF, target: ArrayF, weight: ArrayF) -> Pose:
     turn = np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
     rotation = u @ turn @ vt
     return Pose(rotation, to_m - rotation @ from_m)
-
-
-__all__ = ["LEAST_TAXELS", "Pose", "Shape", "fitted", "rigid", "shapes_of"]

@@ -118,6 +118,3 @@ class PoseSource:
         rows = np.asarray(frame.column(self._column), np.float64).reshape(-1, *self._shape)
         pose: ArrayF = rows[0].copy()
         return pose
-
-
-__all__ = ["POINT", "POSE", "LoadSource", "PoseSource"]

@@ -77,6 +77,3 @@ def restore_session(path: Path, session: Session, type_name: str, uid: npt.NDArr
     except (ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigurationError(f"{path} cannot be read: {error}") from None
     return True
-
-
-__all__ = ["restore_session", "save_session"]

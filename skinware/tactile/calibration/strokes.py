@@ -82,6 +82,3 @@ class StrokeSums:
         scale = np.where(known, 1 / np.where(known, length, 1), 0)
         similarity: ArrayF = np.clip(self.products * scale[:, None] * scale, 0, 1)
         return similarity
-
-
-__all__ = ["ENOUGH_FRAMES", "MOST_TAXELS", "StrokeSums"]

@@ -95,6 +95,3 @@ def shortest_m(distance_m: ArrayF) -> ArrayF:
     for between in range(len(ways)):
         np.minimum(ways, ways[:, between, None] + ways[None, between], out=ways)
     return ways
-
-
-__all__ = ["PITCH_M", "Topology", "shortest_m", "topology_of"]

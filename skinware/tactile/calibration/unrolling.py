@@ -52,7 +52,6 @@ def _scaled(ways: ArrayF) -> ArrayF:
 
 
 def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:
-    """Places whose distances are as the ways, by weight (SMACOF)."""
     laplacian = np.diag(weight.sum(axis=1)) - weight
     inverse = np.linalg.pinv(laplacian, hermitian=True)
     stress = np.inf
@@ -66,6 +65,3 @@ def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:
         places = inverse @ (pull @ places)
     centred: ArrayF = places - places.mean(axis=0)
     return centred
-
-
-__all__ = ["unrolled_m"]

@@ -79,6 +79,3 @@ def _triangle(board: int, triangle: int, flat: npt.NDArray[np.float64]) -> tuple
     position = centre + x[:, np.newaxis] * u + y[:, np.newaxis] * v
     position[:, 1] += number * _BETWEEN_ARMS_M
     return position, normal
-
-
-__all__ = ["ARM_FRAME", "TRIANGLES", "arm", "arm_path"]

@@ -74,6 +74,3 @@ def bench_world(
         begin_s, row = 90 + 30.0 * number, place[6].reshape(3, 4, 3)[number % 3]
         world.stroke(row[[0, -1]], 20, begin_s, begin_s + 3, rise_s=0.1, name="stroke")
     return world
-
-
-__all__ = ["BENCH_S", "bench_world"]

@@ -55,7 +55,6 @@ class Block:
         return usable
 
     def __iter__(self) -> Iterator[Sample]:
-        """Frame by frame."""
         usable = self.usable
         for row in range(len(self)):
             yield Sample(
@@ -78,6 +77,3 @@ class Sample:
     status: npt.NDArray[np.uint8]
     usable: npt.NDArray[np.bool_]
     truth: npt.NDArray[np.float32]
-
-
-__all__ = ["Block", "Sample"]

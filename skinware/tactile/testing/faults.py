@@ -71,7 +71,6 @@ class Faults:
 
     @classmethod
     def none(cls, n: int) -> Faults:
-        """Of a perfect skin."""
         return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
     def jumped(self, time_s: ArrayF, patch: ArrayI) -> tuple[ArrayF | None, npt.NDArray[np.bool_] | None]:
@@ -89,6 +88,3 @@ class Faults:
             added[:, jump.taxels] += jump.counts * (at_s >= jump.at_s)
             suspect[:, jump.taxels] |= (at_s >= jump.at_s) & (at_s < jump.at_s + jump.suspect_s)
         return added, suspect
-
-
-__all__ = ["Faults", "Jump", "Missing"]

@@ -93,16 +93,14 @@ class Push(Gesture):
 
     at_m: tuple[float, float, float]
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+    def points_m(self, time_s: ArrayF) -> ArrayF:
         return np.broadcast_to(np.array(self.at_m, np.float64), (len(time_s), 3))
 
-    def distances_m(  # noqa: D102 - inherited
-        self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]
-    ) -> ArrayF:
+    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
         del time_s  # it does not move
         return self._beyond(surface.position_m[taxels])[np.newaxis]
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
+    def least_distances_m(self, surface: Surface) -> ArrayF:
         return self._beyond(surface.position_m)
 
     def _beyond(self, position_m: ArrayF) -> ArrayF:
@@ -129,18 +127,16 @@ class Stroke(Gesture):
         if len(self.path_m) < 2:
             raise ConfigurationError("a stroke needs a path of at least two points")
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+    def points_m(self, time_s: ArrayF) -> ArrayF:
         path, length = self._line()
         return _along(path, length, (time_s - self.begin_s) / (self.end_s - self.begin_s) * length[-1])
 
-    def distances_m(  # noqa: D102 - inherited
-        self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]
-    ) -> ArrayF:
+    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
         away = self.points_m(time_s)[:, np.newaxis] - surface.position_m[taxels]
         distance: ArrayF = np.maximum(np.linalg.norm(away, axis=2) - self.radius_m, 0)
         return distance
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
+    def least_distances_m(self, surface: Surface) -> ArrayF:
         return self._least(surface, self._line()[0])
 
     def _line(self, *, closed: bool = False) -> tuple[ArrayF, ArrayF]:
@@ -177,7 +173,7 @@ class Wander(Stroke):
     press_s: float = 2.6
     pause_s: float = 1.4
 
-    def forces(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+    def forces(self, time_s: ArrayF) -> ArrayF:
         since_s = time_s - self.begin_s
         moment_s = since_s % (self.press_s + self.pause_s)
         points = np.array([0, self.rise_s, self.press_s - self.falls_s, self.press_s])
@@ -185,11 +181,11 @@ class Wander(Stroke):
         forces: ArrayF = self.force * full * ((since_s >= 0) & (time_s < self.end_s))
         return forces
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+    def points_m(self, time_s: ArrayF) -> ArrayF:
         path, length = self._line(closed=True)
         return _along(path, length, (time_s - self.begin_s) * self.speed_m_s % length[-1])
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
+    def least_distances_m(self, surface: Surface) -> ArrayF:
         return self._least(surface, self._line(closed=True)[0])
 
 
@@ -203,19 +199,14 @@ class Cover(Gesture):
 
     taxels: tuple[int, ...]
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+    def points_m(self, time_s: ArrayF) -> ArrayF:
         return np.full((len(time_s), 3), np.nan)
 
-    def distances_m(  # noqa: D102 - inherited
-        self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]
-    ) -> ArrayF:
+    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
         del time_s  # it does not move
         return self.least_distances_m(surface)[taxels][np.newaxis]
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
+    def least_distances_m(self, surface: Surface) -> ArrayF:
         distance = np.full(len(surface), np.inf)
         distance[list(self.taxels)] = 0
         return distance
-
-
-__all__ = ["Cover", "Gesture", "How", "Push", "Stroke", "Wander"]

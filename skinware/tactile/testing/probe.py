@@ -99,6 +99,3 @@ class Probe:
                 columns["point_m"][:], columns["presses"][:] = shown, self.presses
                 if stopping.is_set():
                     break
-
-
-__all__ = ["Probe"]

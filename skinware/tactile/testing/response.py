@@ -76,6 +76,3 @@ class Response:
             crept += gain * (now - crept)
             used_to[row] = crept
         return self.creep * np.minimum(used_to, load) + self.remainder * np.maximum(used_to - load, 0)
-
-
-__all__ = ["Response"]

@@ -105,6 +105,3 @@ def _gesture(act: _Push | _Stroke) -> Gesture:
     if isinstance(act, _Push):
         return Push(at_m=act.at_m, **act.of_gesture())
     return Stroke(path_m=act.path_m, **act.of_gesture())
-
-
-__all__ = ["Play", "read_stage"]

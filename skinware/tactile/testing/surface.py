@@ -189,6 +189,3 @@ def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) 
 def _numbered(of: npt.NDArray[Any]) -> ArrayI:
     """The same groups, numbered from 0 without gaps."""
     return np.unique(of, return_inverse=True)[1].astype(np.int64)
-
-
-__all__ = ["CHANNELS_M", "PITCH_M", "SIDE_M", "TRIANGLE_M", "Surface", "Taxels", "grid", "triangles"]

@@ -364,7 +364,6 @@ class _State:
         return values
 
     def _leave_out(self, time_s: ArrayF, values: npt.NDArray[np.generic], status: npt.NDArray[np.uint8]) -> None:
-        """Let the taxels fall silent that have to."""
         for gap in self._world.faults.missing:
             gone = (time_s >= gap.begin_s) & (time_s < gap.end_s)
             for patch in np.flatnonzero(gone.any(axis=0)).tolist():
@@ -374,6 +373,3 @@ class _State:
                 before = self._before if first == 0 else values[first - 1]
                 values[first:last, taxels] = before[taxels] if gap.value is None else gap.value
                 status[first:last, taxels] |= np.uint8(gap.status)
-
-
-__all__ = ["World"]

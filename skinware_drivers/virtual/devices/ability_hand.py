@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _ASKED = "asked"  # in the memory of a device: the command that is answered
@@ -21,7 +22,6 @@ _TARGETS = 12
 
 
 def message(content: bytes) -> bytes:
-    """A message as it goes over the line."""
     stuffed = bytearray()
     for byte in content + bytes([-sum(content) & 0xFF]):
         stuffed += bytes([0x7D, byte ^ 0x20]) if byte in (0x7E, 0x7D) else bytes([byte])
@@ -45,19 +45,16 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
     swing = 3000
 
     def places(self) -> npt.NDArray[np.float64]:
-        """A row for each finger."""
         return on_a_grid(30, 6)
 
     def boot(self, device: Device, now_ns: int) -> None:
         """It waits to be asked."""
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """What stands between two delimiters."""
         *parts, rest = heard.split(b"~")
         return [part for part in parts if part], rest[-64:]
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Take a message to its address whose sum is right."""
         content, escaped = bytearray(), False
         for byte in command:
             if byte == 0x7D and not escaped:

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 _DEVICE, _TYPE = 7, 0x0203
@@ -23,7 +24,6 @@ _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
 
 
 def message(number: int, body: bytes) -> bytes:
-    """A message as it goes over the line."""
     sent = bytes((0xF0, 0xC4, number)) + body
     return sent + bytes([functools.reduce(operator.xor, sent)])
 
@@ -44,15 +44,12 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     swing = 3500
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All values."""
         return on_a_grid(sum(self.options.sensors), 4)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Only the command for periods has more than its number."""
         return cut_packets(heard, b"\xf0\xc4", _total)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A message for each sensor."""
         uptime_us = (device.sampled_ns - device.ready_ns) // 1000
         stamp, sent, at = struct.pack("<I", uptime_us & 0xFFFF_FFFF), [], 0
         for number, count in enumerate(self.options.sensors, 1):
@@ -65,11 +62,9 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
 
     def kinds(self) -> Sequence[str]:
-        """A message for each sensor."""
         return [f"sensor{number}" for number, _ in enumerate(self.options.sensors, 1)]
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
-        """Commands that set something have no answer."""
         target, number = command[2:4]
         if functools.reduce(operator.xor, command):
             return message(0xFE, bytes([_BAD_CHECKSUM]))

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _JOINTS = 16
@@ -36,19 +38,15 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     identifiers: Collection[int] = frozenset((0x150, 0x154, 0x3C0, 0x3C8, 0x140, 0x148))
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Beside each other."""
         return on_a_grid(16, 4)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
-        """Its two frames."""
         return [self.kind_of(identifier, b"") for identifier in (0x054 << 2, 0x055 << 2)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
-        """Two frames of eight pads."""
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
 
 
@@ -68,19 +66,15 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     identifiers: Collection[int] = EmulatedAllegroV5.identifiers
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Beside each other."""
         return on_a_grid(4, 4)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
-        """Its two frames."""
         return [self.kind_of(identifier, b"") for identifier in (self._first << 2, self._first + 2 << 2)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
-        """Two frames of two fingertips."""
         told = [value + self.options.air_pa for value in values]
         first, second = self._first << 2, self._first + 2 << 2
         return [(first, struct.pack("<2i", *told[:2])), (second, struct.pack("<2i", *told[2:]))]
@@ -105,15 +99,12 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
     datagrams = True
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Beside each other."""
         return on_a_grid(16, 4)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A sample."""
         number = device.cycle & 0xFFFF_FFFF
         joints = [100 * joint for joint in range(_JOINTS)]
         sample = struct.pack("<I16h16h16H16i", number, *joints, *joints, *values, *joints)
@@ -121,6 +112,3 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
             "<IBBHII", 0x32423556, 1, 2, len(sample), number, device.sampled_ns // 1_000_000 & 0xFFFF_FFFF
         )
         return [header + sample]
-
-
-__all__ = ["EmulatedAllegroV5", "EmulatedAllegroV5Tips", "EmulatedAllegroV5Udp"]

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
@@ -35,13 +36,10 @@ class EmulatedAnySkin(SerialEmulator[EmulatedAnySkinOptions]):
     swing = 400
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Four values at each magnetometer."""
         return on_a_grid(self.options.mags, self.options.mags, each=4)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
-        """One message."""
         return [struct.pack(f"<{len(values)}f", *values) + b"\r\n"]

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
 
 _TACT = 106
 _TOP_10, _FULL = 1, 2
@@ -39,7 +41,6 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Three columns of eight cells."""
         return on_a_grid(24, 3)
 
     def boot(self, device: Device, now_ns: int) -> None:  # noqa: ARG002
@@ -76,7 +77,6 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
         return [*whole, *(self.kind_of(sender | 8, b"") for sender in senders)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        """Five frames of all cells, or one of the ten strongest."""
         sender = device.number << 5 | 0x400
         if device.memory["format"] == _FULL:
             cells = "".join(f"{value:03x}" for value in [*values, 0])

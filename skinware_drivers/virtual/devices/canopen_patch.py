@@ -18,8 +18,9 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import events
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from skinware_drivers.virtual.emulator_options import Seconds
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions, Seconds
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.stage import Actor
 
 _HEARTBEAT = "heartbeat"
@@ -60,13 +61,11 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         self.identifiers: Collection[int] = {0x000} | own
 
     def places(self) -> npt.NDArray[np.float64]:
-        """A grid, as nothing says where they are."""
         mapped = [variable for _, entries in _tpdos(_make_node(self.options.eds, 1, None)) for variable, _ in entries]
         count = sum(_is_felt(variable) for variable in mapped)
         return on_a_grid(count, max(1, round(count**0.5)))
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
-        """Make the nodes, and plan their errors."""
         actors, options = super().power_up(now_ns), self.options
         for number in options.faulty:
             for after_s, code in ((0, _TOO_HOT), (options.faulty_for_s, 0)):
@@ -83,7 +82,6 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
             self._go_to(device, _OPERATIONAL, now_ns)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        """NMT, SYNC, SDO."""
         if identifier == 0x000 and len(payload) == 2 and payload[1] in (0, device.number):
             return self._command(device, payload[0], now_ns)
         if identifier == 0x080 and device.memory["state"] == _OPERATIONAL:
@@ -96,7 +94,6 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         return False
 
     def on_timer(self, device: Device, name: str, time_ns: int) -> None:
-        """Heartbeats, and TPDOs by their event timer."""
         if name == _HEARTBEAT:
             self.reply(device, (0x700 + device.number, bytes([device.memory["state"]])), time_ns)
         else:
@@ -111,7 +108,6 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         return [self.kind_of(identifier, b"") for identifier in found]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        """One frame for each TPDO."""
         found, rest = [], list(values)
         for identifier, entries in _tpdos(device.memory["node"]):
             bits, length = 0, 0
@@ -160,17 +156,14 @@ class _Ports:
         """The emulator knows whom to tell."""
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
-        """Answer."""
         self._emulator.reply(self._device, (can_id, bytes(data)), self._device.memory["now_ns"])
 
     def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> _Ports:  # noqa: ARG002
-        """Begin heartbeats."""
         period_ns = round(period * 1e9)
         self._device.every(_HEARTBEAT, period_ns, self._device.memory["now_ns"] + period_ns)
         return self
 
     def stop(self) -> None:
-        """End them."""
         self._device.stop(_HEARTBEAT)
 
 
@@ -190,7 +183,6 @@ def _number(node: Any, index: int, subindex: int) -> int:
 
 
 def _tpdos(node: Any) -> list[tuple[int, list[tuple[Any, int]]]]:
-    """Identifier, and (variable, bits) of what is mapped, of every TPDO."""
     found = []
     for mapping in (index for index in node.object_dictionary if 0x1A00 <= index < 0x1C00):
         entries = []
@@ -210,6 +202,3 @@ def _bits(variable: Any, value: int, width: int) -> int:
     if variable.data_type == _REAL32:
         return int.from_bytes(struct.pack("<f", value), "little")
     return value & ((1 << width) - 1)
-
-
-__all__ = ["EmulatedCanopen", "EmulatedCanopenOptions"]

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
 
 _SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
 """Which of the sixteen values of a set is that of taxel 0, 1, 2 ..."""
@@ -35,15 +37,12 @@ class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
     identifiers: Collection[int] = frozenset((0x405, 0x407, 0x409, 0x40B))
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Sixteen taxels."""
         return on_a_grid(16, 4)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
-        """Four taxels a frame, in an order of its own."""
         wire = [0] * 16
         for taxel, at in enumerate(_SENT_AS):
             wire[at] = values[taxel]

@@ -13,8 +13,9 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
 from skinware_drivers.virtual.modbus_device import ModbusEmulator
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
 
 
@@ -52,17 +53,14 @@ class EmulatedDfrobot(ModbusEmulator[EmulatedDfrobotOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Of each shape that there is."""
         of_shape = {True: on_a_grid(36, 6), False: on_a_grid(32, 8)}
         return np.concatenate([places for shape, places in of_shape.items() if shape in self._is_square.values()])
 
     def beside(self, device: Device) -> Mapping[int, int]:
-        """What the array is, and whether it is ready."""
         is_ready = device.number not in self.options.unready
         return self._sent({0: 0x0343, 1: 0x3343, 5: 0x1000, 6: int(is_ready), 43: int(self._is_square[device.number])})
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
-        """Rows from the bottom up."""
         is_square = self._is_square[device.number]
         columns = 6 if is_square else 8
         cells = values[:36] if is_square else values[-32:]
@@ -75,6 +73,3 @@ class EmulatedDfrobot(ModbusEmulator[EmulatedDfrobotOptions]):
         if not self.options.swapped:
             return registers
         return {address: value >> 8 | (value & 0xFF) << 8 for address, value in registers.items()}
-
-
-__all__ = ["EmulatedDfrobot", "EmulatedDfrobotOptions"]

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
@@ -46,15 +47,12 @@ class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
         self._sound[:, list(options.broken_columns)] = 0
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All cells on one square."""
         return on_a_grid(self.options.rows * self.options.columns, self.options.columns)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
-        """One frame, or the lines of one."""
         cells = np.reshape(values, self._sound.shape) * self._sound
         if self.options.firmware == "binary":
             return [b"\xaa\x55" + cells.astype(np.uint8).tobytes()]

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _ROOM = 24
@@ -50,11 +51,9 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All channels, thermal ones too."""
         return on_a_grid(12 * self.options.triangles, 12)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """The robot's program has started it."""
         self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
@@ -68,7 +67,6 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
         ]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One datagram with both halves of every triangle."""
         records = []
         for triangle in range(self.options.triangles):
             can = 0x400 | device.number << 4 | triangle

@@ -80,6 +80,3 @@ def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[fl
     row, column = np.divmod(np.arange(rows * columns), columns)
     share = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)
     return np.array(corner) + share * size
-
-
-__all__ = ["EmulatedInspire", "EmulatedInspireOptions"]

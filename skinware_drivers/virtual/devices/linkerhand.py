@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
 
 _SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
 _OF_HAND = {"hand_23x9": ((23, 9), (28, 20)), "hand_12x6": ((12, 6), (14, 16))}
@@ -58,14 +60,12 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
             self.period_s = options.program_ms / 1e3
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All matrices beside each other."""
         if self.options.touch in _FIRST:
             return on_a_grid(20, 5)
         cells = sum(rows * columns for rows, columns in map(self._size, self._commands))
         return on_a_grid(cells, round(cells**0.5))
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """Be asked, if there is a program."""
         if self.options.program_ms or self.options.streaming:
             self.start(device, now_ns)
 
@@ -95,7 +95,6 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         return "question" if payload == self._question(payload[0]) else f"0x{payload[0]:02x}"
 
     def kinds(self) -> Sequence[str]:
-        """The commands that are answered with data."""
         return [f"0x{command:02x}" for command in self._commands]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
@@ -128,13 +127,11 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         return bytes([command]) + bytes.fromhex(sizes.get(self.options.touch, ""))
 
     def _size(self, command: int) -> tuple[int, int]:
-        """Rows and columns of a matrix."""
         if self.options.touch in _OF_HAND:
             return _OF_HAND[self.options.touch][command == 0xB6]
         return _SIZES[self.options.touch]
 
     def _told(self, device: Device, command: int) -> Iterator[CanFrame]:
-        """The frames of an answer."""
         nth, values = command - self._commands[0], device.memory[_FELT]
         if self.options.touch in _FIRST:
             yield device.number, bytes([command, *values[5 * nth : 5 * nth + 5]])
@@ -149,6 +146,3 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         for at in range(0, len(matrix), 5):
             yield device.number, bytes([command, at // columns, at % columns, *matrix[at : at + 5]])
         yield device.number, bytes([command, 0xFF]) + (sum(matrix) & 0xFFFF).to_bytes(2, "little")
-
-
-__all__ = ["EmulatedLinkerHand", "EmulatedLinkerHandOptions"]

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _TAXELS = 12
@@ -30,7 +31,6 @@ _LONGEST = 1100  # bytes of a request on the line
 
 
 def message(number: int, payload: bytes) -> bytes:
-    """A message as it goes over the line."""
     body = bytes([number]) + payload
     return stuff(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
 
@@ -95,11 +95,9 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         self._crc = zlib.crc32(b"".join(self._items))
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All taxels on one square."""
         return on_a_grid(_TAXELS * self.options.modules, _TAXELS)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """Announce the patch, every second until somebody asks."""
         is_first = "reset" not in device.memory and device.cycle == 0
         device.memory.update(
             reset=_POWER_UP if is_first else _BROWN_OUT,
@@ -118,7 +116,6 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         super().boot(device, now_ns)
 
     def on_timer(self, device: Device, name: str, time_ns: int) -> None:
-        """Announcements, and data."""
         if name != "announce":
             self.burst(device, time_ns)
         elif device.streams_from_ns is not None:
@@ -127,7 +124,6 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
             self.say(device, message(_BOOT, self._greeting(device, time_ns)), time_ns)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """A zero ends every message."""
         *whole, rest = heard.split(b"\0")
         return whole, rest[-_LONGEST:]
 
@@ -158,11 +154,9 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         return f"module{body[1]}" if body[0] == _DATA else {_BOOT: "boot", _REPORT: "report"}.get(body[0], "answer")
 
     def kinds(self) -> Sequence[str]:
-        """A message for each module, and those beside the data."""
         return [*(f"module{module}" for module in range(self.options.modules)), "boot", "report"]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A message for each module that is on."""
         memory = device.memory
         cycles = device.cycle - memory["first_cycle"]
         memory["stamp_us"] = memory["us"] + memory["period_us"] * (cycles - memory["us_cycle"])

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 _LONGEST_COMMAND = 64
@@ -68,17 +69,14 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Three values at each taxel."""
         options = self.options
         modules = [options.points] if options.board == "converter" else [self.points_of(slot) for slot in options.slots]
         return on_a_grid(sum(modules), 8, each=3)
 
     def text(self) -> str:
-        """What its sensors say they are."""
         return self.options.sensor_version
 
     def slots(self) -> Sequence[int]:
-        """To which modules are connected."""
         return self.options.slots
 
     def points_of(self, slot: int) -> int:
@@ -91,7 +89,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             super().boot(device, now_ns)
 
     def feel(self, device: Device, time_s: float) -> Sequence[int]:
-        """Who presses, pulls a little to one side."""
         felt = list(super().feel(device, time_s))
         felt[0::3] = [value // 4 for value in felt[0::3]]
         felt[1::3] = [-value // 6 for value in felt[1::3]]
@@ -117,7 +114,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """What was asked for, or all modules."""
         forces = self._tared(device, values)
         if self.options.board == "converter":
             address, count = device.memory["asked"]
@@ -179,7 +175,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return message(b"\xaa\x55\0", struct.pack("<BHH", 0x81, register, 0))
 
     def _registers(self, device: Device) -> bytes:
-        """Those that say what is there."""
         memory = bytearray(0x80)
         memory[0:15] = b"EMULATED V1.0\0\0"
         for slot in self.slots():
@@ -206,7 +201,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             self.say(device, message(b"\xaa\x55\0\x17\x02\0\x01\0\0"), time_ns)
 
     def _tared(self, device: Device, values: Sequence[int]) -> Forces:
-        """Of each taxel, less what it felt when it was told to take that as zero."""
         felt = np.array(values).reshape(-1, 3)
         felt[:, 2] &= 0xFF
         if device.memory.pop("tare", False):
@@ -215,7 +209,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
 
 
 def _told(forces: Forces) -> Forces:
-    """As far as bytes can tell them."""
     return np.clip(forces, (-128, -128, 0), (127, 127, 255))
 
 

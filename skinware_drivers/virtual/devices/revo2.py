@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
 from skinware_drivers.virtual.modbus_device import ModbusEmulator
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
@@ -67,13 +68,11 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Five fingers beside each other."""
         if self.options.edition == "touch":
             return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
         return on_a_grid(_N_VALUES[self.options.edition], 12)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
-        """Input registers with what is felt."""
         options = self.options
         on = options.touch and device.memory.get("on", options.enabled)
         if options.edition == "touch":
@@ -97,12 +96,10 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         return found
 
     def beside(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
-        """Firmware and serial number."""
         prefix = "BCXTL" if self.options.side == "left" else "BCXTR"
         return _text(3000, "1.0.14.U") | _text(3010, f"{prefix}0000000001")
 
     def of_other_function(self, device: Device) -> Mapping[int, int]:
-        """What it says of itself."""
         options = self.options
         on = int(options.touch and device.memory.get("on", options.enabled))
         said = {901: 2 if options.side == "left" else 1, **dict.fromkeys(_SWITCHES[options.edition], on)}
@@ -133,9 +130,5 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
 
 
 def _text(address: int, text: str) -> dict[int, int]:
-    """Ten registers of two characters."""
     data = text.encode().ljust(20, b"\0")
     return {address + place: int.from_bytes(data[2 * place : 2 * place + 2], "big") for place in range(10)}
-
-
-__all__ = ["EmulatedRevo2", "EmulatedRevo2Options"]

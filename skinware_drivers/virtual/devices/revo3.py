@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
 from skinware_drivers.virtual.modbus_device import ModbusEmulator
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
 
 _PRESSURE = {
@@ -69,7 +70,6 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All taxels, or zones."""
         return on_a_grid(42 if self.options.sums else sum(self._points), 16)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
@@ -148,13 +148,9 @@ def _pair(first: int, second: int) -> int:
 
 
 def _text(address: int, text: str) -> dict[int, int]:
-    """Ten registers of two characters."""
     data = text.encode().ljust(20, b"\0")
     return dict(enumerate(map(_pair, data[::2], data[1::2]), address))
 
 
 _TEXTS = _text(3030, "1.0.0") | _text(3040, "1.0") | _text(3050, _SERIAL_NUMBER)
 """Firmware, hardware and serial number, read with function 4."""
-
-
-__all__ = ["EmulatedRevo3", "EmulatedRevo3Options"]

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
@@ -41,7 +42,6 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """The cells of a patch."""
         return on_a_grid(self.options.cells, 4)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -49,7 +49,6 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
         return [bytes([byte]) for byte in heard if byte in b"01"], b""
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
-        """No word."""
         if command == b"1":
             self.start(device, now_ns)
         else:
@@ -61,11 +60,9 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
         return f"0x{payload[1]:02x}"
 
     def kinds(self) -> Sequence[str]:
-        """A record for each cell."""
         return [f"0x{patch << 4 | cell:02x}" for patch in self.options.patches for cell in range(self.options.cells)]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A record for each cell."""
         return [
             bytes((0x55, device.number << 4 | cell)) + struct.pack(">i", value)[1:] for cell, value in enumerate(values)
         ]

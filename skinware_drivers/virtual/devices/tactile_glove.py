@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
@@ -34,11 +35,9 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
     swing = -3000
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All taxels on one square."""
         return on_a_grid(self.options.taxels, 8)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """It sends by itself."""
         self.start(device, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
@@ -46,9 +45,7 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
         return f"0x{payload[0]:02x}"
 
     def kinds(self) -> Sequence[str]:
-        """A packet for each taxel."""
         return [f"0x{0x3C + taxel:02x}" for taxel in range(self.options.taxels)]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
-        """A packet for each taxel."""
         return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 _MOTORS_AND_FINGERS = {"1f": (3, 1), "2f": (6, 2), "3f": (12, 3), "4f": (18, 4), "5f": (20, 5), "5f15": (15, 5)}
@@ -40,18 +41,15 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
     speed_mbit_s = 100
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All cells of all fingers that have sensors."""
         return on_a_grid(len(self._fitted) * self._each_has, self._each_has)
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Wait to be asked."""
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Questions say how long they are."""
         return cut_packets(heard, b"\0", lambda part: max(3, part[1]) if len(part) > 1 else 0)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """What was asked for."""
         if command[2] == 8:
             return self._version()
         if command[2] == 1 and 5 in command[3:]:
@@ -68,7 +66,6 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         return "data" if payload[2] == 1 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """The answer to the question that wanted them."""
         motors, _ = _MOTORS_AND_FINGERS[self.options.hand]
         body = b""
         if 1 in device.memory["asked"]:

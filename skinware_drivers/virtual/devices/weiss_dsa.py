@@ -14,7 +14,8 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _OK, _WRONG = 0, 1
@@ -40,15 +41,12 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
     swing = 3500
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All cells."""
         return on_a_grid(sum(6 * rows for rows in self._rows), 6)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Commands say how long they are."""
         return cut_commands(heard, bare_when_empty=True)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """An error, and what was asked for."""
         number, arguments = command[3], command[6:-2]
         if arguments and crc(command[3:-2]) != int.from_bytes(command[-2:], "little"):
             return message(number, struct.pack("<H", _WRONG))
@@ -72,7 +70,6 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
         return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One message with all cells."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000 & 0xFFFF_FFFF
         if not device.memory.get("runs"):
             return [message(0x00, struct.pack(f"<IB{len(values)}H", uptime_ms, 0, *values))]

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
@@ -22,7 +23,6 @@ _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
 
 
 def message(command: int, payload: bytes) -> bytes:
-    """A message as it goes over the line."""
     head = BEGIN + struct.pack("<BH", command, len(payload)) + payload
     return head + struct.pack("<H", crc(head))
 
@@ -41,15 +41,12 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
     swing = 3500
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All cells."""
         return on_a_grid(self.options.columns * self.options.rows, self.options.columns)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Commands say how long they are."""
         return cut_commands(heard)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
-        """A status, and what was asked for."""
         status, answer = self._do(device, command, now_ns)
         return message(command[3], struct.pack("<H", status) + answer)
 

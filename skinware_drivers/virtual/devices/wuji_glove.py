@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 _OK, _BAD_LENGTH, _BAD_CHECKSUM, _UNKNOWN, _BAD_PAYLOAD = 0x00, 0x10, 0x11, 0x12, 0x13
@@ -23,7 +24,6 @@ _NEEDED = {0x0101: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # 
 
 
 def message(sync: int, body: bytes) -> bytes:
-    """A message as it goes over the line."""
     covered = struct.pack("<H", len(body) + 6) + body
     return bytes((0xAA, sync)) + covered + struct.pack("<H", binascii.crc_hqx(covered, 0xFFFF))
 
@@ -49,11 +49,9 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
     speed_mbit_s = 12  # USB, full speed
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All cells."""
         return on_a_grid(768, 32)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Commands say how long they are."""
         return cut_packets(
             heard, b"\xaa\x56", lambda part: max(10, min(512, part[2] | part[3] << 8)) if len(part) >= 4 else 0
         )
@@ -68,7 +66,6 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
         return "data" if payload[1] == 0x55 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One message with all cells."""
         cells = [math.nan if at in self.options.invalid else value / 4096 for at, value in enumerate(values)]
         sent = device.memory["sent"] = device.memory.get("sent", -1) + 1
         hand = struct.pack("<B3x", self.options.hand == "right")

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
 
 
 class EmulatedXelaOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -44,11 +46,9 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Three axes a taxel."""
         return on_a_grid(16, 4, each=3) if self.options.model == "4x4" else on_a_grid(24, 6, each=3)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        """Start and stop."""
         if identifier != 0x200 + device.number or payload not in (b"\x07\x00", b"\x07\x01"):
             return False
         if payload[1]:
@@ -58,11 +58,9 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         return True
 
     def kinds(self) -> Sequence[str]:
-        """A frame for each taxel."""
         return [self.kind_of(taxel, b"") for board in self.numbers for taxel in self._taxels(board)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        """A frame for each taxel."""
         xyz = zip(values[0::3], values[1::3], values[2::3], strict=True)
         return [(i, struct.pack(">x3Hx", *axes)) for i, axes in zip(self._taxels(device.number), xyz, strict=True)]
 

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _TAXELS = {"uSPa44": (16, 4), "uSPa46": (24, 6), "uSPa22": (4, 2), "uSCuAH": (30, 6)}
@@ -44,12 +45,10 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All axes of a taxel are where it is."""
         count, columns = _TAXELS[self.options.model]
         return np.repeat(on_a_grid(count, columns), 3, axis=0)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """Sends to whoever is there."""
         if device.number == self.numbers[0]:
             self.say(device, json.dumps({"message": "Welcome"}).encode() + b"\n", now_ns)
         self.start(device, now_ns)
@@ -60,11 +59,9 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         return next((f"sensor{number}" for number in self.numbers if str(number) in told), "welcome")
 
     def kinds(self) -> Sequence[str]:
-        """A message for each sensor."""
         return [f"sensor{number}" for number in self.numbers]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A message with one sensor."""
         time_s = device.sampled_ns / 1e9
         sensor: dict[str, object] = {
             "sensor": str(device.number),

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _BOOT_TIME_S = 1_700_000_000.0
@@ -41,11 +42,9 @@ class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
     speed_mbit_s = 100
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All values."""
         return on_a_grid(self.options.length, 12)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """Sends to whoever reads."""
         self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

@@ -107,7 +107,6 @@ class Board(ABC):
         """
 
     def hears(self, now_ns: int) -> bool:
-        """Whether the board has power and is not booting."""
         return self.alive and now_ns >= self._ready_ns
 
     def die(self, now_ns: int, reason: Literal["died", "restarted"] = "died") -> None:
@@ -155,14 +154,12 @@ class Board(ABC):
     # What the board does by itself
 
     def next_event_ns(self) -> int | None:
-        """When ``run`` has something to do."""
         inertial_ns = self.inertial.next_ns
         if self.next_burst_ns is None or inertial_ns is None:
             return self.next_burst_ns if inertial_ns is None else inertial_ns
         return min(self.next_burst_ns, inertial_ns)
 
     def run(self, now_ns: int) -> None:
-        """Do what is due."""
         inertial_ns = self.inertial.next_ns
         if inertial_ns is not None and inertial_ns <= now_ns:
             for low, payload in self.inertial.take():
@@ -237,7 +234,6 @@ class Board(ABC):
             parts.transmitter.queue.append(burst)
 
     def _identifiers(self) -> list[int]:
-        """HEAD, TAIL, HEAD ... of the active triangles."""
         head = self._data_class << 8 | self.address << 4
         tail = head if self.parts.tail_class == DATA else self.parts.tail_class << 8 | self.address << 4
         key = (head, tail, self._active.tobytes())
@@ -340,6 +336,3 @@ class Board(ABC):
                 time_ns=time_ns, board=self.address, triangle=triangle, cycle=cycle, half=half, reason=reason
             )
         )
-
-
-__all__ = ["BOOTLOADER", "EVERY_BOARD", "LONGEST_QUEUE", "OLD_DATA", "POLLING", "Board", "BoardParts"]

@@ -66,23 +66,19 @@ class Converters:
         return self._faults.version, self._touch.version
 
     def set_board(self, skin_type: int, no_load: int) -> None:
-        """Settings of all triangles."""
         self._skin_type, self._no_load = skin_type, no_load
         self._settings_changed()
 
     def set_triangles(self, first: int, last: int, shift: int, cdc_offset: int) -> None:
-        """Settings of the triangles ``first`` to ``last``."""
         self._shift[first : last + 1] = [min(shift, _LARGEST_SHIFT)] * (last + 1 - first)
         self._cdc_offset[first : last + 1] = cdc_offset
         self._settings_changed()
 
     def set_shift(self, shift: int) -> None:
-        """The same shift for all triangles."""
         self._shift = [shift] * TRIANGLES
         self._settings_changed()
 
     def set_cdc_offset(self, cdc_offset: int) -> None:
-        """The same offset for all triangles."""
         self._cdc_offset[:] = cdc_offset
         self._settings_changed()
 
@@ -130,6 +126,3 @@ class Converters:
     def _settings_changed(self) -> None:
         self._arithmetic = Arithmetic(self._skin_type, self._no_load, tuple(self._shift), self._mtb3)
         self._ahead.clear()
-
-
-__all__ = ["DEFAULT_NO_LOAD", "DEFAULT_SHIFT", "DEFAULT_SKIN_TYPE", "Acquisition", "Converters"]

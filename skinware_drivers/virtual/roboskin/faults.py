@@ -86,7 +86,6 @@ class BoardFaults:
         return due
 
     def set_triangle(self, triangle: int, fault: TriangleState) -> None:
-        """Break a triangle or mend it."""
         mask = self.disconnected if fault in ("unplugged", "plugged_in") else self.not_acknowledging
         mask[triangle] = fault in ("unplugged", "no_ack")
         self.version += 1
@@ -126,6 +125,3 @@ class BoardFaults:
     def _chosen(self, probability: float, count: int) -> list[int]:
         chosen: npt.NDArray[np.int64] = np.flatnonzero(self._random.random(count) < probability)
         return [int(position) for position in chosen]
-
-
-__all__ = ["WRONG_LENGTHS", "BoardFaults", "Fate", "TriangleState", "TriangleTrigger"]

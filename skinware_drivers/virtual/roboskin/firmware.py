@@ -161,17 +161,3 @@ def triangle_payloads(sample: Sample, *, short_tail: bool) -> list[list[bytes]]:
     block[:, :, 1, 7] = sample.diagnostics & 0xFF
     places = [(at, 6 if short_tail and at % 16 else 8) for at in range(0, 16 * TRIANGLES, 8)]
     return [[data[at : at + length] for at, length in places] for data in map(np.ndarray.tobytes, block)]
-
-
-__all__ = [
-    "CHANNELS",
-    "FINGERTIP",
-    "NOT_CONNECTED",
-    "NO_ACK",
-    "RAW_TEST",
-    "TRIANGLES",
-    "Arithmetic",
-    "ArrayI",
-    "Sample",
-    "triangle_payloads",
-]

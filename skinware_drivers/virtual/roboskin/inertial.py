@@ -72,7 +72,6 @@ class InertialSensors:
         self.next_ns = None
 
     def take(self) -> list[InertialMessage]:
-        """The messages that are due at ``next_ns``, which moves on."""
         if self.next_ns is None:
             return []
         time_s = self.next_ns * 1e-9
@@ -118,6 +117,3 @@ class InertialSensors:
             x, z = along * math.cos(tilt) - down * math.sin(tilt), along * math.sin(tilt) + down * math.cos(tilt)
             scale, y = 16, 0.0
         return struct.pack("<3h", round(scale * x), round(scale * y), round(scale * z))
-
-
-__all__ = ["MTB3_UNITS", "MTB4_UNITS", "InertialMessage", "InertialSensors", "Units"]

@@ -44,7 +44,7 @@ class Mtb3(Board):
         self._busy_until_ns = ready_ns
         self._calibrate(ready_ns, "power_up")
 
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: D102 - inherited
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
         if not self.hears(now_ns):
             return False
         host, destination = identifier >> 4 & 0xF, identifier & 0xF
@@ -138,6 +138,3 @@ class Mtb3(Board):
         self._calibrate_slowly(time_ns, "no_ack")
         self.next_burst_ns = self._busy_until_ns
         return False
-
-
-__all__ = ["Mtb3"]

@@ -32,7 +32,7 @@ class Mtb4(Board):
         super()._power_up(ready_ns)
         self._converters_ready = False
 
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: D102 - inherited
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
         destination = identifier & 0xF
         if not self.hears(now_ns) or destination not in (self.address, EVERY_BOARD):
             return False
@@ -101,6 +101,3 @@ class Mtb4(Board):
         """New baselines at the beginning of a burst, which follows at once (``tick``)."""
         self._calibrate(time_ns, "no_ack")
         return True
-
-
-__all__ = ["Mtb4"]

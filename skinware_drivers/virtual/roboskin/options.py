@@ -117,6 +117,3 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
                 raise ConfigurationError(
                     f"option {name}: there is no board {address}; boards={','.join(map(str, self.boards))}"
                 )
-
-
-__all__ = ["RoboskinOptions"]

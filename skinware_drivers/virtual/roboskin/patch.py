@@ -26,7 +26,6 @@ def make_boards(
     skin: PressedSkin,
     now_ns: int,
 ) -> list[Board]:
-    """The boards in the order of the option ``boards``, each powered up at ``now_ns`` and with its own phase."""
     if source is None and options.pattern == "cycle":
         source = cycle_pattern
     phases = np.random.default_rng([options.seed, len(options.boards)]).uniform(0.02, 1, len(options.boards))
@@ -67,6 +66,3 @@ def make_foreign_traffic(
     ] + [EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in options.boards]
     random = np.random.default_rng([options.seed, len(options.boards), 2])
     return [ForeignTraffic(identifiers, options.foreign_hz, random, wire.attach(), log, counts, now_ns)]
-
-
-__all__ = ["make_boards", "make_foreign_traffic"]

@@ -165,6 +165,3 @@ class PressedSkin:
             for name in ("pressure", "temperature")
         ]
         return Geometry.joined(of_each_type)
-
-
-__all__ = ["PressedSkin"]

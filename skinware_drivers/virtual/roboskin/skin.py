@@ -81,7 +81,6 @@ class EmulatedRoboskin(Stage):
         return name
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of frames with data that the boards send."""
         from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL
         from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 
@@ -121,7 +120,6 @@ class EmulatedRoboskin(Stage):
         self._set_triangle(address, triangle, "unplugged", now_ns)
 
     def plug_in(self, address: int, triangle: int, now_ns: int) -> None:
-        """Put the plug back."""
         self._set_triangle(address, triangle, "plugged_in", now_ns)
 
     def acknowledge(self, address: int, triangle: int, now_ns: int, *, on: bool) -> None:
@@ -160,6 +158,3 @@ class EmulatedRoboskin(Stage):
                 self.schedule(now_ns + round(options.restart_after_s * 1e9), restart)
         self.plan_silence(options.silence, self.kinds(), options.silence_after_s, now_ns)
         return [*self._boards, *make_foreign_traffic(options, self.wire, self.log, self.counts, now_ns)]
-
-
-__all__ = ["EmulatedRoboskin"]

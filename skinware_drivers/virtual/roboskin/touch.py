@@ -57,7 +57,6 @@ class Touch:
 
     @property
     def streams(self) -> bool:
-        """Whether the board has begun to stream."""
         return self._streams
 
     @property
@@ -94,6 +93,3 @@ class Touch:
 def cycle_pattern(board: int, triangle: int, cycle: int, time_ns: int) -> Sequence[int]:  # noqa: ARG001 - a WireSource
     """A source of which all 12 values of a triangle are the cycle's number modulo 256: torn data shows."""
     return (cycle & 0xFF,) * CHANNELS
-
-
-__all__ = ["DEFAULT_CDC_OFFSET", "Touch", "WireSource", "cycle_pattern"]

@@ -12,10 +12,10 @@ Read a skin without knowing its hardware::
 import os
 
 from skinware import realtime, threads
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader, DriverWriter
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
@@ -28,12 +28,12 @@ __all__ = [
     "BusReason",
     "BusState",
     "Column",
-    "DriverFrame",
     "DriverReader",
+    "DriverSnapshot",
     "DriverWriter",
-    "Frame",
     "Namespace",
     "PatchState",
+    "Sample",
     "Schema",
     "ServiceReader",
     "ServiceWriter",

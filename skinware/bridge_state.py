@@ -20,7 +20,7 @@ from skinware._columns import texts
 from skinware.errors import BadServiceFile
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import Column, ServiceReader, ServiceWriter
 
 KIND = "bridge"
@@ -126,7 +126,7 @@ def service_name(robot: str) -> str:
     return f"{robot[:40]}-bridge"
 
 
-class BridgeFrame(Frame):
+class BridgeSample(Sample):
     """How a bridge was at one time."""
 
     __slots__ = ()
@@ -153,7 +153,7 @@ class BridgeFrame(Frame):
         )
 
 
-class BridgeReader(ServiceReader[BridgeFrame]):
+class BridgeReader(ServiceReader[BridgeSample]):
     """Reads how a bridge is.
 
     Args:
@@ -164,7 +164,7 @@ class BridgeReader(ServiceReader[BridgeFrame]):
         BadServiceFile: the service is no state of a bridge.
     """
 
-    frame_class = BridgeFrame
+    frame_class = BridgeSample
 
     def _describe(self, attached: segments.Segment) -> str:
         columns = attached.schema.columns

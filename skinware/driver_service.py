@@ -15,7 +15,7 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
@@ -182,14 +182,14 @@ class DriverWriter:
         self.close()
 
 
-class DriverReader(ServiceReader[DriverFrame]):
+class DriverReader(ServiceReader[DriverSnapshot]):
     """Reads one driver: a :class:`skinware.service.ServiceReader` that also knows the skin's structure.
 
     Raises:
         BadServiceFile: the service is not a driver, or its tables contradict each other.
     """
 
-    frame_class = DriverFrame
+    frame_class = DriverSnapshot
 
     @property
     def structure(self) -> Structure:
@@ -201,15 +201,15 @@ class DriverReader(ServiceReader[DriverFrame]):
         """Name of the driver's class, as it told; empty if it did not."""
         return "".join(_names(self.static(), "driver_type")[:1])
 
-    def bus_counters(self, frame: DriverFrame) -> list[dict[str, int]]:
+    def bus_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
         """The counters of every bus in a frame, by name."""
         return self._counters(frame, "bus", len(self.structure.buses))
 
-    def patch_counters(self, frame: DriverFrame) -> list[dict[str, int]]:
+    def patch_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
         """The counters of every patch in a frame, by name."""
         return self._counters(frame, "patch", self.structure.n_patches)
 
-    def _counters(self, frame: DriverFrame, what: str, count: int) -> list[dict[str, int]]:
+    def _counters(self, frame: DriverSnapshot, what: str, count: int) -> list[dict[str, int]]:
         names, counts = counters_of(frame, self.static(), what, count)
         return [dict(zip(names, row, strict=True)) for row in counts.tolist()]
 
@@ -220,7 +220,7 @@ class DriverReader(ServiceReader[DriverFrame]):
 
 
 def counters_of(
-    frame: DriverFrame, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
+    frame: DriverSnapshot, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
 ) -> tuple[list[str], npt.NDArray[np.uint64]]:
     """Counters in a frame: their names, and (count, names) numbers; no names where the driver tells none.
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any, Self
 
 from skinware._renamed import renamed
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import (
     BadServiceFile,
     Closed,
@@ -38,7 +38,7 @@ DriverCallback = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
 
 
-class _Reader(Tap[DriverFrame], DriverReader):
+class _Reader(Tap[DriverSnapshot], DriverReader):
     """A reader of one driver of a skin."""
 
 
@@ -79,7 +79,7 @@ class Skin:
         self._trouble = ""  # why a driver could not be read by this program
         self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
-        self._in_c: Look[DriverFrame] | None = None
+        self._in_c: Look[DriverSnapshot] | None = None
         self._inodes_in_c: dict[str, int] = {}
         self._latest: Snapshot | None = None  # what C looks for news of
         self._next_discovery_ns = self._next_look_ns = 0
@@ -370,7 +370,7 @@ def _names(given: Collection[str] | None) -> frozenset[str] | None:
     return None if given is None else frozenset(given)
 
 
-def _nearest(readers: list[_Reader]) -> tuple[DriverFrame, ...]:
+def _nearest(readers: list[_Reader]) -> tuple[DriverSnapshot, ...]:
     newest_ns = [reader.newest_acquired_ns() for reader in readers]
     time_ns = now_ns()
     reached_ns = [

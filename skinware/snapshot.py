@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._renamed import renamed
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import StructureError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.skin_layout import SkinLayout
@@ -25,9 +25,9 @@ class Snapshot:
     """
 
     layout: SkinLayout
-    frames: tuple[DriverFrame, ...]
+    frames: tuple[DriverSnapshot, ...]
 
-    def of(self, driver: str) -> DriverFrame:
+    def of(self, driver: str) -> DriverSnapshot:
         """The frame of one driver.
 
         Raises:
@@ -108,7 +108,7 @@ class Snapshot:
         """(n,) int64: index into ``layout.modules``, the names of modules, of every sensor of a type."""
         return self.layout.module_of(type_name)
 
-    def _frames_with(self, type_name: str) -> list[DriverFrame]:
+    def _frames_with(self, type_name: str) -> list[DriverSnapshot]:
         return [self.frames[driver] for driver, _ in self.layout.parts(type_name)]
 
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from skinware._renamed import renamed
 from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
 from skinware.service import ServiceReader, ServiceWriter
 from skinware.skin import Skin
@@ -35,7 +35,7 @@ log: logging.Logger = logging.getLogger("skinware.threads")
 _REST_AFTER_OVERRUN_S = 0.01
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Frame)
+F = TypeVar("F", bound=Sample)
 
 
 class _Stoppable(Protocol):

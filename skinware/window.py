@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.snapshot import Snapshot
 
@@ -41,7 +41,7 @@ class Window:
         self._physical: npt.NDArray[Any] = np.zeros((length, 0), np.float32)
         self._fresh = np.zeros((length, 0), bool)
 
-    def add(self, frame: DriverFrame | Snapshot) -> None:
+    def add(self, frame: DriverSnapshot | Snapshot) -> None:
         """Take a frame in; the oldest gives way.
 
         A frame of another structure, or a snapshot of another layout, empties the window first: its sensors are others.

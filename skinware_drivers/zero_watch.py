@@ -21,7 +21,7 @@ class ZeroWatch(Watch):
     """Knows which modules have sent nothing but 0 since they were first heard: not touched yet, or dead.
 
     Their values are good and fresh: hands whose taxels rest at exactly 0 are usual. What is known is published as
-    :attr:`skinware.DriverFrame.module_untouched`. After the first other value, a module counts as alive for good.
+    :attr:`skinware.DriverSnapshot.module_untouched`. After the first other value, a module counts as alive for good.
 
     Attributes:
         patience_s: for how long 0 comes before the log names a module.

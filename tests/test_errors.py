@@ -20,7 +20,7 @@ import zenoh
 from serial.tools import list_ports
 
 import skinware.recording
-from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter, errors
+from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWriter, errors
 from skinware.bridge import Link as BridgeLink
 from skinware.bridge import endpoints
 from skinware.errors import SkinwareError
@@ -52,8 +52,8 @@ def writer(**more: object) -> ServiceWriter:
     return ServiceWriter("pose", COLUMNS, **more)  # type: ignore[arg-type]
 
 
-def reader() -> ServiceReader[Frame]:
-    return ServiceReader[Frame]("pose")
+def reader() -> ServiceReader[Sample]:
+    return ServiceReader[Sample]("pose")
 
 
 def publish(to: ServiceWriter) -> None:
@@ -195,7 +195,7 @@ def Paused(_: pytest.MonkeyPatch) -> object:  # noqa: N802
         return writing.begin()
 
 
-def serving(ask: Callable[[ServiceReader[Frame]], object]) -> object:
+def serving(ask: Callable[[ServiceReader[Sample]], object]) -> object:
     def fail() -> None:
         raise RuntimeError("the valve is stuck")
 

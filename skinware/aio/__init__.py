@@ -22,7 +22,7 @@ from typing import Any, Generic, Self
 import skinware.skin
 from skinware.aio._wakeups import WakeWord, wakeups
 from skinware.errors import RequestTimeout, ServiceTimeout
-from skinware.memory.ring import FrameT
+from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.service import Position, ServiceReader
 from skinware.service._tap import wake_word_of
@@ -53,7 +53,7 @@ class _Awaited:
         self.close()
 
 
-class Reader(_Awaited, Generic[FrameT]):
+class Reader(_Awaited, Generic[SampleT]):
     """A reader of one service for asyncio.
 
     Args:
@@ -63,17 +63,17 @@ class Reader(_Awaited, Generic[FrameT]):
         sync: that reader, for everything that does not wait.
     """
 
-    def __init__(self, reader: ServiceReader[FrameT]) -> None:
-        self.sync: ServiceReader[FrameT] = reader
+    def __init__(self, reader: ServiceReader[SampleT]) -> None:
+        self.sync: ServiceReader[SampleT] = reader
         super().__init__()
 
     async def read(
         self,
         *,
-        newer_than: FrameT | Position | None = None,
+        newer_than: SampleT | Position | None = None,
         max_age_s: float | None = None,
         timeout_s: float | None = 5.0,
-    ) -> FrameT:
+    ) -> SampleT:
         """As :meth:`skinware.ServiceReader.read`; it raises the same."""
         deadline_ns = _deadline_ns(timeout_s)
         while True:
@@ -89,19 +89,19 @@ class Reader(_Awaited, Generic[FrameT]):
 
     async def frames(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
-    ) -> AsyncIterator[FrameT]:
+    ) -> AsyncIterator[SampleT]:
         """As :meth:`skinware.ServiceReader.frames`; it raises the same."""
-        frame: FrameT | None = None
+        frame: SampleT | None = None
         timer = None if rate_hz is None else Periodic(rate_hz)
         while timer is None or await _deadline(timer):
             newer_than = frame if timer is None or self.sync.structure_changed else None
             frame = await self.read(newer_than=newer_than, max_age_s=max_age_s, timeout_s=timeout_s)
             yield frame
 
-    def __aiter__(self) -> AsyncIterator[FrameT]:
+    def __aiter__(self) -> AsyncIterator[SampleT]:
         return self.frames()
 
-    async def request(self, *, timeout_s: float = 5.0) -> FrameT:
+    async def request(self, *, timeout_s: float = 5.0) -> SampleT:
         """As :meth:`skinware.ServiceReader.request`; it raises the same."""
         deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
         answer = await self._ask("acquire", {}, timeout_s)

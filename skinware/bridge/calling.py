@@ -15,7 +15,7 @@ from skinware.bridge.link import Question
 from skinware.bridge.messages import Answered, read_text
 from skinware.errors import Paused, RequestCancelled, RequestError, RequestRefused, SkinwareError
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import PendingRequest, ServiceReader
 from skinware.service.messages import Answer
@@ -101,7 +101,7 @@ class Calls:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         return pending.result(0.0)
 
-    def _reader(self, name: str) -> ServiceReader[Frame]:
+    def _reader(self, name: str) -> ServiceReader[Sample]:
         return ServiceReader(name, namespace=self._namespace, announce=False)
 
 

@@ -30,7 +30,7 @@ _Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sample:
+class Exchange:
     """What questions told at one moment.
 
     Attributes:
@@ -45,18 +45,18 @@ class Sample:
     round_trip_ns: int
 
     @staticmethod
-    def of(asked_ns: int, heard_ns: int, answered_ns: int, returned_ns: int) -> Sample:
+    def of(asked_ns: int, heard_ns: int, answered_ns: int, returned_ns: int) -> Exchange:
         """Of our times ``asked_ns`` and ``returned_ns`` and the other end's, ``heard_ns`` and ``answered_ns``."""
         low_ns, high_ns = asked_ns - heard_ns, returned_ns - answered_ns
-        return Sample((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
+        return Exchange((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
 
-    def with_(self, other: Sample) -> Sample:
+    def with_(self, other: Exchange) -> Exchange:
         """What both told, at the moment of this one; only the other where the clock jumped between them."""
         drift_ns = round(_MOST_DRIFT * abs(other.at_ns - self.at_ns))
         low_ns, high_ns = max(self.low_ns, other.low_ns - drift_ns), min(self.high_ns, other.high_ns + drift_ns)
         if low_ns > high_ns:
             return other
-        return Sample(self.at_ns, low_ns, high_ns, min(self.round_trip_ns, other.round_trip_ns))
+        return Exchange(self.at_ns, low_ns, high_ns, min(self.round_trip_ns, other.round_trip_ns))
 
 
 class PeerClock:
@@ -67,7 +67,7 @@ class PeerClock:
     """
 
     def __init__(self) -> None:
-        self._samples: deque[Sample] = deque()
+        self._samples: deque[Exchange] = deque()
         self._rounds = 0
         self._at_ns = 0
         self._offset_ns = self._slope = 0.0
@@ -90,7 +90,7 @@ class PeerClock:
         """Our clock minus the other, at one of our moments."""
         return round(self._offset_ns + self._slope * (at_ns - self._at_ns))
 
-    def add(self, sample: Sample) -> None:
+    def add(self, sample: Exchange) -> None:
         samples = self._samples
         if samples and abs(sample.at_ns - samples[-1].at_ns) < _AT_ONCE_NS:
             samples[-1] = samples[-1].with_(sample)

@@ -13,7 +13,7 @@ from skinware._columns import Index, as_index, texts
 from skinware.bridge.messages import Head
 from skinware.errors import StructureError
 from skinware.memory.file_layout import SLOT
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.memory.schema import Schema
 from skinware.structure import Structure
 from skinware.transfer.frames import RecordedDriverFrame
@@ -72,7 +72,7 @@ class Cut:
         self.head = Head(whole.head_with(cut, Schema(columns, whole.schema.description)))
         self.generation: Generation = Generation(self.head.raw, whole.name)
 
-    def frame(self, frame: Frame) -> RecordedDriverFrame:
+    def frame(self, frame: Sample) -> RecordedDriverFrame:
         slot = np.zeros(self.generation.slot_stride, np.uint8)
         slot[: SLOT.itemsize] = np.frombuffer(frame.slot, np.uint8, SLOT.itemsize)
         cut = RecordedDriverFrame(self.generation, memoryview(slot.data))

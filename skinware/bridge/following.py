@@ -27,7 +27,7 @@ from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
-from skinware.transfer.frames import RecordedFrame, frame_of
+from skinware.transfer.frames import RecordedSample, frame_of
 from skinware.transfer.generation import Generation
 
 Slot = npt.NDArray[np.uint8]
@@ -224,11 +224,11 @@ class Follower:
             if key == self._frame_key:  # and not of a bridge that is not followed any more
                 self._take_frame(message)
 
-    def _pull_all(self, here: RecordedFrame | None = None) -> None:
+    def _pull_all(self, here: RecordedSample | None = None) -> None:
         while len(self._open) < self._pacing.open:
             self._pull(here)
 
-    def _pull(self, here: RecordedFrame | None = None) -> None:
+    def _pull(self, here: RecordedSample | None = None) -> None:
         """Ask for a frame that is newer than all that are here; ``here`` is one that is not published yet."""
         self._pulls += 1
         pull, others = self._pulls, len(self._open)
@@ -298,7 +298,7 @@ class Follower:
         if frame is not None:
             self._publish(frame)
 
-    def _frame_of(self, message: bytes) -> RecordedFrame | None:
+    def _frame_of(self, message: bytes) -> RecordedSample | None:
         """The frame of a message; None if it cannot be read, or not yet."""
         if self.is_over:
             return None
@@ -335,7 +335,7 @@ class Follower:
         coded, keeps = coded_part(message)
         return self._decoder.decode(coded, keeps=keeps)
 
-    def _publish(self, frame: RecordedFrame) -> None:
+    def _publish(self, frame: RecordedSample) -> None:
         generation = self._generation
         if generation is None or frame.position <= self._newest or now_ns() < self._again_ns:
             return
@@ -386,7 +386,7 @@ def _check(generation: Generation) -> None:
         )
 
 
-def _checked(frame: RecordedFrame, generation: Generation) -> RecordedFrame:
+def _checked(frame: RecordedSample, generation: Generation) -> RecordedSample:
     """The frame, if it can be one.
 
     Raises:

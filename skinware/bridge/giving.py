@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from skinware.bridge.link import Question, Sender
 from skinware.bridge.messages import RAW, coded_message, number_in, raw_message
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import CodedColumn, encoded
 
@@ -38,7 +38,7 @@ class _Form:
 
     generation: int
     columns: Sequence[CodedColumn]
-    made_of: Callable[[Frame], Frame]
+    made_of: Callable[[Sample], Sample]
 
 
 @dataclass
@@ -56,7 +56,7 @@ class _Puller:
     open: deque[tuple[int, Question]] = field(default_factory=deque)
     sent: tuple[int, int] = (0, 0)
     generation: int = 0
-    kept: dict[int, Frame] = field(default_factory=dict)
+    kept: dict[int, Sample] = field(default_factory=dict)
     kept_ns: int = 0
     since: int = 0
     asked_ns: int = 0
@@ -77,12 +77,12 @@ class Stream:
         self._send, self._soon = send, soon
         self._lock = threading.Lock()
         self._form = _Form(0, (), _as_it_is)
-        self._newest: Frame | None = None
+        self._newest: Sample | None = None
         self._pullers: dict[str, _Puller] = {}
         self.frames: int = 0
 
     @property
-    def newest(self) -> Frame | None:
+    def newest(self) -> Sample | None:
         return self._newest
 
     @property
@@ -91,7 +91,7 @@ class Stream:
         return len(self._pullers)
 
     def begin(
-        self, generation: int, columns: Sequence[CodedColumn], made_of: Callable[[Frame], Frame] | None = None
+        self, generation: int, columns: Sequence[CodedColumn], made_of: Callable[[Sample], Sample] | None = None
     ) -> None:
         """Another generation begins.
 
@@ -103,7 +103,7 @@ class Stream:
         with self._lock:
             self._form, self._newest = _Form(generation, columns, made_of or _as_it_is), None
 
-    def take(self, frame: Frame) -> None:
+    def take(self, frame: Sample) -> None:
         """A frame; those of other generations, and older ones than the newest, are left out."""
         with self._lock:
             form, before = self._form, self._newest
@@ -183,7 +183,7 @@ class Stream:
         else:
             self._soon(lambda: question.reply(raw_message(form.made_of(newest))))
 
-    def _give(self, form: _Form, frame: Frame, question: Question, puller: _Puller) -> None:
+    def _give(self, form: _Form, frame: Sample, question: Question, puller: _Puller) -> None:
         """Answer a question for a frame; always in the same thread."""
         given = form.made_of(frame)
         if puller.generation != given.generation:
@@ -201,7 +201,7 @@ class Stream:
         question.reply(coded_message(message, keeps))
 
 
-def _as_it_is(frame: Frame) -> Frame:
+def _as_it_is(frame: Sample) -> Sample:
     return frame
 
 

@@ -47,7 +47,7 @@ import numpy.typing as npt
 
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.limits import LIMITS, read_json, unpack
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.tactile.choosing import SensorChoice
 from skinware.tactile.regions import Region, Regions
 
@@ -297,7 +297,7 @@ def host_name() -> str:
     return socket.gethostname()[:64]
 
 
-def raw_message(frame: Frame) -> bytes:
+def raw_message(frame: Sample) -> bytes:
     return b"".join((_HEAD.pack(RAW, frame.generation), frame.slot))
 
 

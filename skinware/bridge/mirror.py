@@ -12,7 +12,7 @@ from skinware.bridge.messages import Answered
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
-from skinware.transfer.frames import RecordedFrame
+from skinware.transfer.frames import RecordedSample
 from skinware.transfer.generation import Generation
 from skinware.transfer.republishing import Published, Republisher
 
@@ -67,7 +67,7 @@ class Mirror(Republisher):
 
         super().watch(fd, locked)
 
-    def shift_ns(self, frame: RecordedFrame) -> int:  # noqa: ARG002
+    def shift_ns(self, frame: RecordedSample) -> int:  # noqa: ARG002
         return self._offset_ns()
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:
@@ -78,7 +78,7 @@ class Mirror(Republisher):
         for request in service.writer.requests():
             self._ask(name, request)
 
-    def publish(self, name: str, frame: RecordedFrame, generation: Generation, *, follows: bool = True) -> None:
+    def publish(self, name: str, frame: RecordedSample, generation: Generation, *, follows: bool = True) -> None:
         """Likewise. Answers that waited for this frame are given."""
         super().publish(name, frame, generation, follows=follows)
         self._newest[name] = frame.position

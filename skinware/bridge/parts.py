@@ -11,7 +11,7 @@ from skinware.bridge.cutting import Cut
 from skinware.bridge.giving import Stream
 from skinware.bridge.messages import Wish
 from skinware.errors import BridgeError
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.choosing import SensorChoice
@@ -49,7 +49,7 @@ class Part:
                     self._begin(name, Cut(whole, wanted))
             return name in self._cuts
 
-    def take(self, name: str, frame: Frame) -> None:
+    def take(self, name: str, frame: Sample) -> None:
         """Give what is of this part of a driver's frame, if it is of the generation that is known."""
         cut = self._cuts.get(name)
         if cut is not None and cut.generation.generation == frame.generation:
@@ -116,7 +116,7 @@ class Parts:
     def find(self, number: str) -> Part | None:
         return self._parts.get(number)
 
-    def take(self, name: str, frame: Frame) -> None:
+    def take(self, name: str, frame: Sample) -> None:
         """Give what is of each part of a driver's frame."""
         for part in list(self._parts.values()):
             part.take(name, frame)

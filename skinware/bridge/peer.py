@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.clock import Exchange, PeerClock
 from skinware.bridge.guarding import Guard, Room
 from skinware.bridge.link import Link, Reply
 from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, Services, token_parts
@@ -254,10 +254,10 @@ class Peer:
         self._next_clock_ns = self._pinged_ns + self.clock.pause_ns()
         self._pinger.ask()
 
-    def _clock_answered(self, sample: Sample) -> None:
+    def _clock_answered(self, sample: Exchange) -> None:
         self.soon("a clock", lambda: self._take_clock(sample))
 
-    def _take_clock(self, sample: Sample) -> None:
+    def _take_clock(self, sample: Exchange) -> None:
         self.heard()
         self.clock.add(sample)
         self._watcher.clock_told()

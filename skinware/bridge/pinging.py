@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from skinware.bridge.clock import Sample
+from skinware.bridge.clock import Exchange
 from skinware.bridge.guarding import Guard
 from skinware.bridge.link import Link, Priority
 from skinware.bridge.messages import Keys
@@ -35,12 +35,12 @@ class Pinger:
         guard: counts answers that cannot be.
     """
 
-    def __init__(self, link: Link, who: str, told: Callable[[Sample], None], guard: Guard) -> None:
+    def __init__(self, link: Link, who: str, told: Callable[[Exchange], None], guard: Guard) -> None:
         self._link, self._who, self._told, self._guard = link, who, told, guard
         self._ping = ""
         self._silence: Callable[[], None] = lambda: None
         self._asked_ns = self._left = self._since_ns = 0
-        self._known: Sample | None = None
+        self._known: Exchange | None = None
 
     def follow(self, keys: Keys) -> None:
         self._silence()
@@ -81,7 +81,7 @@ class Pinger:
         is_newest, is_last = asked_ns == self._asked_ns, self._left == 0
         if is_newest and not is_last:
             self._ask()  # before all else, while threads are awake
-        sample = Sample.of(asked_ns, heard_ns, answered_ns, returned_ns)
+        sample = Exchange.of(asked_ns, heard_ns, answered_ns, returned_ns)
         self._known = sample if self._known is None else self._known.with_(sample)
         if is_newest and is_last:
             self._tell()

@@ -37,7 +37,7 @@ from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import boot
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn
@@ -199,7 +199,7 @@ class Server:
         self._states[service] = told
         self._link.tell(self._keys.services, self._told())
 
-    def took(self, service: str, frame: Frame) -> None:
+    def took(self, service: str, frame: Sample) -> None:
         """Likewise."""
         self._services[service].stream.take(frame)
         self._parts.take(service, frame)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.clock import Exchange, PeerClock
 from skinware.bridge.guarding import Guard
 from skinware.bridge.link import Link
 from skinware.bridge.messages import (
@@ -135,7 +135,7 @@ class Watcher:
                 seen.bytes += len(payload)
 
     def _ask_clock(self, seen: Seen) -> None:
-        def told(sample: Sample) -> None:
+        def told(sample: Exchange) -> None:
             with self._lock:
                 seen.clock.add(sample)
 

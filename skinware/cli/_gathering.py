@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from skinware.cli._command import warn
 from skinware.cli._coverage import SIGNS, bars, picture
-from skinware.cli._driver_frames import after, enter_pressed, frames_until
+from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
 from skinware.cli._format import terminal_width
 from skinware.cli._terminal import echo, print_json
 from skinware.driver_service import DriverReader

@@ -15,7 +15,7 @@ from skinware.cli._painting import marks_text, scale_text
 from skinware.cli._palette import TRUE_COLOURS, Palette
 from skinware.cli._scale import CHANGE, RANGE, RAW, SCALES, ChangeScale, Scaled, ValueScale
 from skinware.cli._top_rows import RowKey, patches_of, title_of
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.sensor_types import SensorType
 from skinware.skin_layout import SkinLayout
 from skinware.status import Status
@@ -148,7 +148,7 @@ class Picture:
         name = self.type_in(watched.structure).name
         return watched.wipe.save(folder, driver, name, watched.rest.noise(name))
 
-    def draw(self, key: RowKey, frame: DriverFrame, width: int, height: int, life: str) -> None:
+    def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
         """Draw a frame: sets ``arrangement`` and all that is drawn.
 
         Args:
@@ -186,7 +186,7 @@ class Picture:
         self.scale = Text(f"{name} ", no_wrap=True).append_text(scale_text(scaled.values, unit, self._palette))
         self.marks = marks_text(marks, self._palette)
 
-    def _watch(self, driver: str, frame: DriverFrame) -> _Watched:
+    def _watch(self, driver: str, frame: DriverSnapshot) -> _Watched:
         watched = self._watched.get(driver)
         if watched is None or watched.structure is not frame.structure:
             watched = self._watched[driver] = _Watched(driver, frame.structure)
@@ -196,7 +196,7 @@ class Picture:
         return watched
 
     def _scaled(
-        self, watched: _Watched, frame: DriverFrame, sensors: npt.NDArray[np.int64], sensor_type: SensorType
+        self, watched: _Watched, frame: DriverSnapshot, sensors: npt.NDArray[np.int64], sensor_type: SensorType
     ) -> tuple[str, Scaled]:
         fresh = frame.status[sensors] == 0
         if watched.wipe is None and self.scale_name != CHANGE:
@@ -231,7 +231,7 @@ class _Watched:
             index = structure.index(sensor_type.name)
             self._scale[index], self._offset[index] = sensor_type.scale, sensor_type.offset
 
-    def follow(self, frame: DriverFrame) -> None:
+    def follow(self, frame: DriverSnapshot) -> None:
         self.physical = frame.values.astype(np.float32) * self._scale + self._offset
         fresh = frame.status == 0
         self.rest.follow(self.physical, fresh, frame.published_ns)
@@ -239,7 +239,7 @@ class _Watched:
             self.wipe.follow(self.physical, fresh)
 
 
-def describe_sensor(frame: DriverFrame, position: int) -> str:
+def describe_sensor(frame: DriverSnapshot, position: int) -> str:
     """One sensor in words: which it is, its value, and what is wrong with it."""
     structure = frame.structure
     sensor_type = next(t for t in structure.types if t.id == structure.sensor_type[position])

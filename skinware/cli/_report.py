@@ -9,12 +9,12 @@ import numpy as np
 
 from skinware import bridge_state, native
 from skinware.cli import _bridges
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import KIND, DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS, ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
@@ -31,7 +31,7 @@ from skinware.views.health import (
     untouched,
 )
 
-FrameT = TypeVar("FrameT", bound=Frame)
+SampleT = TypeVar("SampleT", bound=Sample)
 
 
 def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
 
 
 def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
-    with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
+    with ServiceReader[Sample](name, namespace=namespace, announce=False) as service:
         if service.kind != KIND:
             told: dict[str, Any] = {"description": service.schema.description, "columns": _columns(service)}
             told |= {"bridge": _bridge(namespace, name)} if service.kind == bridge_state.KIND else {}
@@ -116,7 +116,7 @@ def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
         return None if frame is None else {"robot": frame.state.robot, **_bridges.as_data(frame.state)}
 
 
-def _newest(service: ServiceReader[FrameT]) -> FrameT | None:
+def _newest(service: ServiceReader[SampleT]) -> SampleT | None:
     if service.latest is None:
         return None
     try:
@@ -125,7 +125,7 @@ def _newest(service: ServiceReader[FrameT]) -> FrameT | None:
         return None  # between two lives of its writer, or too fast for a copy
 
 
-def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
+def _common(service: ServiceReader[Any], frame: Sample | None) -> dict[str, Any]:
     life = life_of(service, frame)
     statistics = service.writer_statistics
     return {
@@ -176,7 +176,7 @@ def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[str, Any]:
+def _skin(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> dict[str, Any]:
     structure = driver.structure
     return {
         "driver_type": driver.driver_type,
@@ -195,7 +195,7 @@ def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[st
     }
 
 
-def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, Any]]:
+def _buses(driver: DriverReader, frame: DriverSnapshot | None) -> list[dict[str, Any]]:
     if frame is None:
         return [{"name": name, "state": None} for name in driver.structure.buses]
     time_ns = now_ns()
@@ -215,7 +215,7 @@ def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, An
     return entries
 
 
-def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list[dict[str, Any]]:
+def _patches(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> list[dict[str, Any]]:
     structure = driver.structure if frame is None else frame.structure
     modules = np.bincount(structure.module_patch, minlength=structure.n_patches).tolist()
     patch_sensors = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()

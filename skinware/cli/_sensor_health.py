@@ -15,7 +15,7 @@ from skinware.errors import BadServiceFile, Overrun, ServiceNotFound, ServiceTim
 from skinware.memory.namespace import Namespace
 from skinware.service import ServiceReader
 from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.health_service import KIND, HealthFrame, HealthReader
+from skinware.tactile.health_service import KIND, HealthReader, HealthSample
 from skinware.views.health import life_of
 
 _NOTHING = """\
@@ -103,7 +103,7 @@ def _entry(namespace: Namespace, name: str, driver: str | None) -> dict[str, Any
     return told | {"kinds": kinds, "faults": _faults(namespace, frame, report)}
 
 
-def _faults(namespace: Namespace, frame: HealthFrame, report: HealthReport) -> list[dict[str, Any]]:
+def _faults(namespace: Namespace, frame: HealthSample, report: HealthReport) -> list[dict[str, Any]]:
     source = frame.source
     with DriverReader(source.driver, namespace=namespace, announce=False) as reader:
         structure = reader.structure

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.structure import Structure
 from skinware.views.health import (
     DEAD,
@@ -59,7 +59,7 @@ class Row(NamedTuple):
 
 def rows_of(
     reader: DriverReader,
-    frame: DriverFrame | None,
+    frame: DriverSnapshot | None,
     health: SkinHealth,
     patch_rates_hz: Sequence[float | None] = (),
 ) -> list[Row]:
@@ -106,7 +106,7 @@ def rows_of(
     return rows
 
 
-def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str, rates_hz: Sequence[float | None]) -> list[Row]:
+def _patch_rows(reader: DriverReader, frame: DriverSnapshot, life: str, rates_hz: Sequence[float | None]) -> list[Row]:
     structure, status = frame.structure, status_now(life, frame)
     was = "was " if life in WITHOUT_NEWS else ""
     total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
@@ -129,7 +129,7 @@ def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str, rates_hz: S
     return rows
 
 
-def patches_of(key: RowKey, frame: DriverFrame) -> list[int]:
+def patches_of(key: RowKey, frame: DriverSnapshot) -> list[int]:
     """The patches that a row stands for: its own, those of its bus, or all of its driver."""
     structure = frame.structure
     if key.kind == PATCH:

@@ -314,7 +314,7 @@ def _opened(
         how: options of all commands that gather.
         poses: service, its namespace, column and shape.
     """
-    from skinware.cli._driver_frames import reader_of
+    from skinware.cli._driver_snapshots import reader_of
     from skinware.cli._gathering import Gathering
     from skinware.memory.namespace import Namespace
     from skinware.service import ServiceReader

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from skinware._columns import Index
-    from skinware.driver_frame import DriverFrame
     from skinware.driver_service import DriverReader
+    from skinware.driver_snapshot import DriverSnapshot
     from skinware.memory.namespace import Namespace
     from skinware.structure import Structure
 
@@ -90,7 +90,7 @@ def command(
                 return
 
 
-def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, counts: bool) -> dict[str, Any]:
+def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, counts: bool) -> dict[str, Any]:
     """One frame as JSON prints it; with ``type_name`` only those sensors, and their uids."""
     index: Index = slice(None) if type_name is None else frame.structure.index(type_name)
     values = (frame.values if counts else _physical(frame))[index]
@@ -108,7 +108,7 @@ def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, cou
     return data
 
 
-def as_line(frame: DriverFrame, type_name: str | None, counts: bool) -> str:
+def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
     """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
@@ -133,7 +133,7 @@ def as_line(frame: DriverFrame, type_name: str | None, counts: bool) -> str:
     return "  ".join([*parts, f"{not_fresh} not fresh"])
 
 
-def _physical(frame: DriverFrame) -> npt.NDArray[Any]:
+def _physical(frame: DriverSnapshot) -> npt.NDArray[Any]:
     """(n_sensors,) float32: every value in the unit of its type."""
     import numpy as np
 
@@ -193,13 +193,13 @@ def _only_driver(namespace: Namespace, end_s: float) -> str:
 def _drivers(namespace: Namespace) -> dict[str, bool]:
     from skinware.driver_service import KIND
     from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
-    from skinware.memory.ring import Frame
+    from skinware.memory.ring import Sample
     from skinware.service import ServiceReader
 
     found = {}
     for name in namespace.services():
         try:
-            with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
+            with ServiceReader[Sample](name, namespace=namespace, announce=False) as service:
                 if service.kind == KIND:
                     found[name] = service.alive
         except (BadServiceFile, ConfigurationError, ServiceNotFound):
@@ -207,7 +207,7 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
     return found
 
 
-def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverFrame]:
+def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverSnapshot]:
     """Frames indefinitely, over restarts of the driver; says on stderr when it came back."""
     from skinware.cli._format import plural
     from skinware.errors import StructureChanged
@@ -247,7 +247,7 @@ def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
         time.sleep(_LOOK_EVERY_S)
 
 
-def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverFrame]:
+def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverSnapshot]:
     """The newest frame at the deadlines of a rate, each frame once.
 
     Raises:
@@ -257,7 +257,7 @@ def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> I
     from skinware.realtime import Periodic
 
     timer = Periodic(rate_hz)
-    newest: DriverFrame | None = None
+    newest: DriverSnapshot | None = None
     while True:
         newest = reader.read(newer_than=newest, timeout_s=timeout_s)
         yield newest

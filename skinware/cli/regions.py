@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from skinware.driver_frame import DriverFrame
     from skinware.driver_service import DriverReader
+    from skinware.driver_snapshot import DriverSnapshot
 
 _TELL_EVERY_S = 1.0
 
@@ -105,7 +105,7 @@ def paint(
 
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
-    from skinware.cli._driver_frames import reader_of
+    from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
     from skinware.tactile.region_files import put_region
     from skinware.tactile.regions import Region
@@ -157,7 +157,7 @@ class _Painter:
         """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
         import numpy as np
 
-        from skinware.cli._driver_frames import after, enter_pressed, frames_until
+        from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.painting import without_holes
         from skinware.views.rest import SETTLING_S
@@ -177,9 +177,9 @@ class _Painter:
             return int(stroked.sum()), stroked
         return int(stroked.sum()), without_holes(stroked, neighbours(geometry[self._index]))
 
-    def _touched(self, frame: DriverFrame) -> npt.NDArray[np.bool_]:
+    def _touched(self, frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
         """(n,) bool: which sensors of the type are far from rest."""
-        from skinware.cli._driver_frames import physical_of
+        from skinware.cli._driver_snapshots import physical_of
         from skinware.views.wiping import threshold
 
         physical = physical_of(frame, self.type_name)

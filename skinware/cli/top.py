@@ -25,7 +25,7 @@ from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
-    from skinware.tactile.contacts_service import ContactsFrame
+    from skinware.tactile.contacts_service import ContactsSample
     from skinware.views.bridges import LiveBridges
     from skinware.views.live import LiveDrivers
     from skinware.views.touches import LiveSources
@@ -129,7 +129,7 @@ def _on_terminal() -> bool:
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
-def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_json: bool) -> None:
+def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as_json: bool) -> None:
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
     from skinware.views.touches import places_of

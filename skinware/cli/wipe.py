@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from skinware.driver_frame import DriverFrame
     from skinware.driver_service import DriverReader
+    from skinware.driver_snapshot import DriverSnapshot
 
 _TELL_EVERY_S = 1.0
 
@@ -65,7 +65,7 @@ def command(
 
     Exit status: 0 every sensor answered, 1 some never did or the driver failed, 2 wrong usage.
     """
-    from skinware.cli._driver_frames import reader_of
+    from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
 
     with reader_of(Namespace(namespace), name, "skin-wipe NAME") as reader:
@@ -98,7 +98,7 @@ class _Wipe:
         self._is_redrawing = not as_json and sys.stdout.isatty()
 
     def go_on(self, duration_s: float | None) -> None:
-        from skinware.cli._driver_frames import after
+        from skinware.cli._driver_snapshots import after
         from skinware.views.rest import SETTLING_S
         from skinware.views.wiping import threshold
 
@@ -162,9 +162,9 @@ class _Wipe:
         never = self._test.never_moved(self._type.name, self._rest.noise(self._type.name))
         return never[np.isin(never, self._tested())]
 
-    def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverFrame, npt.NDArray[np.float32]]]:
+    def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Frames with their physical values, (n_sensors,); 0 for sensors of other types."""
-        from skinware.cli._driver_frames import after, frames_until, physical_of
+        from skinware.cli._driver_snapshots import after, frames_until, physical_of
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):
             self._status = frame.status

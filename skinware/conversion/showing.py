@@ -17,7 +17,7 @@ from skinware._names import distinct
 from skinware.conversion import definitions
 from skinware.conversion.cdr import Cdr
 from skinware.conversion.skin_messages import acquired_ns
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.matrices import rows_and_columns
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
@@ -73,7 +73,7 @@ class Showing:
     def topics(self) -> dict[str, Schema]:
         return {each.topic: each.schema for each in self._shown}
 
-    def messages(self, frame: DriverFrame, time_ns: int) -> Iterator[Message]:
+    def messages(self, frame: DriverSnapshot, time_ns: int) -> Iterator[Message]:
         """What is shown of a frame.
 
         Args:
@@ -85,7 +85,7 @@ class Showing:
 
     def pictures(
         self,
-        frame: DriverFrame,
+        frame: DriverSnapshot,
         time_ns: int,
         *,
         status: npt.NDArray[np.uint8] | None = None,
@@ -107,7 +107,7 @@ class Showing:
         for each in shown:
             yield each.message(frame, values[each.type_name], status, stamp_ns)
 
-    def _state(self, frame: DriverFrame) -> Message:
+    def _state(self, frame: DriverSnapshot) -> Message:
         structure = self._structure
         fresh = np.bincount(structure.sensor_patch[frame.status == 0], minlength=structure.n_patches)
         state = {
@@ -159,7 +159,7 @@ class _Cloud:
         self.points = np.zeros(len(rows), _POINT)
 
     def message(
-        self, frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
+        self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
     ) -> Message:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
         self.points["age"] = _ages_s(frame)[frame.structure.sensor_group[self._index]]
@@ -171,7 +171,7 @@ class _Cloud:
         return Message(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
 
 
-def _ages_s(frame: DriverFrame) -> npt.NDArray[np.float32]:
+def _ages_s(frame: DriverSnapshot) -> npt.NDArray[np.float32]:
     """(n_groups,) how old the data of each was when the frame was published, s; NaN: never seen."""
     seen_ns = frame.group_time_ns
     ages_s: npt.NDArray[np.float32] = ((frame.published_ns - seen_ns) / NS_PER_S).astype(np.float32)
@@ -210,7 +210,7 @@ class _Image:
         self._is_bounded = math.isfinite(sensor_type.minimum) and math.isfinite(sensor_type.maximum)
 
     def message(
-        self, _frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
+        self, _frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
     ) -> Message:
         good = (status[self._index] == 0) & np.isfinite(values)
         if self._is_bounded:

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion.cdr import Cdr
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.structure import Structure
 
 
-def acquired_ns(frame: DriverFrame, time_ns: int) -> int:
+def acquired_ns(frame: DriverSnapshot, time_ns: int) -> int:
     """When the newest data of a frame was acquired, wall clock; when it was published, if it has none.
 
     Args:
@@ -22,7 +22,7 @@ def acquired_ns(frame: DriverFrame, time_ns: int) -> int:
     return time_ns - (frame.published_ns - frame.acquired_ns if frame.acquired_ns else 0)
 
 
-def skin_frame(frame: DriverFrame, time_ns: int, status: npt.NDArray[np.uint8] | None = None) -> bytes:
+def skin_frame(frame: DriverSnapshot, time_ns: int, status: npt.NDArray[np.uint8] | None = None) -> bytes:
     """All values of a frame, as ``skinware_msgs/SkinFrame``.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 
 from skinware.conversion.tables import COLUMNS, TIME, Table
 from skinware.memory.file_layout import SLOT
-from skinware.transfer.frames import RecordedFrame, frame_of
+from skinware.transfer.frames import RecordedSample, frame_of
 from skinware.transfer.generation import Generation
 
 
@@ -27,7 +27,7 @@ class TimedFrame(NamedTuple):
     time_ns: int
     service: str
     generation: Generation
-    frame: RecordedFrame
+    frame: RecordedSample
 
 
 def timed_frames(tables: Sequence[Table]) -> Iterator[TimedFrame]:

@@ -11,7 +11,7 @@ from skinware.conversion.showing import Message, Showing, in_topic
 from skinware.conversion.tables import Source, Table
 from skinware.conversion.timed_frames import TimedFrame, timed_frames
 from skinware.conversion.viewers import Viewers
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import EVENTS, SCHEMAS, Channels
@@ -92,7 +92,7 @@ def _drivers(source: Source) -> list[Table]:
 
 
 def _skin_frame(timed: TimedFrame) -> Message:
-    data = skin_messages.skin_frame(DriverFrame(timed.generation, timed.frame.slot), timed.time_ns)
+    data = skin_messages.skin_frame(DriverSnapshot(timed.generation, timed.frame.slot), timed.time_ns)
     return Message(f"/skin/{in_topic(timed.service)}/frame", "cdr", definitions.SKIN_FRAME, data)
 
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skinware.conversion.showing import Message, Showing
-from skinware.driver_frame import DriverFrame
-from skinware.memory.ring import Frame
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
@@ -42,7 +42,7 @@ class Viewers:
         self._json_state, self._period_ns = json_state, round(NS_PER_S / rate_hz)
         self._drivers: dict[str, _Driver] = {}
 
-    def messages(self, service: str, generation: Generation, frame: Frame, time_ns: int) -> Iterator[Message]:
+    def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[Message]:
         """What is shown of a frame, if it is time for one.
 
         Args:
@@ -60,4 +60,4 @@ class Viewers:
         if time_ns < driver.due_ns:
             return
         driver.due_ns = max(driver.due_ns + self._period_ns, time_ns + self._period_ns // 2)
-        yield from driver.showing.messages(DriverFrame(generation, frame.slot), time_ns)
+        yield from driver.showing.messages(DriverSnapshot(generation, frame.slot), time_ns)

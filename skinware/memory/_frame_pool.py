@@ -13,15 +13,15 @@ from itertools import accumulate
 from sys import getrefcount
 from typing import Generic
 
-from skinware.memory.ring import FrameT, RingReader
+from skinware.memory.ring import RingReader, SampleT
 
 Memory = ctypes.Array[ctypes.c_char]
-_Place = tuple[tuple[FrameT, ...], bytearray, Memory]
+_Place = tuple[tuple[SampleT, ...], bytearray, Memory]
 
 _COUNTS_COME_LATE = not getattr(sys, "_is_gil_enabled", lambda: True)()  # those of other threads
 
 
-class FramePool(Generic[FrameT]):
+class FramePool(Generic[SampleT]):
     """Frames to be filled by C: one of each ring, all in one piece of memory. Not for several threads at once.
 
     Args:
@@ -31,7 +31,7 @@ class FramePool(Generic[FrameT]):
         starts: where each frame begins in the memory, bytes.
     """
 
-    def __init__(self, rings: Sequence[RingReader[FrameT]]) -> None:
+    def __init__(self, rings: Sequence[RingReader[SampleT]]) -> None:
         *self.starts, self._size = accumulate((ring.frame_size for ring in rings), initial=0)
         self._rings = rings
         self._memory_type = ctypes.c_char * self._size
@@ -40,7 +40,7 @@ class FramePool(Generic[FrameT]):
         self._references_of_nobody = -1 if _COUNTS_COME_LATE else self._references(self._places[0])
         self._turn = 0
 
-    def free(self) -> _Place[FrameT]:
+    def free(self) -> _Place[SampleT]:
         """Frames that nobody has, their bytes, and the same for calls of C.
 
         Whoever has a frame has a reference to it or to all of them, and whoever has an array of one, to the bytes.
@@ -51,19 +51,19 @@ class FramePool(Generic[FrameT]):
             place = self._places[turn] = self._place()
         return place
 
-    def _place(self) -> _Place[FrameT]:
+    def _place(self) -> _Place[SampleT]:
         data = bytearray(self._size)
         frames = tuple([ring.frame_in(data, start) for ring, start in zip(self._rings, self.starts, strict=True)])
         return frames, data, self._memory_type.from_buffer(data)
 
 
-def _references_of_one(place: _Place[FrameT]) -> int:
+def _references_of_one(place: _Place[SampleT]) -> int:
     """The same where there is one frame, in as few steps as can be: a loop asks in every turn."""
     frames, data, _ = place
     return getrefcount(frames) + getrefcount(data) + getrefcount(frames[0])
 
 
-def _references(place: _Place[FrameT]) -> int:
+def _references(place: _Place[SampleT]) -> int:
     """How many there are to the frames of a place and to its bytes."""
     frames, data, _ = place
     return getrefcount(frames) + getrefcount(data) + sum(map(getrefcount, frames))

@@ -10,7 +10,7 @@ from skinware import native
 from skinware.memory import futex
 from skinware.memory._frame_pool import FramePool
 from skinware.memory.native_ring import NativeRingReader
-from skinware.memory.ring import FrameT, RingReader
+from skinware.memory.ring import RingReader, SampleT
 
 _NEWS, _NO_NEWS = 1, 0  # what look.c answers
 
@@ -38,7 +38,7 @@ class _LookState(ctypes.Structure):
     ]
 
 
-class Look(Generic[FrameT]):
+class Look(Generic[SampleT]):
     """A look at several rings whose readers have left their turns to C.
 
     Args:
@@ -46,7 +46,7 @@ class Look(Generic[FrameT]):
         library: with their C.
     """
 
-    def __init__(self, rings: Sequence[NativeRingReader[FrameT]], library: native.Library) -> None:
+    def __init__(self, rings: Sequence[NativeRingReader[SampleT]], library: native.Library) -> None:
         self.rings = rings
         self._at_once = library.quick.skinware_native_newest
         self._with_sleep = library.waiting.skinware_native_newest
@@ -56,7 +56,7 @@ class Look(Generic[FrameT]):
         for seen, ring, start in zip(self._state.rings, rings, self._pool.starts, strict=False):
             seen.turns, seen.start = ring.turns_address, start
 
-    def newest(self, until_ns: int | None) -> tuple[FrameT, ...] | None:
+    def newest(self, until_ns: int | None) -> tuple[SampleT, ...] | None:
         """The newest frame of every ring, each a private copy.
 
         Args:
@@ -85,7 +85,7 @@ class Look(Generic[FrameT]):
         raise PythonsTurn
 
 
-def look_at(rings: Sequence[RingReader[FrameT]]) -> Look[FrameT] | None:
+def look_at(rings: Sequence[RingReader[SampleT]]) -> Look[SampleT] | None:
     library = native.core()
     natives = [ring for ring in rings if isinstance(ring, NativeRingReader)]
     if library is None or len(natives) < len(rings) or not 1 <= len(rings) <= futex.MAX_WORDS:

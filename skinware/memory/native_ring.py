@@ -13,7 +13,7 @@ import time
 
 from skinware import native
 from skinware.memory._frame_pool import FramePool
-from skinware.memory.ring import LATEST, FrameT, RingReader, Turn, Turns
+from skinware.memory.ring import LATEST, RingReader, SampleT, Turn, Turns
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.segments import Segment
 
@@ -22,7 +22,7 @@ _COPIED, _NOTHING = 1, 0  # what library.c answers
 _NEWEST = ctypes.c_uint64(0)
 
 
-def ring_reader(segment: Segment, frame_class: type[FrameT], context: object = None) -> RingReader[FrameT]:
+def ring_reader(segment: Segment, frame_class: type[SampleT], context: object = None) -> RingReader[SampleT]:
     """A reader's end of a generation, native where that is possible."""
     library = native.core()
     if library is None:
@@ -79,10 +79,10 @@ class _TurnsState(_Ring):
     ]
 
 
-class NativeRingReader(RingReader[FrameT]):
+class NativeRingReader(RingReader[SampleT]):
     """A reader's end whose waits and copies are calls of C."""
 
-    def __init__(self, segment: Segment, frame_class: type[FrameT], context: object, library: native.Library) -> None:
+    def __init__(self, segment: Segment, frame_class: type[SampleT], context: object, library: native.Library) -> None:
         super().__init__(segment, frame_class, context)
         self._pool = FramePool([self])
         self._copy_call = library.quick.skinware_native_copy
@@ -103,19 +103,19 @@ class NativeRingReader(RingReader[FrameT]):
     def turns_address(self) -> int:
         return ctypes.addressof(self._turns)
 
-    def copy(self, sequence: int | None = None) -> FrameT | None:
+    def copy(self, sequence: int | None = None) -> SampleT | None:
         (frame,), _, memory = self._pool.free()
         wanted = _NEWEST if sequence is None else ctypes.c_uint64(sequence)
         return self._copied(self._copy_call(self._request_at, wanted, memory), frame)
 
-    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
+    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> SampleT | None:
         (frame,), _, memory = self._pool.free()
         request = self._request
         request.wake_count, request.known = wake_count, latest
         request.wanted, request.timeout_ns = sequence or 0, timeout_ns
         return self._copied(self._wait_call(self._request_at, memory), frame)
 
-    def _copied(self, result: int, frame: FrameT) -> FrameT | None:
+    def _copied(self, result: int, frame: SampleT) -> SampleT | None:
         if result == _COPIED:
             frame.stale = False
             return frame
@@ -123,7 +123,7 @@ class NativeRingReader(RingReader[FrameT]):
             return None
         raise self._overrun()
 
-    def next_turn(self, timeout_ns: int | None, in_order: bool) -> FrameT | None:
+    def next_turn(self, timeout_ns: int | None, in_order: bool) -> SampleT | None:
         """One call of C, which lets go of the interpreter lock only if it has to sleep: others may keep it for long."""
         (frame,), _, memory = self._pool.free()
         frame.stale = False

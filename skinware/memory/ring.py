@@ -47,7 +47,7 @@ class FrameSource(Protocol):
         """The writer's nominal period, 0 if it has none."""
 
 
-class Frame:
+class Sample:
     """One published frame: a private copy, or (from ``view``) the ring's own memory.
 
     Copies that were made in one look share a piece of memory, which lives as long as any of them or of their arrays.
@@ -141,11 +141,11 @@ class Frame:
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    FrameT = TypeVar("FrameT", bound=Frame, default=Frame)  # so that a reader of plain frames needs no annotation
+    SampleT = TypeVar("SampleT", bound=Sample, default=Sample)  # so that a reader of plain frames needs no annotation
 else:
     from typing import TypeVar
 
-    FrameT = TypeVar("FrameT", bound=Frame)
+    SampleT = TypeVar("SampleT", bound=Sample)
 
 
 class Turn(NamedTuple):
@@ -180,7 +180,7 @@ class Turns(NamedTuple):
     over: list[Turn]
 
 
-class RingReader(Generic[FrameT]):
+class RingReader(Generic[SampleT]):
     """A reader's end of one generation: reads only, takes no lock, is not known to the writer.
 
     Args:
@@ -189,7 +189,7 @@ class RingReader(Generic[FrameT]):
         context: what every frame carries as ``context``.
     """
 
-    def __init__(self, segment: Segment, frame_class: type[FrameT], context: object = None) -> None:
+    def __init__(self, segment: Segment, frame_class: type[SampleT], context: object = None) -> None:
         layout = segment.layout
         self._frame_class = frame_class
         self.context = context
@@ -213,7 +213,7 @@ class RingReader(Generic[FrameT]):
     def frame_size(self) -> int:
         return self.segment.layout.slot_stride
 
-    def frame_in(self, data: bytearray, start: int) -> FrameT:
+    def frame_in(self, data: bytearray, start: int) -> SampleT:
         """A frame in memory of which it takes ``frame_size`` bytes, a multiple of 64, from ``start`` on."""
         return self._frame_class(self, data, start=start)
 
@@ -232,7 +232,7 @@ class RingReader(Generic[FrameT]):
         fence()
         return count
 
-    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
+    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> SampleT | None:
         """Sleep until the futex word is another than ``wake_count``, or the time is up; may return early.
 
         Returns:
@@ -244,7 +244,7 @@ class RingReader(Generic[FrameT]):
         self.wake_word.wait(wake_count, timeout_ns)
         return self.copy(sequence) if self.latest != latest else None
 
-    def copy(self, sequence: int | None = None) -> FrameT | None:
+    def copy(self, sequence: int | None = None) -> SampleT | None:
         """A private copy of a frame.
 
         Args:
@@ -277,7 +277,7 @@ class RingReader(Generic[FrameT]):
             f"give the service more slots (it has {self._count}) or publish less often"
         )
 
-    def _copy(self, sequence: int) -> FrameT | None:
+    def _copy(self, sequence: int) -> SampleT | None:
         slot = sequence % self._count
         words = self._slot_words[slot]
         if words[SEQUENCE] != sequence:
@@ -290,7 +290,7 @@ class RingReader(Generic[FrameT]):
     # -- turns of a loop -------------------------------------------------------------------------------------------
     # Where there is C, a loop that takes frames as they come goes round there, as long as nothing happens but frames.
 
-    def next_turn(self, timeout_ns: int | None, in_order: bool) -> FrameT | None:  # noqa: ARG002, not here
+    def next_turn(self, timeout_ns: int | None, in_order: bool) -> SampleT | None:  # noqa: ARG002, not here
         """The next frame; None if whatever is to be done now has to be done here, as always without C.
 
         Args:
@@ -348,7 +348,7 @@ class RingReader(Generic[FrameT]):
                 times.append((sequence, time_ns))
         return times
 
-    def view(self) -> FrameT | None:
+    def view(self) -> SampleT | None:
         """The newest frame in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(COPY_ATTEMPTS):
             wanted = self.latest

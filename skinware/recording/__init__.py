@@ -25,11 +25,11 @@ from skinware.recording.reading import Recording
 from skinware.recording.series import Series
 from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireItem, WirePiece, WireTrack
-from skinware.transfer.frames import RecordedDriverFrame, RecordedFrame, RecordedSnapshot
+from skinware.transfer.frames import RecordedDriverFrame, RecordedSample, RecordedSnapshot
 
 __all__ = [
     "RecordedDriverFrame",
-    "RecordedFrame",
+    "RecordedSample",
     "RecordedSnapshot",
     "Recording",
     "Series",

@@ -22,7 +22,7 @@ from skinware.errors import BadRecording
 from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
 from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Head, Target
@@ -53,7 +53,7 @@ class _Began:
 @dataclass(frozen=True)
 class _Took:
     service: str
-    frame: Frame
+    frame: Sample
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Beside(Protocol):
     """Makes messages of frames, such as viewers know."""
 
     def messages(
-        self, service: str, generation: Generation, frame: Frame, time_ns: int
+        self, service: str, generation: Generation, frame: Sample, time_ns: int
     ) -> Iterable[tuple[str, str, Schema, bytes]]:
         """(topic, encoding, schema, data) of each message.
 
@@ -185,7 +185,7 @@ class Recorder:
         """See :class:`skinware.transfer.collecting.Listener`."""
         self._jobs.put(_Began(service, head))
 
-    def took(self, service: str, frame: Frame) -> None:
+    def took(self, service: str, frame: Sample) -> None:
         self._bytes_given += len(frame.slot)
         self._jobs.put(_Took(service, frame))
 
@@ -326,7 +326,7 @@ class _Coder(threading.Thread):
             channel, schema = self.channels.of_about(wires.driver)
             self._heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
-    def _add_frame(self, stream: _Stream, service: str, frame: Frame) -> None:
+    def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
         if not self._chunk.has(channel):
             stream.encoder.next_is_key()
@@ -337,7 +337,7 @@ class _Coder(threading.Thread):
             for topic, encoding, known, data in self._beside.messages(service, stream.generation, frame, time_ns):
                 self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
 
-    def _add_wire(self, stream: _WireStream, frame: Frame) -> None:
+    def _add_wire(self, stream: _WireStream, frame: Sample) -> None:
         bus = int(frame.column("bus")[()])
         if bus >= len(stream.buses):
             return

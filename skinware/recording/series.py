@@ -118,7 +118,7 @@ class Series:
 
         Args:
             type_name: which sensors.
-            max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverFrame.fresh`.
+            max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverSnapshot.fresh`.
         """
         limits_ns = self.structure.age_limits_ns(self.origin.period_ns)[self.structure.index(type_name)]
         max_age_ns = limits_ns if max_age_s is None else round(max_age_s * NS_PER_S)

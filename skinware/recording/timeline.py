@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from skinware.recording.mcap_reading import ChunkPlace
 from skinware.transfer.collecting import CLOSED, DEAD
-from skinware.transfer.frames import RecordedFrame
+from skinware.transfer.frames import RecordedSample
 
 GONE = (CLOSED, DEAD)
 _KEPT_CHUNKS = 3
@@ -28,7 +28,7 @@ class Moment(NamedTuple):
 
     time_s: float
     service: str
-    frame: RecordedFrame | None
+    frame: RecordedSample | None
     event: str = ""
 
 

@@ -17,7 +17,7 @@ from skinware.recording.mcap_reading import ChunkContents
 from skinware.recording.series import Series
 from skinware.structure import Structure
 from skinware.transfer.codec import HEADER, Run, runs
-from skinware.transfer.frames import RecordedFrame, frames_of
+from skinware.transfer.frames import RecordedSample, frames_of
 from skinware.transfer.generation import PER_SENSOR, Generation
 
 _FOR_DRIVERS = ("values", "status", "module_time_ns")
@@ -106,7 +106,7 @@ class Track:
             raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
         return origin.context
 
-    def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedFrame]:
+    def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedSample]:
         """Every frame, in order; those of a driver are driver frames.
 
         Args:
@@ -118,7 +118,7 @@ class Track:
                 if time_s >= start_s and (end_s is None or time_s < end_s):
                     yield frame
 
-    def frames_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedFrame]]:
+    def frames_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedSample]]:
         """The frames in a chunk, each with its time, s since the recording began."""
         for part in self._decodable(contents):
             yield from zip(part.time_s.tolist(), frames_of(part.generation, part.run), strict=True)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.limits import LIMITS
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.recording.tracks import ChunkSource
 from skinware.wire import read_pieces
@@ -43,7 +43,7 @@ FRAME = np.dtype(
 """A CAN frame; the columns are those of :class:`WirePiece` and ``skinware.wire.ROWS``."""
 
 
-def message_of(frame: Frame) -> bytes:
+def message_of(frame: Sample) -> bytes:
     """The message of a frame of a driver's wire service."""
     used = int(frame.column("used")[()])
     header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("lost")[()]))

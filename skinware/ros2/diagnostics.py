@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from skinware.conversion.cdr import Cdr
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import BusState
 from skinware.views.health import DEAD, LIVE, PAUSED, SILENT, SkinHealth, bus_reason_name, bus_state_name
@@ -76,7 +76,7 @@ def message(of: Iterable[Status], time_ns: int) -> bytes:
     return cdr.done()
 
 
-def _level(health: SkinHealth, frame: DriverFrame | None) -> Level:
+def _level(health: SkinHealth, frame: DriverSnapshot | None) -> Level:
     if health.life != LIVE or frame is None:
         return _OF_LIFE.get(health.life, Level.WARN)
     return Level.OK if health.statuses["fresh"] == health.sensors else Level.WARN

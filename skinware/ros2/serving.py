@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from skinware.conversion.showing import in_topic
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
@@ -65,14 +65,14 @@ class _Served:
 
     topics: DriverTopics
     end_tare: Callable[[], None]
-    frame: DriverFrame | None = None
+    frame: DriverSnapshot | None = None
     due_ns: int = 0
     look_ns: int = 0
     is_over: bool = False
     wants_frames: bool = False
     lost: int = 0
 
-    def take(self, frame: DriverFrame, *, wants_frames: bool) -> None:
+    def take(self, frame: DriverSnapshot, *, wants_frames: bool) -> None:
         before = self.frame
         if before is not None and wants_frames and self.wants_frames and frame.generation == before.generation:
             self.lost += frame.sequence - before.sequence - 1

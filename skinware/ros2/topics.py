@@ -9,7 +9,7 @@ import numpy as np
 from skinware.conversion import skin_messages
 from skinware.conversion.showing import Showing, in_topic
 from skinware.conversion.tables import sensor_names
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import now_ns
 from skinware.ros2 import types
 from skinware.ros2.transport import Node, Publisher, Qos
@@ -51,7 +51,7 @@ class DriverTopics:
     def wants_frames(self) -> bool:
         return self._frames.is_wanted
 
-    def tell(self, frame: DriverFrame, *, with_pictures: bool, is_last: bool = False) -> None:
+    def tell(self, frame: DriverSnapshot, *, with_pictures: bool, is_last: bool = False) -> None:
         """Send what somebody wants of a frame.
 
         Args:
@@ -74,7 +74,7 @@ class DriverTopics:
         for publisher in (self._frames, self._sensors, *self._pictures.values()):
             publisher.close()
 
-    def _take_generation(self, frame: DriverFrame, time_ns: int) -> None:
+    def _take_generation(self, frame: DriverSnapshot, time_ns: int) -> None:
         structure, self._generation = frame.structure, frame.generation
         if structure is not self._structure:
             self._structure, self._showing = structure, Showing(self._name, structure)

@@ -11,7 +11,7 @@ from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, Re
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.native_ring import ring_reader
-from skinware.memory.ring import Frame, FrameT, RingReader
+from skinware.memory.ring import RingReader, Sample, SampleT
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, Periodic, now_ns
@@ -25,7 +25,7 @@ _HASTE = 2
 """So many times faster than its data came, a writer does not publish for long."""
 
 
-class Attachment(Generic[FrameT]):
+class Attachment(Generic[SampleT]):
     """Attached to one service by name; goes over to its next generation when the writer comes back.
 
     Args:
@@ -39,7 +39,7 @@ class Attachment(Generic[FrameT]):
         NamespaceError: the namespace cannot be trusted or read.
     """
 
-    frame_class: type[Any] = Frame
+    frame_class: type[Any] = Sample
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None) -> None:
         self.name: str = check_name(name, "service")
@@ -47,7 +47,7 @@ class Attachment(Generic[FrameT]):
         self._client = RequestClient(self.namespace, name)
         self._closed = False
         self._moved = False
-        self._ring: RingReader[FrameT] = self._attach_within(timeout_s)
+        self._ring: RingReader[SampleT] = self._attach_within(timeout_s)
 
     @property
     def writer_statistics(self) -> WriterStatistics:
@@ -155,7 +155,7 @@ class Attachment(Generic[FrameT]):
         """
         return dict(self.call(OPERATIONS, timeout_s=timeout_s))
 
-    def _attach(self, known: RingReader[FrameT] | None = None) -> RingReader[FrameT]:
+    def _attach(self, known: RingReader[SampleT] | None = None) -> RingReader[SampleT]:
         segment = segments.attach(self.namespace, self.name)
         if known is not None and _digest(segment) == _digest(known.segment):
             return ring_reader(segment, self.frame_class, known.context)
@@ -165,7 +165,7 @@ class Attachment(Generic[FrameT]):
         """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
-    def _attach_within(self, timeout_s: float | None) -> RingReader[FrameT]:
+    def _attach_within(self, timeout_s: float | None) -> RingReader[SampleT]:
         timer = Periodic(10)
         deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
         while True:
@@ -176,7 +176,7 @@ class Attachment(Generic[FrameT]):
                     raise
             timer.wait()
 
-    def _adopt(self, ring: RingReader[FrameT]) -> None:
+    def _adopt(self, ring: RingReader[SampleT]) -> None:
         self._ring.segment.close()
         self._ring = ring
         self._moved = False

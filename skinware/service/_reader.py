@@ -11,14 +11,14 @@ from skinware.errors import Overrun
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame, FrameT
+from skinware.memory.ring import Sample, SampleT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
 
-class ServiceReader(Taking[FrameT]):
+class ServiceReader(Taking[SampleT]):
     """Reads one service, and attaches again by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
@@ -84,10 +84,10 @@ class ServiceReader(Taking[FrameT]):
     def read(
         self,
         *,
-        newer_than: Frame | Position | None = None,
+        newer_than: Sample | Position | None = None,
         max_age_s: float | None = None,
         timeout_s: float | None = 5.0,
-    ) -> FrameT:
+    ) -> SampleT:
         """The newest frame, as a private copy.
 
         Args:
@@ -104,11 +104,11 @@ class ServiceReader(Taking[FrameT]):
             Overrun: the writer is too fast for this number of slots.
             Closed: this reader was closed, or belongs to the process before a fork.
         """
-        known = newer_than.position if isinstance(newer_than, Frame) else newer_than
+        known = newer_than.position if isinstance(newer_than, Sample) else newer_than
         return self._read(known, max_age_s, self._deadline_ns(_in_ns(timeout_s), False))
 
     @contextlib.contextmanager
-    def view(self) -> Iterator[FrameT]:
+    def view(self) -> Iterator[SampleT]:
         """The newest frame in place, with no copy, for as long as the block lasts.
 
         The writer may overwrite it meanwhile: ``frame.valid`` says whether it still is whole, and the end of the block
@@ -139,7 +139,7 @@ class ServiceReader(Taking[FrameT]):
 
     def frames(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
-    ) -> Iterator[FrameT]:
+    ) -> Iterator[SampleT]:
         """Newest frames, without end.
 
         Args:
@@ -174,10 +174,10 @@ class ServiceReader(Taking[FrameT]):
                 raise self._structure_changed()
             yield frame
 
-    def __iter__(self) -> Iterator[FrameT]:
+    def __iter__(self) -> Iterator[SampleT]:
         return self.frames()
 
-    def in_order(self, *, timeout_s: float | None = None) -> Iterator[FrameT]:
+    def in_order(self, *, timeout_s: float | None = None) -> Iterator[SampleT]:
         """Every frame, one after the other, as long as this program keeps up within the ring's slots.
 
         For recorders and tests; a control loop wants the newest (``frames``). What was overwritten before its turn
@@ -198,7 +198,7 @@ class ServiceReader(Taking[FrameT]):
                     self._go_round_in_c()
                 yield frame
 
-    def request(self, *, timeout_s: float = 5.0) -> FrameT:
+    def request(self, *, timeout_s: float = 5.0) -> SampleT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
 
         Raises:
@@ -241,7 +241,7 @@ class ServiceReader(Taking[FrameT]):
         renamed("ServiceReader.peek()", "ServiceReader.latest")
         return None if self._ring.state & GENERATION_ENDED else self.latest
 
-    def take_newest(self) -> FrameT:
+    def take_newest(self) -> SampleT:
         """Deprecated: ``read(timeout_s=0)``."""
         renamed("ServiceReader.take_newest()", "ServiceReader.read(timeout_s=0)")
         return self._newest_now(self._ring.copy, True)

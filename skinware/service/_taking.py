@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
+from skinware.memory.ring import COPY_ATTEMPTS, RingReader, Sample, SampleT
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._accounts import Accounts
 from skinware.service._attachment import GENERATION_ENDED, Attachment
@@ -15,7 +15,7 @@ Position = tuple[int, int]
 """(generation, sequence) of a frame."""
 
 
-class Taking(Attachment[FrameT]):
+class Taking(Attachment[SampleT]):
     """Takes the frames of a service: the newest, or one after the other.
 
     Args:
@@ -30,7 +30,7 @@ class Taking(Attachment[FrameT]):
         self._turns_in_c = False  # whether the ring counts at the moment, for a loop
         self._accounts = Accounts(self.namespace, name, announce)
 
-    def _adopt(self, ring: RingReader[FrameT]) -> None:
+    def _adopt(self, ring: RingReader[SampleT]) -> None:
         self._end_turn()
         if self._last is not None and ring.generation != self._ring.generation:
             before = self._ring.segment
@@ -42,7 +42,7 @@ class Taking(Attachment[FrameT]):
             self._last = (ring.generation, 0)
         super()._adopt(ring)
 
-    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> FrameT:
+    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> SampleT:
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
@@ -56,7 +56,7 @@ class Taking(Attachment[FrameT]):
                 return frame
             known = frame.position
 
-    def _read_in_order(self, deadline_ns: int | None) -> FrameT:
+    def _read_in_order(self, deadline_ns: int | None) -> SampleT:
         self._require_open()
         if self._lags():
             self._end_turn()
@@ -70,7 +70,7 @@ class Taking(Attachment[FrameT]):
         *,
         in_order: bool = False,
         max_age_s: float | None = None,
-    ) -> FrameT:
+    ) -> SampleT:
         """Wait for a frame that is newer than ``known``: the newest, or the next in order.
 
         One that is slept for was published within the last slice: its writer lived then, which saves the question
@@ -128,7 +128,7 @@ class Taking(Attachment[FrameT]):
         last = self._last
         return last is not None and last < (self._ring.generation, self._ring.latest)
 
-    def _next_in_order(self) -> FrameT | None:
+    def _next_in_order(self) -> SampleT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
             return self._ring.copy()
@@ -147,25 +147,25 @@ class Taking(Attachment[FrameT]):
             " often, or start it again if it died while it filled one"
         )
 
-    def _newest_now(self, take: Callable[[], FrameT | None], alive: bool) -> FrameT:
+    def _newest_now(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
         """The newest frame without a wait, so that this is the moment to count it."""
         frame = self._taken(self._whole(take), alive)
         self._end_turn()
         return frame
 
-    def _whole(self, take: Callable[[], FrameT | None]) -> FrameT | None:
+    def _whole(self, take: Callable[[], SampleT | None]) -> SampleT | None:
         try:
             return take()
         except Overrun:
             self._accounts.record.overruns += 1
             raise
 
-    def _taken(self, frame: FrameT | None, alive: bool) -> FrameT:
+    def _taken(self, frame: SampleT | None, alive: bool) -> SampleT:
         frame = self._checked(frame, alive)
         self._count(frame)
         return frame
 
-    def _checked(self, frame: FrameT | None, alive: bool) -> FrameT:
+    def _checked(self, frame: SampleT | None, alive: bool) -> SampleT:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
         frame.stale = not alive
@@ -212,7 +212,7 @@ class Taking(Attachment[FrameT]):
         turn, self._open_turn = self._open_turn, None
         self._accounts.end_turn(turn)
 
-    def _count(self, frame: FrameT) -> None:
+    def _count(self, frame: SampleT) -> None:
         last = self._last
         lost = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
@@ -222,5 +222,5 @@ class Taking(Attachment[FrameT]):
         self._open_turn = frame.acquired_ns, now_ns()
 
 
-def _is_young(frame: Frame, max_age_s: float | None) -> bool:
+def _is_young(frame: Sample, max_age_s: float | None) -> bool:
     return max_age_s is None or frame.age_ns <= max_age_s * NS_PER_S

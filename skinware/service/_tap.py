@@ -6,7 +6,7 @@ from typing import Any
 
 from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.futex import Word
-from skinware.memory.ring import FrameT, RingReader
+from skinware.memory.ring import RingReader, SampleT
 from skinware.realtime import now_ns
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader
@@ -19,7 +19,7 @@ def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
     return ring.wake_word, ring.wake_count
 
 
-class Tap(ServiceReader[FrameT]):
+class Tap(ServiceReader[SampleT]):
     """A reader whose owner looks for new generations and for the dead, and waits for many readers at once."""
 
     @property
@@ -47,7 +47,7 @@ class Tap(ServiceReader[FrameT]):
         """How long it takes the writer to go round its ring at its nominal rate, 0 if it has none."""
         return self._ring.period_ns * self._ring.slot_count
 
-    def ring_in_c(self) -> RingReader[FrameT]:
+    def ring_in_c(self) -> RingReader[SampleT]:
         if not self._turns_in_c:
             self._go_round_in_c()
         return self._ring
@@ -72,7 +72,7 @@ class Tap(ServiceReader[FrameT]):
         self._accounts.begin_loop("in order")
         self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
 
-    def next_in_order(self) -> FrameT | None:
+    def next_in_order(self) -> SampleT | None:
         """The frame after the one that was taken last, over generations; None if it is not there yet. Never waits.
 
         Raises:
@@ -83,7 +83,7 @@ class Tap(ServiceReader[FrameT]):
         except ServiceTimeout:
             return None
 
-    def newest(self) -> FrameT:
+    def newest(self) -> SampleT:
         """A copy of the newest frame of the generation at hand.
 
         Raises:
@@ -100,7 +100,7 @@ class Tap(ServiceReader[FrameT]):
         """
         return self._acquisitions()[-1][1]
 
-    def nearest(self, time_ns: int) -> FrameT:
+    def nearest(self, time_ns: int) -> SampleT:
         """A copy of the frame, among those that the ring still holds, whose ``acquired_ns`` is nearest to a time.
 
         Raises:

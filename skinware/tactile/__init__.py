@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skinware.tactile.calm import Calm
     from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
-    from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
+    from skinware.tactile.contacts_service import ContactsReader, ContactsSample
     from skinware.tactile.curves import Curve, CurveTable, fit_curve, read_curves
     from skinware.tactile.health import Health, HealthSettings
     from skinware.tactile.health_report import HealthKind, HealthReport
@@ -50,8 +50,8 @@ __all__ = [
     "ContactKind",
     "ContactSet",
     "Contacts",
-    "ContactsFrame",
     "ContactsReader",
+    "ContactsSample",
     "Curve",
     "CurveSettings",
     "CurveTable",

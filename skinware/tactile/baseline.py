@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
@@ -186,7 +186,7 @@ class Baseline:
         self._forced |= taxels
         return int(taxels.sum())
 
-    def take(self, frame: DriverFrame) -> Calm:
+    def take(self, frame: DriverSnapshot) -> Calm:
         """The next frame of the driver.
 
         Raises:

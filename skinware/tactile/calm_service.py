@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader, DriverWriter
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import (
     BadServiceFile,
     ConfigurationError,
@@ -105,7 +105,7 @@ class CalmService:
         self._copied: list[str] = []
         self._not_told: list[str] = []
         self._is_ready = self._is_lost = self._stopping = False
-        self._last: DriverFrame | None = None
+        self._last: DriverSnapshot | None = None
         self._structure: Structure | None = None
         self._touched: dict[str, int] = {}
         self._refused: set[str] = set()
@@ -203,7 +203,7 @@ class CalmService:
 
     # -- reading the driver -------------------------------------------------------------------------------------
 
-    def _next_frame(self) -> DriverFrame | None:
+    def _next_frame(self) -> DriverSnapshot | None:
         """The driver's newest frame, if a newer one came within 50 ms."""
         if self._reader is None:
             self._reader = self._attached()
@@ -251,7 +251,7 @@ class CalmService:
 
     # -- publishing ---------------------------------------------------------------------------------------------
 
-    def _publish(self, frame: DriverFrame) -> None:
+    def _publish(self, frame: DriverSnapshot) -> None:
         if frame.structure is not self._structure:
             self._follow(frame)
         chain, writer = self._chain, self._writer
@@ -301,7 +301,7 @@ class CalmService:
             elif not baseline.refused_share:
                 self._refused.discard(name)
 
-    def _follow(self, frame: DriverFrame) -> None:
+    def _follow(self, frame: DriverSnapshot) -> None:
         assert self._reader is not None  # noqa: S101 - the frame is its
         before, known = self._chain, self._structure
         self._structure = frame.structure

@@ -37,7 +37,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
@@ -331,7 +331,7 @@ class Chain:
                     found.setdefault(name, stage.baseline)
         return found
 
-    def step(self, frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
+    def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
         """Take the next frame through all stages.
 
         Args:

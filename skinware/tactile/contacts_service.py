@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from skinware._columns import texts
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
@@ -71,7 +71,7 @@ class ContactsSource:
     frames: tuple[str, ...]
 
 
-class ContactsFrame(Frame):
+class ContactsSample(Sample):
     """The contacts of one frame; going through it goes through them, the oldest first."""
 
     __slots__ = ("_contacts",)
@@ -100,7 +100,7 @@ class ContactsFrame(Frame):
         return iter(self.contacts)
 
 
-class ContactsReader(SourceReader[ContactsSource, ContactsFrame]):
+class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
     """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose frames are contacts.
 
     Args:
@@ -112,7 +112,7 @@ class ContactsReader(SourceReader[ContactsSource, ContactsFrame]):
     """
 
     kind = KIND
-    frame_class = ContactsFrame
+    frame_class = ContactsSample
 
     @staticmethod
     def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> ContactsSource:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from skinware._columns import texts
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.health_report import COLUMNS, HealthReport
@@ -63,7 +63,7 @@ class HealthSource:
     type_id: npt.NDArray[np.uint32]
 
 
-class HealthFrame(Frame):
+class HealthSample(Sample):
     """What is known at one time."""
 
     __slots__ = ()
@@ -79,7 +79,7 @@ class HealthFrame(Frame):
         return HealthReport(**{name: self.column(name) for name in COLUMNS})
 
 
-class HealthReader(SourceReader[HealthSource, HealthFrame]):
+class HealthReader(SourceReader[HealthSource, HealthSample]):
     """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose frames are reports.
 
     Args:
@@ -91,7 +91,7 @@ class HealthReader(SourceReader[HealthSource, HealthFrame]):
     """
 
     kind = KIND
-    frame_class = HealthFrame
+    frame_class = HealthSample
 
     @staticmethod
     def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> HealthSource:

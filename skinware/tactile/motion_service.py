@@ -23,7 +23,7 @@ import numpy.typing as npt
 from skinware._columns import texts
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import Column, ServiceWriter
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
@@ -62,7 +62,7 @@ class MotionSource:
     frames: tuple[str, ...]
 
 
-class MotionFrame(Frame):
+class MotionSample(Sample):
     """The motion of all regions in one frame; going through it goes through them."""
 
     __slots__ = ()
@@ -82,7 +82,7 @@ class MotionFrame(Frame):
         return iter(self.motion)
 
 
-class MotionReader(SourceReader[MotionSource, MotionFrame]):
+class MotionReader(SourceReader[MotionSource, MotionSample]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose frames are motion.
 
     Args:
@@ -94,7 +94,7 @@ class MotionReader(SourceReader[MotionSource, MotionFrame]):
     """
 
     kind = KIND
-    frame_class = MotionFrame
+    frame_class = MotionSample
 
     @staticmethod
     def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> MotionSource:

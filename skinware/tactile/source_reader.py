@@ -12,13 +12,13 @@ import numpy.typing as npt
 from skinware.errors import BadServiceFile
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import FrameT
+from skinware.memory.ring import SampleT
 from skinware.service import ServiceReader
 
 SourceT = TypeVar("SourceT")
 
 
-class SourceReader(ServiceReader[FrameT], Generic[SourceT, FrameT]):
+class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
     """Reads a service of one kind, whose static columns say what it is of.
 
     Args:

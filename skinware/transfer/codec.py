@@ -32,7 +32,7 @@ import numpy.typing as npt
 from skinware.errors import BadRecording
 from skinware.limits import LIMITS
 from skinware.memory.file_layout import SLOT, Column
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 
 HEADER = np.dtype(
     [
@@ -96,18 +96,18 @@ class Encoder:
 
     def __init__(self, columns: Sequence[CodedColumn]) -> None:
         self._columns = columns
-        self._before: Frame | None = None
+        self._before: Sample | None = None
 
     def next_is_key(self) -> None:
         self._before = None
 
-    def encode(self, frame: Frame) -> bytes:
+    def encode(self, frame: Sample) -> bytes:
         """The message of a frame, which is kept until the next one."""
         before, self._before = self._before, frame
         return encoded(frame, before, self._columns)
 
 
-def encoded(frame: Frame, before: Frame | None, columns: Sequence[CodedColumn]) -> bytes:
+def encoded(frame: Sample, before: Sample | None, columns: Sequence[CodedColumn]) -> bytes:
     """The message of a frame.
 
     Args:

@@ -10,7 +10,7 @@ from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotF
 from skinware.memory import futex, segments
 from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.wire import KIND, WISH, service_name
@@ -33,7 +33,7 @@ class Listener(Protocol):
     def began(self, service: str, head: bytes) -> None:
         """A new generation of a service begins with the next frame of it; ``head`` is its file up to its slots."""
 
-    def took(self, service: str, frame: Frame) -> None:
+    def took(self, service: str, frame: Sample) -> None:
         """A frame, with which nothing else is done."""
 
     def happened(self, event: dict[str, Any]) -> None:
@@ -51,7 +51,7 @@ class _Source:
         state: what was told of it last.
     """
 
-    reader: Tap[Frame]
+    reader: Tap[Sample]
     generation: int = 0
     lost: int = 0
     state: str = field(default="live")
@@ -69,7 +69,7 @@ class _Taken(NamedTuple):
     """
 
     service: str
-    frame: Frame
+    frame: Sample
     head: bytes | None
     is_restarted: bool
     lost: int
@@ -182,7 +182,7 @@ class Collector:
             self._tell("lost", taken.service, count=taken.lost, before=taken.frame.sequence)
         self._listener.took(taken.service, taken.frame)
 
-    def _frames(self, name: str, source: _Source) -> Iterator[Frame]:
+    def _frames(self, name: str, source: _Source) -> Iterator[Sample]:
         for _ in range(_MOST_AT_ONCE):
             if not (self._has_more(source) or source.reader.moved_on or source.reader.structure_changed):
                 return
@@ -236,7 +236,7 @@ class Collector:
         if segments.living_inode(self._namespace, name) is None:
             return
         try:
-            reader: Tap[Frame] = Tap(name, namespace=self._namespace)
+            reader: Tap[Sample] = Tap(name, namespace=self._namespace)
         except ServiceNotFound:
             return
         except (BadServiceFile, NamespaceError) as error:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
-from skinware.memory.ring import Frame
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.memory.ring import Sample
 from skinware.snapshot import Snapshot
 from skinware.transfer.codec import Run
 from skinware.transfer.generation import Generation
 
 
-class RecordedFrame(Frame):
+class RecordedSample(Sample):
     """A recorded frame of a service. Its age is the one that it had when it was published."""
 
     __slots__ = ()
@@ -26,7 +26,7 @@ class RecordedFrame(Frame):
         return self.published_ns - self.acquired_ns
 
 
-class RecordedDriverFrame(RecordedFrame, DriverFrame):
+class RecordedDriverFrame(RecordedSample, DriverSnapshot):
     """A recorded frame of a driver."""
 
     __slots__ = ()
@@ -57,12 +57,12 @@ class RecordedSnapshot(Snapshot):
         return super().fresh(type_name, max_age_s=max_age_s, at_ns=self.at_ns if at_ns is None else at_ns)
 
 
-def frames_of(generation: Generation, run: Run) -> Iterator[RecordedFrame]:
+def frames_of(generation: Generation, run: Run) -> Iterator[RecordedSample]:
     """The frames of a run; they share one piece of memory."""
     for slot in run.decode_slots(generation.slot_stride):
         yield frame_of(generation, slot)
 
 
-def frame_of(generation: Generation, slot: npt.NDArray[np.uint8]) -> RecordedFrame:
+def frame_of(generation: Generation, slot: npt.NDArray[np.uint8]) -> RecordedSample:
     """The frame that stands in (stride,) bytes, as it was in the ring."""
-    return (RecordedDriverFrame if generation.is_driver else RecordedFrame)(generation, memoryview(slot.data))
+    return (RecordedDriverFrame if generation.is_driver else RecordedSample)(generation, memoryview(slot.data))

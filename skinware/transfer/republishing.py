@@ -17,7 +17,7 @@ from skinware.memory.schema import STATIC_NAME
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request, ServiceWriter
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
-from skinware.transfer.frames import RecordedFrame
+from skinware.transfer.frames import RecordedSample
 from skinware.transfer.generation import Generation
 
 _TIMES_OF_DRIVERS = ("module_time_ns", "group_time_ns", "bus_since_ns")
@@ -84,14 +84,14 @@ class Republisher:
         self.frames: Counter[str] = Counter()
         self.speed: float = 1.0
 
-    def shift_ns(self, frame: RecordedFrame) -> int:
+    def shift_ns(self, frame: RecordedSample) -> int:
         """By how much times of a frame that is published now are moved."""
         return now_ns() - frame.published_ns
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:  # noqa: ARG002
         return self._operations
 
-    def publish(self, name: str, frame: RecordedFrame, generation: Generation, *, follows: bool = True) -> None:
+    def publish(self, name: str, frame: RecordedSample, generation: Generation, *, follows: bool = True) -> None:
         """Publish a frame now.
 
         Args:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
-from skinware.tactile.contacts_service import ContactsFrame
-from skinware.tactile.motion_service import MotionFrame
+from skinware.tactile.contacts_service import ContactsSample
+from skinware.tactile.motion_service import MotionSample
 from skinware.views.live import LiveDriver, LiveDrivers
 from skinware.views.touches import live_contacts, live_motion
 
@@ -56,16 +56,16 @@ class Beside:
         is_here = calm.frame is not None and calm.frame.acquired_ns >= frame.acquired_ns
         return is_here or now_ns() - frame.published_ns > _PATIENCE_NS
 
-    def calm_of(self, driver: str) -> DriverFrame | None:
+    def calm_of(self, driver: str) -> DriverSnapshot | None:
         """The newest frame of a calmed driver; None where there is none, or nobody calms it any more."""
         calm = self._calm_of(driver)
         return None if calm is None or calm.frame is None or calm.frame.stale else calm.frame
 
-    def contacts_of(self, driver: str) -> ContactsFrame | None:
+    def contacts_of(self, driver: str) -> ContactsSample | None:
         """The newest contacts on a driver; None where nobody tells any."""
         return next((frame for source in self._contacts if (frame := source.of(driver)) is not None), None)
 
-    def motion_of(self, driver: str) -> MotionFrame | None:
+    def motion_of(self, driver: str) -> MotionSample | None:
         """The newest motion over the regions of a driver; None where nobody tells any."""
         return next((frame for source in self._motion if (frame := source.of(driver)) is not None), None)
 

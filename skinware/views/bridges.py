@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from skinware.bridge_state import BridgeFrame, BridgeReader, BridgeState
+from skinware.bridge_state import BridgeReader, BridgeSample, BridgeState
 from skinware.memory.namespace import Namespace
 from skinware.views.live_services import LiveServices
 
 
-class LiveBridges(LiveServices[BridgeReader, BridgeFrame]):
+class LiveBridges(LiveServices[BridgeReader, BridgeSample]):
     """What the bridges of a namespace tell of themselves.
 
     Args:

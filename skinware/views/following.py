@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.contacts_service import ContactsFrame
-from skinware.tactile.motion_service import MotionFrame
+from skinware.tactile.contacts_service import ContactsSample
+from skinware.tactile.motion_service import MotionSample
 from skinware.views.beside import Beside
 from skinware.views.health import LIVE, STARTING, life_of, status_now
 from skinware.views.live import LiveDriver, LiveDrivers
@@ -55,14 +55,14 @@ class Followed:
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
         self.number, self.live, self.namespace = number, live, namespace
-        self.frame: DriverFrame | None = None
+        self.frame: DriverSnapshot | None = None
         self.life = STARTING
         self.changes = 0
         self.taken_ns = 0
         self._judged_ns = 0
-        self.contacts: ContactsFrame | None = None
-        self.motion: MotionFrame | None = None
-        self._calm: DriverFrame | None = None
+        self.contacts: ContactsSample | None = None
+        self.motion: MotionSample | None = None
+        self._calm: DriverSnapshot | None = None
         self._calm_structure: Structure | None = None
         self._calm_fits = False
         self._shared: dict[object, Any] = {}
@@ -76,7 +76,7 @@ class Followed:
         """The picture of this name; None where there is none."""
         return next((quantity for quantity in self.quantities if quantity.name == name), None)
 
-    def take(self, frame: DriverFrame, beside: Beside) -> None:
+    def take(self, frame: DriverSnapshot, beside: Beside) -> None:
         """Go on to a newer frame.
 
         Args:
@@ -137,7 +137,7 @@ class Followed:
         return frame.contacts.contact_of
 
     @property
-    def _calm_frame(self) -> DriverFrame | None:
+    def _calm_frame(self) -> DriverSnapshot | None:
         """The newest frame of the calmed driver, if it is of the same sensors and lives."""
         frame = self._calm
         if frame is None:
@@ -163,7 +163,7 @@ class Followed:
         self.past, self.rest = Past(structure.n_sensors, structure.dtype), Rest(structure)
         self._calm_structure = None
 
-    def _judge(self, frame: DriverFrame, beside: Beside) -> None:
+    def _judge(self, frame: DriverSnapshot, beside: Beside) -> None:
         self._judged_ns = now_ns()
         self._calm = beside.calm_of(self.name)
         self.contacts, self.motion = beside.contacts_of(self.name), beside.motion_of(self.name)

@@ -14,9 +14,9 @@ from skinware.status import BusReason, BusState, PatchState, Status
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from skinware.driver_frame import DriverFrame
     from skinware.driver_service import DriverReader
-    from skinware.memory.ring import Frame
+    from skinware.driver_snapshot import DriverSnapshot
+    from skinware.memory.ring import Sample
     from skinware.service import ServiceReader
 
 LIVE, SILENT, PAUSED, STARTING, DEAD = "live", "silent", "paused", "starting", "dead"
@@ -30,7 +30,7 @@ _BUS_STATES = {int(state): state.name.lower() for state in BusState}
 _BUS_REASONS = {int(reason): reason.name.lower() for reason in BusReason}
 
 
-def life_of(service: ServiceReader[Any], newest: Frame | None) -> str:
+def life_of(service: ServiceReader[Any], newest: Sample | None) -> str:
     """What a service is doing.
 
     Args:
@@ -84,7 +84,7 @@ class SkinHealth:
     counters: dict[str, int]
 
 
-def health_of(reader: DriverReader, frame: DriverFrame | None, measured_hz: float | None) -> SkinHealth:
+def health_of(reader: DriverReader, frame: DriverSnapshot | None, measured_hz: float | None) -> SkinHealth:
     """Sum up a driver.
 
     Args:
@@ -114,7 +114,7 @@ def health_of(reader: DriverReader, frame: DriverFrame | None, measured_hz: floa
     )
 
 
-def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
+def status_now(life: str, frame: DriverSnapshot) -> npt.NDArray[np.uint8]:
     """(n_sensors,) uint8: the status of a frame's sensors now: what has become too old since, is stale."""
     status, stale = frame.status, np.uint8(Status.STALE)
     if life in WITHOUT_NEWS:
@@ -129,7 +129,7 @@ def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
     return np.where(fresh | (status != 0), status, stale)
 
 
-def untouched(frame: DriverFrame) -> npt.NDArray[np.bool_]:
+def untouched(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
     """(n_sensors,) bool: sensors of modules that have sent nothing but 0 so far; they are fresh all the same."""
     return frame.module_untouched[frame.structure.sensor_module]
 
@@ -142,7 +142,7 @@ def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
     return counts
 
 
-def patch_ages_ns(frame: DriverFrame) -> list[int | None]:
+def patch_ages_ns(frame: DriverSnapshot) -> list[int | None]:
     """How old the newest data of every patch is; None for one that was never heard."""
     newest_ns = np.zeros(frame.structure.n_patches, np.int64)
     np.maximum.at(newest_ns, frame.structure.group_patch, frame.group_time_ns)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
@@ -40,7 +40,7 @@ class LiveDriver:
 
     def __init__(self, reader: DriverReader) -> None:
         self.reader = reader
-        self.frame: DriverFrame | None = None
+        self.frame: DriverSnapshot | None = None
         self._samples: deque[_Sample] = deque()  # of one generation
 
     @property
@@ -107,7 +107,7 @@ class LiveDriver:
     def health(self) -> SkinHealth:
         return health_of(self.reader, self.frame, self.rate_hz)
 
-    def _sample(self, frame: DriverFrame) -> None:
+    def _sample(self, frame: DriverSnapshot) -> None:
         samples = self._samples
         if self.frame is not None and frame.generation != self.frame.generation:
             samples.clear()

@@ -7,13 +7,13 @@ from typing import Any, Generic, TypeVar
 
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import FrameT
+from skinware.memory.ring import SampleT
 from skinware.service import ServiceReader
 
 ReaderT = TypeVar("ReaderT", bound=ServiceReader[Any])
 
 
-class LiveServices(Generic[ReaderT, FrameT]):
+class LiveServices(Generic[ReaderT, SampleT]):
     """The services of one kind in one namespace.
 
     Args:
@@ -46,14 +46,14 @@ class LiveServices(Generic[ReaderT, FrameT]):
         for name in list(self._readers):
             self._drop(name)
 
-    def _newest(self, name: str) -> FrameT | None:
+    def _newest(self, name: str) -> SampleT | None:
         """What a service of a living writer told last; None where there is nothing."""
         reader = self._readers[name]
         try:
             reader.refresh()
             if reader.structure_changed:
                 reader.reattach()
-            frame: FrameT = reader.read(timeout_s=0.0)
+            frame: SampleT = reader.read(timeout_s=0.0)
         except (ServiceTimeout, Overrun):
             return None  # nothing published yet
         except (ServiceNotFound, BadServiceFile):

@@ -8,11 +8,11 @@ import numpy as np
 
 from skinware.errors import StructureError
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import FrameT
+from skinware.memory.ring import SampleT
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
-from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
-from skinware.tactile.motion_service import MotionFrame, MotionReader
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.tactile.motion_service import MotionReader, MotionSample
 from skinware.tactile.source_reader import SourceReader
 from skinware.views.live_services import LiveServices
 
@@ -34,10 +34,10 @@ class TouchedPlace(NamedTuple):
     module: str
 
 
-class LiveSources(LiveServices[SourceReader[Any, FrameT], FrameT]):
+class LiveSources(LiveServices[SourceReader[Any, SampleT], SampleT]):
     """The services of one kind that tell something of drivers, in one namespace, followed live."""
 
-    def of(self, driver: str) -> FrameT | None:
+    def of(self, driver: str) -> SampleT | None:
         """What was told last of a driver; None where no service tells anything."""
         for name, reader in self._readers.items():
             if reader.source.driver == driver:
@@ -45,16 +45,16 @@ class LiveSources(LiveServices[SourceReader[Any, FrameT], FrameT]):
         return None
 
 
-def live_contacts(namespace: Namespace) -> LiveSources[ContactsFrame]:
+def live_contacts(namespace: Namespace) -> LiveSources[ContactsSample]:
     return LiveSources(namespace, ContactsReader)
 
 
-def live_motion(namespace: Namespace) -> LiveSources[MotionFrame]:
+def live_motion(namespace: Namespace) -> LiveSources[MotionSample]:
     """The services of motion over regions in a namespace."""
     return LiveSources(namespace, MotionReader)
 
 
-def places_of(frame: ContactsFrame | None, structure: Structure) -> list[TouchedPlace]:
+def places_of(frame: ContactsSample | None, structure: Structure) -> list[TouchedPlace]:
     """Where the contacts are, the oldest first; none if they are of other sensors than those of the driver.
 
     Args:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.regions import Region
@@ -259,7 +259,7 @@ class Outlet:
             else:
                 self._tell_once(service, f"driver {served.driver} has the port {served.port.name} already")
 
-    def took(self, service: str, frame: Frame) -> None:
+    def took(self, service: str, frame: Sample) -> None:
         for served, vector in self._vectors.get(service, ()):
             served.offer(vector.of(frame.column("values"), frame.column("status")), frame.acquired_ns)
 

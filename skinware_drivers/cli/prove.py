@@ -173,7 +173,7 @@ def _captured(
     name: str | None, driver_arguments: Sequence[str], place: Namespace, files: ProofFiles
 ) -> Iterator[DriverReader]:
     """A reader of a driver that is captured as long as the block: of one that runs, or of one that is started."""
-    from skinware.cli._driver_frames import reader_of
+    from skinware.cli._driver_snapshots import reader_of
     from skinware_drivers.cli.capturing import captured
 
     with contextlib.ExitStack() as beside:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import counters_of
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware.samples import sample_report, sample_text
 from skinware.status import Status, load_report
@@ -79,7 +79,7 @@ class DriverLog:
     structure: Structure
     by_hour: bool = False
     frames: int = 0
-    newest: DriverFrame | None = None
+    newest: DriverSnapshot | None = None
     future_ns: int = 0
     backwards: int = 0
     longest_gap_s: float = 0.0
@@ -95,7 +95,7 @@ class DriverLog:
         self._always: npt.NDArray[np.uint8] = np.full(self.structure.n_sensors, 0xFF, np.uint8)
         self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
 
-    def take(self, frame: DriverFrame, tables: Tables, time_s: float) -> None:
+    def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
         """Take in the next frame.
 
         Args:
@@ -119,7 +119,7 @@ class DriverLog:
         self.frames += 1
         self.newest = frame
 
-    def _follow_times(self, before: DriverFrame, frame: DriverFrame) -> None:
+    def _follow_times(self, before: DriverSnapshot, frame: DriverSnapshot) -> None:
         same_writer = before.generation == frame.generation
         for total, name in ((self._interval, "patch_interval_counts"), (self._delay, "patch_age_counts")):
             now, was = (getattr(one, name).astype(np.int64) for one in (frame, before))
@@ -129,7 +129,7 @@ class DriverLog:
         self.future_ns = max(self.future_ns, int(times.max(initial=0)) - frame.published_ns)
         self.longest_gap_s = max(self.longest_gap_s, (frame.published_ns - before.published_ns) / 1e9)
 
-    def _follow_states(self, frame: DriverFrame, time_s: float) -> None:
+    def _follow_states(self, frame: DriverSnapshot, time_s: float) -> None:
         reasons = frame.bus_reason.tolist()
         for row, state in enumerate(frame.bus_state.tolist()):
             reason = (bus_reason_name(reasons[row]) or "").replace("_", "-")

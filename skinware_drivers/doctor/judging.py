@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
@@ -39,7 +39,7 @@ class TaxelJudge:
             return
         self._health = ChainHealth(self._chain, driver)
 
-    def take(self, frame: DriverFrame) -> None:
+    def take(self, frame: DriverSnapshot) -> None:
         """Take in the next frame; those that come too soon after another are left out."""
         if self._why_not or frame.acquired_ns < self._due_ns:
             return

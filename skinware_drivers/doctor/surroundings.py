@@ -15,7 +15,7 @@ import skinware.native
 import skinware_drivers.native
 from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory.namespace import ROOT, Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import ServiceReader
 from skinware_drivers.doctor.evidence import Counted, InterfaceSeen, MachineSeen, NamespaceSeen
 from skinware_drivers.finding.interfaces import CanInterface
@@ -128,7 +128,7 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
         idle_s = time.time() - namespace.path.stat().st_mtime
         for name in namespace.services():
             try:
-                with ServiceReader[Frame](name, namespace=namespace, announce=False) as reader:
+                with ServiceReader[Sample](name, namespace=namespace, announce=False) as reader:
                     (living if reader.alive else dead).append(name)
                     size += 0 if reader.alive else namespace.ring_path(name).stat().st_size
             except (BadServiceFile, ConfigurationError) as error:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from skinware.cli._sensor_health import health
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import (
     BadServiceFile,
     ConfigurationError,
@@ -79,7 +79,7 @@ class _DriverWatch:
         self._generation = reader.generation
         self._begun = self._newest_statistics = reader.writer_statistics
         self._restarts = 0
-        self._newest: DriverFrame | None = None
+        self._newest: DriverSnapshot | None = None
 
     def look(self, time_s: float) -> None:
         """Take the newest frame in, if there is one that is new.

@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 
 import skinware.recording
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
@@ -216,7 +216,7 @@ class _Published:
 
     def __init__(self) -> None:
         self._reader: DriverReader | None = None
-        self._frames: list[tuple[Structure, list[DriverFrame]]] = []
+        self._frames: list[tuple[Structure, list[DriverSnapshot]]] = []
         self._last: tuple[int, int] | None = None
 
     def look(self, runner: Runner, namespace: Namespace) -> None:

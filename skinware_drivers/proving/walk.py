@@ -10,10 +10,10 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._driver_frames import after, frames_until
+from skinware.cli._driver_snapshots import after, frames_until
 from skinware.cli._format import figure_text, plural
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
@@ -122,8 +122,8 @@ class _Walk:
         self._high: Values = np.full(len(module), -np.inf)
         self._usable = np.zeros(len(module), bool)
         self._threshold = 0.0
-        self._first: DriverFrame | None = None
-        self._last: DriverFrame | None = None
+        self._first: DriverSnapshot | None = None
+        self._last: DriverSnapshot | None = None
 
     @property
     def _names(self) -> Sequence[str]:
@@ -254,7 +254,7 @@ class _Walk:
             if np.nanmax(np.abs(values - self._rest)) <= self._threshold:
                 break
 
-    def _look_at_range(self, name: str, values: Values, frame: DriverFrame | None) -> None:
+    def _look_at_range(self, name: str, values: Values, frame: DriverSnapshot | None) -> None:
         flagged = 0
         if frame is not None:
             status = frame.status_of(self._type.name)
@@ -311,7 +311,7 @@ class _Walk:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverFrame, Values]]:
+    def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverSnapshot, Values]]:
         """Frames until whoever takes them has what he wants; else a check fails, and says why.
 
         Raises:
@@ -321,7 +321,7 @@ class _Walk:
         yield from self._frames(after(self._manner.patience_s))
         raise _Missed(what, else_)
 
-    def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverFrame, Values]]:
+    def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverSnapshot, Values]]:
         """Frames with physical values of the type, (n,); of taxels without data, those at rest.
 
         Raises:

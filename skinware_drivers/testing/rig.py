@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.realtime import NS_PER_S
 from skinware.samples import sample_report, sample_text
@@ -83,7 +83,7 @@ class Recorder:
     """
 
     def __init__(self, clock: HandClock) -> None:
-        self.frames: list[DriverFrame] = []
+        self.frames: list[DriverSnapshot] = []
         self.times_ns: list[int] = []
         self.keep = True
         self.count: int = 0
@@ -249,8 +249,8 @@ class Running(Rig):
             defect(f"the driver ended by itself: {type(error).__name__}: {error}" if error else "the driver ended")
 
     async def until(
-        self, condition: Callable[[DriverFrame], object], why_not: str, within_s: float = _LONGEST_START_S
-    ) -> DriverFrame:
+        self, condition: Callable[[DriverSnapshot], object], why_not: str, within_s: float = _LONGEST_START_S
+    ) -> DriverSnapshot:
         """Let time pass until a published frame fulfils a condition; a defect if none does."""
         record, end_ns = self.record, self.clock.now_ns + round(within_s * 1e9)
         seen = record.count
@@ -262,12 +262,12 @@ class Running(Rig):
             require(self.clock.now_ns < end_ns, why_not)
             await self.sleep(min(self.adapter.period_s / 2, 0.05))
 
-    async def until_fresh(self, within_s: float = _LONGEST_START_S) -> DriverFrame:
+    async def until_fresh(self, within_s: float = _LONGEST_START_S) -> DriverSnapshot:
         """Until every sensor was seen and none is stale."""
         frames, begun_ns = self.wire.frames, self.clock.now_ns
         heard_ns: int | None = None
 
-        def is_decided(frame: DriverFrame) -> bool:
+        def is_decided(frame: DriverSnapshot) -> bool:
             nonlocal heard_ns
             if heard_ns is None and self.wire.frames > frames:
                 heard_ns = self.clock.now_ns
@@ -359,12 +359,12 @@ class Running(Rig):
         return int(structure.sensor_patch[self.numbers.index(number) * self.truth.n_values])
 
 
-def is_fresh(frame: DriverFrame) -> bool:
+def is_fresh(frame: DriverSnapshot) -> bool:
     """Whether every sensor is good, or at least shown."""
     return not (frame.status & ~np.uint8(SHOWN_ANYWAY)).any()
 
 
-def is_live(frame: DriverFrame) -> bool:
+def is_live(frame: DriverSnapshot) -> bool:
     return bool((frame.patch_state == PatchState.LIVE).all() and (frame.bus_state == BusState.LIVE).all())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.bus import FrameBatch
@@ -114,7 +114,7 @@ class SilenceTests(Suite):
         rig.devices.restart(number, now_ns)
 
     @staticmethod
-    async def _until_stale(rig: Running, patch: int, why_not: str) -> DriverFrame:
+    async def _until_stale(rig: Running, patch: int, why_not: str) -> DriverSnapshot:
         return await rig.until(
             lambda frame: frame.patch_state[patch] != PatchState.LIVE, why_not, within_s=20 * rig.adapter.period_s + 3
         )

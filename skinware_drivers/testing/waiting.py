@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ServiceTimeout
 from skinware.samples import sample_report, sample_text
 from skinware.status import Status
@@ -32,11 +32,11 @@ def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:
 
 def read_until(
     reader: DriverReader,
-    condition: Callable[[DriverFrame], bool],
+    condition: Callable[[DriverSnapshot], bool],
     within_s: float = PATIENCE_S,
     *,
     frames: int | None = None,
-) -> DriverFrame:
+) -> DriverSnapshot:
     """The first frame that fulfils a condition; fails the test if none does in time, and tells what was in the last.
 
     Args:
@@ -63,7 +63,7 @@ def read_until(
     return defect(f"none of the {count} frames of {within_s:g} s fulfils the condition {condition}{seen}")
 
 
-def _in_words(reader: DriverReader, frame: DriverFrame) -> str:
+def _in_words(reader: DriverReader, frame: DriverSnapshot) -> str:
     told = [f"of the last, {np.count_nonzero(frame.status == 0)} of {len(frame.status)} sensors are fresh"]
     told += [f"{n} {bit.name}" for bit in Status if (n := np.count_nonzero(frame.status & np.uint8(bit)))]
     for bus, counters in enumerate(reader.bus_counters(frame)):

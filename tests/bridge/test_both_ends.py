@@ -12,7 +12,7 @@ from skinware.bridge.giving import Stream
 from skinware.bridge.messages import coded_part, parts_of
 from skinware.errors import Paused, PeerGone, RequestError, RequestFailed, RequestRefused, StructureChanged
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import ServiceReader, ServiceWriter
 from skinware.transfer.codec import HEADER, CodedColumn
 from skinware_drivers.testing.waiting import wait_until
@@ -139,7 +139,7 @@ def test_each_of_several_open_questions_has_a_frame_of_its_own(namespace: Namesp
         is_heard = False
 
     stream = Stream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
-    with driver(namespace) as writer, ServiceReader[Frame]("arm", namespace=namespace) as reader:
+    with driver(namespace) as writer, ServiceReader[Sample]("arm", namespace=namespace) as reader:
         publish(writer)
         first = reader.read()
         stream.begin(first.generation, [CodedColumn.of(column) for column in reader._ring.segment.layout.slot])

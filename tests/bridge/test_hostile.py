@@ -37,7 +37,7 @@ from skinware.bridge.turns import Turns
 from skinware.bridge.watching import Watcher
 from skinware.errors import BridgeError, RequestError
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.service import ServiceReader
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.liar import DEEP, INSTANCE, ROBOT, Lies, coded, frame, generation, head, lying, services
@@ -154,7 +154,7 @@ def test_an_odd_answer_to_a_call_is_an_error_of_the_call(namespace: Namespace, a
     ):
         wait_until(lambda: "pose" in ends.here.services())
         with (
-            ServiceReader[Frame]("pose", namespace=ends.here, timeout_s=30) as reader,
+            ServiceReader[Sample]("pose", namespace=ends.here, timeout_s=30) as reader,
             pytest.raises(RequestError),
         ):
             reader.call("tare")

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinware import DriverReader, DriverWriter, Frame
+from skinware import DriverReader, DriverWriter, Sample
 from skinware.bridge.access import Rules
-from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.clock import Exchange, PeerClock
 from skinware.bridge.diagnosis import why_unreachable
 from skinware.bridge.endpoints import endpoints
 from skinware.bridge.messages import (
@@ -66,7 +66,7 @@ class Peers:
             there_ns, back_ns = 150_000 + self._generator.exponential(200_000, 2)
             heard_ns, returned_ns = asked_ns + there_ns, asked_ns + there_ns + 20_000 + back_ns
             there = (self._other(heard_ns), self._other(heard_ns + 20_000))
-            self.clock.add(Sample.of(round(asked_ns), *there, round(returned_ns)))
+            self.clock.add(Exchange.of(round(asked_ns), *there, round(returned_ns)))
         self._pass(self.clock.pause_ns())
 
     def wrong_ns(self) -> float:
@@ -287,7 +287,7 @@ def test_frames_one_after_the_other_are_those_that_were_coded(namespace: Namespa
                 decoder.decode(encoder.encode(_next(writer, reader)))
 
 
-def _next(writer: DriverWriter, reader: DriverReader) -> Frame:
+def _next(writer: DriverWriter, reader: DriverReader) -> Sample:
     publish(writer)
     return reader.read()
 

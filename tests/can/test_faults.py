@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from skinware import BusReason, BusState, DriverFrame, DriverReader, Status
+from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.interface import read_controller
@@ -37,15 +37,15 @@ TIOCSETD, N_SLCAN, SIOCGIFNAME = 0x5423, 17, 0x8910
 FIRST, SECOND = slice(0, 8), slice(8, 16)
 
 
-def is_fresh(frame: DriverFrame, part: slice = slice(None)) -> bool:
+def is_fresh(frame: DriverSnapshot, part: slice = slice(None)) -> bool:
     return not frame.status[part].any()
 
 
-def is_in_order(frame: DriverFrame) -> bool:
+def is_in_order(frame: DriverSnapshot) -> bool:
     return is_fresh(frame) and frame.bus_state.tolist() == [BusState.LIVE] * 2 and not frame.bus_reason.any()
 
 
-def goes_on_without(frame: DriverFrame, reason: BusReason, state: BusState) -> bool:
+def goes_on_without(frame: DriverSnapshot, reason: BusReason, state: BusState) -> bool:
     """The first bus is in this state and shows nothing as fresh; the second one lives."""
     told = (frame.bus_state[0], frame.bus_reason[0]) == (state, reason)
     return told and bool((frame.status[FIRST] & Status.STALE).all()) and is_fresh(frame, SECOND)
@@ -253,7 +253,7 @@ def test_a_babbling_node_and_foreign_traffic_cost_no_data(vcan: Callable[[], str
         read_until(reader, is_in_order)
 
 
-def iter_until_now(reader: DriverReader, start: DriverFrame) -> Iterator[DriverFrame]:
+def iter_until_now(reader: DriverReader, start: DriverSnapshot) -> Iterator[DriverSnapshot]:
     now_ns = time.monotonic_ns()
     for frame in reader.in_order(timeout_s=30):
         if frame.published_ns > now_ns:

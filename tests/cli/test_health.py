@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Structure
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.status import Status
 from skinware.views import health
 from skinware.views.health import (
@@ -31,7 +31,7 @@ def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool =
     service = SimpleNamespace(alive=alive, paused=paused, rate_hz=lambda: rate_hz)
     published_ns = NOW_NS - round((silence_s or 0) * SECOND)
     frame = None if silence_s is None else SimpleNamespace(published_ns=published_ns)
-    return life_of(cast(Any, service), cast(Frame | None, frame))
+    return life_of(cast(Any, service), cast(Sample | None, frame))
 
 
 @pytest.fixture

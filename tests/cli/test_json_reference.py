@@ -15,7 +15,7 @@ import click
 import numpy as np
 import pytest
 
-from skinware import DriverReader, Frame, Namespace, PatchState, ServiceReader, ServiceWriter
+from skinware import DriverReader, Namespace, PatchState, Sample, ServiceReader, ServiceWriter
 from skinware.bridge_state import BridgeState, BridgeStateWriter
 from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command as calibrate
@@ -173,7 +173,7 @@ def test_a_driver_and_those_that_look_at_it(
         check("`ready`", driver.wait_for("ready"))
         service.begin()
         service.commit(now_ns())
-        with DriverReader("roboskin") as reader, ServiceReader[Frame]("pose") as other:
+        with DriverReader("roboskin") as reader, ServiceReader[Sample]("pose") as other:
             read_until(reader, lambda frame: bool(frame.bus_samples["why"].any()))
             other.read()
             (namespace.path / "broken.ring").write_bytes(b"x")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, Status
+from skinware import DriverReader, DriverSnapshot, Status
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import LEVELS
 from skinware.cli._picture import Picture, describe_sensor
@@ -29,7 +29,7 @@ def published() -> Iterator[tuple[FakeSkin, DriverReader]]:
         yield skin, reader
 
 
-def drawn(picture: Picture, key: RowKey, frame: DriverFrame, life: str = "live") -> list[int]:
+def drawn(picture: Picture, key: RowKey, frame: DriverSnapshot, life: str = "live") -> list[int]:
     """The different codes in a picture."""
     picture.draw(key, frame, 78, 20, life)
     return sorted(set(picture.pixels.ravel().tolist()) - {heat.BACKGROUND})

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader
+from skinware import Namespace, Sample, ServiceReader
 from skinware.cli._replay_keys import clock
 from skinware.errors import ServiceError
 from skinware_drivers.testing.waiting import wait_until
@@ -89,7 +89,7 @@ def in_terminal(command: str, file: Path) -> Iterator[Screen]:
 def told() -> dict[str, Any]:
     """What a replay tells programs; nothing while there is none."""
     try:
-        with ServiceReader[Frame]("torso", announce=False) as reader:
+        with ServiceReader[Sample]("torso", announce=False) as reader:
             found: dict[str, Any] = reader.call("replay", timeout_s=10)
             return found
     except ServiceError:
@@ -145,7 +145,7 @@ def test_in_the_background_of_a_terminal_it_goes_on_without_keys(file: Path) -> 
         wait_until(lambda: told()["time_s"] != before)
         assert not told()["paused"]
         assert "space:" not in screen.text
-        with ServiceReader[Frame]("torso", announce=False) as reader:
+        with ServiceReader[Sample]("torso", announce=False) as reader:
             os.kill(reader.writer_pid, signal.SIGTERM)
         screen.shell.wait(PATIENCE_S)
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 import pytest
 
 import skinware.aio
-from skinware import DriverReader, Frame, ServiceReader, ServiceWriter, Skin
+from skinware import DriverReader, Sample, ServiceReader, ServiceWriter, Skin
 from skinware.aio import _wakeups
 from skinware.errors import RequestFailed, RequestTimeout, ServiceTimeout, StructureChanged
 from skinware.memory import futex
@@ -20,7 +20,7 @@ from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.core.services import SMALL, on_request, publish
 
 T = TypeVar("T")
-Reader = skinware.aio.Reader[Frame]
+Reader = skinware.aio.Reader[Sample]
 
 
 async def soon(what: Awaitable[T]) -> T:

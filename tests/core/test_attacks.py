@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader
+from skinware import Namespace, Sample, ServiceReader
 from skinware.memory import file_layout
 from skinware.memory.announcement import _SIZE, living_readers, sweep
 from skinware.memory.locks import _FLOCK
@@ -67,7 +67,7 @@ def reads_on(users: Users, work: Callable[..., Any], *arguments: Any) -> tuple[A
 def read_and_ask(board: Path) -> None:
     mine = Board(board).rows[2]
     become(OWNER, [])
-    with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+    with ServiceReader[Sample]("x", timeout_s=PATIENCE_S) as reader:
         while not mine[STOP]:
             frame = reader.request(timeout_s=PATIENCE_S)
             assert (frame.column("values") == frame.sequence).all()
@@ -167,7 +167,7 @@ def flood(board: Path) -> int:
 
 def wake_ups(board: Path) -> int:
     """Wake all readers without an end, and move them to a futex that nobody wakes."""
-    with ServiceReader[Frame]("x", announce=False) as reader:
+    with ServiceReader[Sample]("x", announce=False) as reader:
         start = reader._ring.segment.data.ctypes.data
         address, elsewhere = start + file_layout.WAKE_WORD_OFFSET, start + file_layout.STATISTICS_OFFSET
         libc = ctypes.CDLL(None)
@@ -261,7 +261,7 @@ def test_locks_and_fake_announcements_neither_hide_a_death_nor_harm_who_looks(us
     assert records
     for record in records:
         assert (record.service + record.program + record.kind).isprintable()
-    with ServiceReader[Frame]("x", announce=False) as reader:
+    with ServiceReader[Sample]("x", announce=False) as reader:
         assert reader.alive
         users.crew.kill(users.driver)
         assert not reader.alive

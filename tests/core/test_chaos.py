@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import RequestError
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
@@ -92,7 +92,7 @@ def outlive_the_parent(until: Path) -> None:
 def victim_reader(name: str, state: str, lines: int) -> None:
     bomb = Bomb(state, lines)
     with bomb.armed("attaching"):
-        reader = ServiceReader[Frame](name, timeout_s=PATIENCE_S)
+        reader = ServiceReader[Sample](name, timeout_s=PATIENCE_S)
     for _ in range(1_000_000):
         frame = None
         for _ in range(5):
@@ -107,7 +107,7 @@ def victim_reader(name: str, state: str, lines: int) -> None:
 def victim_requester(name: str, state: str, lines: int) -> None:
     bomb = Bomb(state, lines)
     with bomb.armed("attaching"):
-        reader = ServiceReader[Frame](name, timeout_s=PATIENCE_S)
+        reader = ServiceReader[Sample](name, timeout_s=PATIENCE_S)
     for _ in range(1_000_000):
         try:
             with bomb.armed("asking", last_chance=False):
@@ -128,7 +128,7 @@ def survivor(name: str, board: Path, row: int, way: str) -> None:
     """Reads on through all deaths of a driver, and tells what it sees."""
     rows = Board(board).rows
     mine = rows[row]
-    with ServiceReader[Frame](name, timeout_s=PATIENCE_S) as reader:
+    with ServiceReader[Sample](name, timeout_s=PATIENCE_S) as reader:
         frames = {
             "asap": reader.frames(timeout_s=PATIENCE_S),
             "in order": reader.in_order(timeout_s=PATIENCE_S),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy.typing as npt
 import pytest
 
-from skinware import Frame, ServiceReader, ServiceWriter
+from skinware import Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun
 from skinware.memory.ring import COPY_ATTEMPTS
 from skinware.service import Columns
@@ -37,7 +37,7 @@ def fill(columns: dict[str, npt.NDArray[Any]], sequence: int) -> None:
     columns["one"][:] = sequence & 0xFF
 
 
-def is_whole(frame: Frame) -> bool:
+def is_whole(frame: Sample) -> bool:
     """Whether every number in it is of the same frame."""
     sequence = frame.sequence
     number = sequence.to_bytes(8, "little")  # comparing bytes takes a tenth of the time that numpy takes
@@ -83,7 +83,7 @@ def write_on_request(board: Path, slots: int) -> None:
         rows[0, COMPARED] = writer.sequence
 
 
-def taker(reader: ServiceReader[Frame], way: str) -> Callable[[], Frame]:
+def taker(reader: ServiceReader[Sample], way: str) -> Callable[[], Sample]:
     if way == "asap":
         return partial(next, reader.frames(timeout_s=PATIENCE_S))
     if way == "periodic":
@@ -98,7 +98,7 @@ def taker(reader: ServiceReader[Frame], way: str) -> Callable[[], Frame]:
 def compare(board: Path, row: int, way: str, wanted: int) -> None:
     """Take frames and look at every number in them."""
     mine = Board(board).rows[row]
-    with ServiceReader[Frame]("flood", timeout_s=PATIENCE_S) as reader:
+    with ServiceReader[Sample]("flood", timeout_s=PATIENCE_S) as reader:
         reader.read(timeout_s=PATIENCE_S)
         take = taker(reader, way)
         before = 0
@@ -147,9 +147,9 @@ def test_no_torn_frame_from_a_writer_flat_out(way: str, slots: int, tmp_path: Pa
 
 @pytest.mark.parametrize("way", ["copy", "view", "in order", "asap"])
 def test_a_slot_that_is_never_whole_is_an_overrun(way: str) -> None:
-    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         in_order, asap = reader.in_order(timeout_s=PATIENCE_S), reader.frames(timeout_s=PATIENCE_S)
-        takes: dict[str, Callable[[], Frame]] = {
+        takes: dict[str, Callable[[], Sample]] = {
             "copy": reader.read,
             "view": reader.view().__enter__,
             "in order": partial(next, in_order),
@@ -176,7 +176,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
 ) -> None:
     if data_path == "native" and way != "view":
         pytest.skip("C counts its attempts where no test can look")
-    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         attempts = 0
 
         def publish() -> None:
@@ -184,7 +184,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
             fill(writer.begin(), sequence)
             writer.commit(sequence, sequence)
 
-        class Overtaken(Frame):
+        class Overtaken(Sample):
             __slots__ = ()
 
             def __init__(self, *arguments: object) -> None:
@@ -199,7 +199,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
         next(in_order)
         publish()
         reader._ring._frame_class = Overtaken
-        takes: dict[str, Callable[[], Frame]] = {
+        takes: dict[str, Callable[[], Sample]] = {
             "copy": reader.read,
             "view": reader.view().__enter__,
             "in order": partial(next, in_order),
@@ -208,7 +208,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
             takes[way]()
         assert COPY_ATTEMPTS <= attempts <= COPY_ATTEMPTS + 1
         assert reader.statistics.overruns == 1
-        reader._ring._frame_class = Frame
+        reader._ring._frame_class = Sample
         assert is_whole(reader.read())
 
 
@@ -229,7 +229,7 @@ def write_at_100_hz(board: Path, row: int) -> None:
 def sleep_in_the_loop(board: Path, row: int, way: str) -> None:
     """A reader that comes back twice a second and must know what it missed."""
     rows = Board(board).rows
-    with ServiceReader[Frame]("steady1", timeout_s=PATIENCE_S) as reader:
+    with ServiceReader[Sample]("steady1", timeout_s=PATIENCE_S) as reader:
         frames = reader.in_order(timeout_s=PATIENCE_S) if way == "in order" else reader.frames(timeout_s=PATIENCE_S)
         for frame in frames:
             rows[row, FIRST] = rows[row, FIRST] or frame.sequence

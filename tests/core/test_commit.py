@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skinware import Frame, ServiceReader, ServiceWriter
+from skinware import Sample, ServiceReader, ServiceWriter
 from skinware.errors import ServiceError
 from skinware.realtime import NS_PER_S, now_ns
 
@@ -25,9 +25,9 @@ BAD = [
 
 
 @contextmanager
-def service() -> Iterator[tuple[ServiceWriter, ServiceReader[Frame]]]:
+def service() -> Iterator[tuple[ServiceWriter, ServiceReader[Sample]]]:
     """Its writer, which has published one frame of ones in a ring of two slots, and a reader."""
-    with ServiceWriter("x", {"values": ("<i8", 4)}, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"values": ("<i8", 4)}, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         writer.begin()["values"][:] = 1
         writer.commit(7, flags=3)
         yield writer, reader
@@ -83,7 +83,7 @@ def test_a_stamp_in_the_future_is_kept_and_counted() -> None:
 
 
 def test_frames_that_are_left_out_are_lost_to_readers_and_the_newest_is_always_there() -> None:
-    with ServiceWriter("x", {"values": ("<i8", 4)}, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"values": ("<i8", 4)}, slots=4) as writer, ServiceReader[Sample]("x") as reader:
         frames = reader.in_order(timeout_s=30)
         sequence, lost = 0, 0
         for skip in (0, 1, 2, 0, 3, 4, 0, 5, 1000, 1003, 0):

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.driver_service import DriverReader, DriverWriter
 from skinware.errors import (
     BadServiceFile,
@@ -64,7 +64,7 @@ def test_damaged_files_are_refused(namespace: Namespace, damage: Callable[[bytes
     data = damage(ring_file(namespace))
     namespace.ring_path("x").write_bytes(data)
     with pytest.raises(BadServiceFile, match=words):
-        ServiceReader[Frame]("x")
+        ServiceReader[Sample]("x")
     namespace.ring_path("x").unlink()
 
 
@@ -91,7 +91,7 @@ ABSURD = {
 @pytest.mark.parametrize("field", ABSURD)
 def test_a_forged_predecessor_stops_no_writer(namespace: Namespace, field: str) -> None:
     forged(namespace, *ABSURD[field])
-    with ServiceWriter("x", {"values": ("<u8", 512)}) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"values": ("<u8", 512)}) as writer, ServiceReader[Sample]("x") as reader:
         writer.begin()["values"][:] = 8
         writer.commit(2)
         frame = reader.read()
@@ -103,14 +103,14 @@ def test_a_forged_count_beside_the_lock_is_not_believed(namespace: Namespace) ->
     with ServiceWriter("x", {"values": ("<u8", 512)}):
         pass
     namespace.lock_path("x").write_bytes(b"\xff" * 8)
-    with ServiceWriter("x", {"values": ("<u8", 512)}), ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"values": ("<u8", 512)}), ServiceReader[Sample]("x") as reader:
         assert reader._ring.segment.published_before == 0
 
 
 @pytest.mark.usefixtures("data_path")
 def test_a_dead_writer_was_not_too_fast(namespace: Namespace, program: Path) -> None:
     forged(namespace, *ABSURD["latest"])
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"):
             reader.read()
         with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"), reader.view():
@@ -159,34 +159,34 @@ def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> N
     path = namespace.ring_path("x")
     path.symlink_to("/etc/passwd")
     with pytest.raises(BadServiceFile, match="cannot be opened"):
-        ServiceReader[Frame]("x")
+        ServiceReader[Sample]("x")
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(BadServiceFile, match="not a regular file"):
-        ServiceReader[Frame]("x")
+        ServiceReader[Sample]("x")
     path.unlink()
     if os.geteuid() == 0:
         path.write_bytes(data)
         os.chown(path, 12345, -1)
         with pytest.raises(BadServiceFile, match="owned by uid 12345"):
-            ServiceReader[Frame]("x")
+            ServiceReader[Sample]("x")
         path.unlink()
 
 
 def test_a_folder_that_cannot_be_trusted_is_refused(namespace: Namespace) -> None:
     with pytest.raises(ServiceNotFound, match="nor another; start a driver"):
-        ServiceReader[Frame]("x")
+        ServiceReader[Sample]("x")
     namespace.create()
     namespace.path.chmod(0o2777)
     with pytest.raises(NamespaceError, match="written by others"):
-        ServiceReader[Frame]("x")
+        ServiceReader[Sample]("x")
     if os.geteuid() == 0:
         namespace.path.chmod(0o2750)
         os.chown(namespace.path, 12345, -1)
         with pytest.raises(NamespaceError, match="SKINWARE_OWNER"):
-            ServiceReader[Frame]("x")
+            ServiceReader[Sample]("x")
         with pytest.raises(ServiceNotFound):
-            ServiceReader[Frame]("x", namespace=Namespace(owner=12345))
+            ServiceReader[Sample]("x", namespace=Namespace(owner=12345))
 
 
 # -- anything may be wrong ---------------------------------------------------------------------------------------
@@ -197,7 +197,7 @@ def attempt(namespace: Namespace, data: bytes) -> bool:
     path = namespace.ring_path("x")
     path.write_bytes(data)
     try:
-        for reader_class in (ServiceReader[Frame], DriverReader):
+        for reader_class in (ServiceReader[Sample], DriverReader):
             try:
                 reader = reader_class("x")
             except BadServiceFile:
@@ -211,13 +211,13 @@ def attempt(namespace: Namespace, data: bytes) -> bool:
     return True
 
 
-def touch(reader: ServiceReader[Frame] | DriverReader) -> None:
+def touch(reader: ServiceReader[Sample] | DriverReader) -> None:
     size = len(reader._ring.segment.data)
     layout = reader._ring.segment.layout
     for array in reader.static().values():
         array.tobytes()
     assert layout.slot_offset + layout.slot_count * layout.slot_stride <= size
-    takes: tuple[Callable[[], Frame], ...] = (
+    takes: tuple[Callable[[], Sample], ...] = (
         partial(reader.read, timeout_s=0),
         partial(next, reader.in_order(timeout_s=0)),
     )
@@ -361,7 +361,7 @@ def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(name
     with ServiceWriter("x", {"values": ("<u8", 512)}, {"table": np.arange(5, dtype="<u4")}) as writer:
         writer.begin()
         writer.commit(1)
-        with ServiceReader[Frame]("x") as reader, open(namespace.ring_path("x"), "r+b", buffering=0) as file:
+        with ServiceReader[Sample]("x") as reader, open(namespace.ring_path("x"), "r+b", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
             for _ in range(300):
                 offset = generator.choice([0, 512, 1152, generator.randrange(size)])

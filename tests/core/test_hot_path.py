@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.memory import futex
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
@@ -26,7 +26,7 @@ def publish(writer: ServiceWriter, value: int, flags: int = 0) -> None:
 
 
 def test_a_copy_is_the_readers_own_and_a_view_cannot_be_written() -> None:
-    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 7, flags=5)
         copy = reader.read()
         with reader.view() as view:
@@ -43,7 +43,7 @@ def test_a_copy_is_the_readers_own_and_a_view_cannot_be_written() -> None:
 
 
 def test_every_slot_is_read_from_its_own_place() -> None:
-    with ServiceWriter("x", COLUMNS, slots=5) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=5) as writer, ServiceReader[Sample]("x") as reader:
         frames = reader.in_order(timeout_s=5)
         for value in range(1, 12):
             publish(writer, value)
@@ -54,10 +54,10 @@ def test_every_slot_is_read_from_its_own_place() -> None:
 
 
 def test_a_frame_that_was_waited_for_is_not_stale_and_the_next_read_tells_of_a_death() -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         first = reader.read()
-        taken: list[Frame] = []
+        taken: list[Sample] = []
         thread = threading.Thread(target=lambda: taken.append(reader.read(newer_than=first, timeout_s=30)))
         thread.start()
         time.sleep(0.02)  # most likely it sleeps by now; the test holds either way
@@ -70,7 +70,7 @@ def test_a_frame_that_was_waited_for_is_not_stale_and_the_next_read_tells_of_a_d
 
 
 def test_an_announcement_tells_the_age_of_a_frame(namespace: Namespace) -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
 
         def told() -> bool:
             writer.begin()
@@ -109,7 +109,7 @@ def test_a_futex_wait_ends_by_another_value_or_a_wake_up() -> None:
 
 @pytest.mark.parametrize("announce", [True, False])
 def test_every_turn_is_counted_although_it_is_added_up_later(announce: bool) -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x", announce=announce) as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x", announce=announce) as reader:
         frames = reader.in_order(timeout_s=5)
         for value in range(1, 21):
             publish(writer, value)

@@ -21,7 +21,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import (
     Closed,
     NameInUse,
@@ -72,7 +72,7 @@ class Reading:
     """The model of a reader: the generation it reads, where it is, and what it has taken and lost."""
 
     name: str
-    reader: ServiceReader[Frame]
+    reader: ServiceReader[Sample]
     life: Life
     taken: int = 0
     frames: int = 0
@@ -99,7 +99,7 @@ class Reading:
             self.go_over(found)
         return not self.moved
 
-    def take(self, sequence: int, frame: Frame) -> None:
+    def take(self, sequence: int, frame: Sample) -> None:
         assert frame.sequence == sequence
         assert frame.column("values").tolist() == [sequence] * self.life.shape
         assert frame.stale == self.life.ended
@@ -242,9 +242,9 @@ class Lifecycle(RuleBasedStateMachine):
         life = self.services[name].found
         if life is None:
             with pytest.raises(ServiceNotFound):
-                ServiceReader[Frame](name, namespace=self.namespace)
+                ServiceReader[Sample](name, namespace=self.namespace)
             return multiple()
-        reading = Reading(name, ServiceReader[Frame](name, namespace=self.namespace), life)
+        reading = Reading(name, ServiceReader[Sample](name, namespace=self.namespace), life)
         self.readings.append(reading)
         return reading
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, StructureChanged
 from tests.core.services import publish
 from tests.core.workers import seeded
@@ -24,7 +24,7 @@ def test_generations_that_came_and_went_between_two_reads_are_counted() -> None:
     with ServiceWriter("x", COLUMNS) as writer:
         for _ in range(10):
             publish(writer, 0)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         reader.read()
     for count in (100, 5):
         with ServiceWriter("x", COLUMNS) as writer:
@@ -42,7 +42,7 @@ def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequ
     published = 0
     writer = ServiceWriter("x", COLUMNS)
     publish(writer, published := published + 1)
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         taken, first = 1, int(reader.read().column("values")[0])
         for _ in range(300):
             match dice.randrange(6):
@@ -70,7 +70,7 @@ def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequ
 
 
 def test_frames_of_another_structure_are_counted_too() -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         frame = reader.read()
         for n in (3, 7):
@@ -88,7 +88,7 @@ def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namesp
     with ServiceWriter("x", COLUMNS) as writer:
         for _ in range(10):
             publish(writer, 0)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         reader.read()
     namespace.lock_path("x").unlink()
     with ServiceWriter("x", COLUMNS) as writer:
@@ -99,7 +99,7 @@ def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namesp
     reader.close()
 
 
-def overwritten_while_viewed(reader: ServiceReader[Frame], writer: ServiceWriter) -> None:
+def overwritten_while_viewed(reader: ServiceReader[Sample], writer: ServiceWriter) -> None:
     with reader.view() as frame:
         for _ in range(3):
             publish(writer, 2)
@@ -107,7 +107,7 @@ def overwritten_while_viewed(reader: ServiceReader[Frame], writer: ServiceWriter
 
 
 def test_a_view_that_became_invalid_was_not_taken() -> None:
-    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         with pytest.raises(Overrun):
             overwritten_while_viewed(reader, writer)

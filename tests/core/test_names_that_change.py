@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverReader, DriverWriter, Frame, Namespace, ServiceReader, ServiceWriter, Skin
+from skinware import DriverReader, DriverWriter, Namespace, Sample, ServiceReader, ServiceWriter, Skin
 from skinware import skin as skin_module
 from skinware.errors import BadServiceFile, PeerGone, StructureChanged
 from skinware.memory import file_layout
@@ -188,7 +188,7 @@ def test_what_a_driver_need_not_tell_may_be_missing(tables: dict[str, Any], colu
     ],
 )
 def test_what_contradicts_the_structure_is_refused(tables: dict[str, Any], columns: dict[str, Any]) -> None:
-    with Odd(tables, columns), ServiceReader[Frame]("odd") as plain:
+    with Odd(tables, columns), ServiceReader[Sample]("odd") as plain:
         assert plain.read().sequence == 1
         with pytest.raises(BadServiceFile):
             DriverReader("odd")

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware import Frame, ServiceReader, ServiceWriter, native
+from skinware import Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Closed, ServiceTimeout
 from skinware.memory import native_look, native_ring
 from skinware.memory.native_ring import NativeRingReader, NativeRingWriter
@@ -37,7 +37,7 @@ def publish(writer: ServiceWriter, value: int) -> None:
     writer.commit(value, value)
 
 
-def taking(reader: ServiceReader[Frame], way: str) -> Callable[[], Frame]:
+def taking(reader: ServiceReader[Sample], way: str) -> Callable[[], Sample]:
     """How a loop takes its next frame."""
     if way == "read":
         return lambda: reader.read(newer_than=reader._last, timeout_s=20)
@@ -45,7 +45,7 @@ def taking(reader: ServiceReader[Frame], way: str) -> Callable[[], Frame]:
     return lambda: next(frames)
 
 
-def is_whole(frame: Frame, value: int) -> bool:
+def is_whole(frame: Sample, value: int) -> bool:
     return bool(
         (frame.sequence, frame.acquired_ns, frame.flags) == (value, value, value)
         and (frame.column("values") == value).all()
@@ -70,12 +70,12 @@ def native_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize("way", WAYS)
 def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
     keep: list[tuple[int, Any]] = []
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         take = taking(reader, way)
         for value in range(1, 61):
             publish(writer, value)
             frame = take()
-            kept: list[Callable[[Frame], Any]] = [
+            kept: list[Callable[[Sample], Any]] = [
                 lambda frame: frame,
                 lambda frame: frame.column("values"),
                 lambda frame: frame.column("values")[5:9][::2],
@@ -87,7 +87,7 @@ def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
     del frame
     gc.collect()
     for value, thing in keep:
-        if isinstance(thing, Frame):
+        if isinstance(thing, Sample):
             assert is_whole(thing, value)
         elif thing is not None:
             array: npt.NDArray[Any] = np.asarray(thing)
@@ -99,7 +99,7 @@ def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
 
 @pytest.mark.usefixtures("native_path")
 def test_frames_that_nobody_has_are_filled_again() -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         take = taking(reader, "asap")
         seen = set()
         for value in range(1, 41):
@@ -113,7 +113,7 @@ def test_frames_that_nobody_has_are_filled_again() -> None:
 @pytest.mark.usefixtures("native_path")
 def test_a_frame_of_a_dead_writer_is_stale_and_the_same_memory_afterwards_is_not() -> None:
     writer = ServiceWriter("x", COLUMNS)
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         reader.read()
         reader.read()
@@ -147,7 +147,7 @@ def test_both_ways_see_the_same(way: str, writers: str, monkeypatch: pytest.Monk
     readers = {}
     for path in ("native", "python"):
         on(path)
-        readers[path] = ServiceReader[Frame]("x")
+        readers[path] = ServiceReader[Sample]("x")
     assert isinstance(readers["native"]._ring, NativeRingReader)
     assert not isinstance(readers["python"]._ring, NativeRingReader)
     takes = {path: taking(reader, way) for path, reader in readers.items()}
@@ -181,7 +181,7 @@ def test_both_ways_see_the_same(way: str, writers: str, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 def test_a_writer_tells_the_same_of_itself(data_path: str) -> None:
-    with ServiceWriter("x", COLUMNS, slots=3) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=3) as writer, ServiceReader[Sample]("x") as reader:
         assert isinstance(writer._ring, NativeRingWriter) == (data_path == "native")
         now_ns = time.monotonic_ns()
         for acquired_ns in (-1, -(1 << 63), 0, now_ns, now_ns + (1 << 40), now_ns - 3_000_000):
@@ -212,7 +212,7 @@ def test_a_signal_ends_a_wait(way: str, data_path: str) -> None:
 
     before = signal.signal(signal.SIGALRM, ring)
     try:
-        with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
             take = taking(reader, way)
             publish(writer, 1)
             take()
@@ -231,7 +231,7 @@ def test_a_signal_ends_a_wait(way: str, data_path: str) -> None:
 @pytest.mark.parametrize("way", WAYS)
 def test_another_thread_stops_a_wait(way: str, data_path: str) -> None:
     with ServiceWriter("x", COLUMNS) as writer:
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         take = taking(reader, way)
         publish(writer, 1)
         take()
@@ -246,7 +246,7 @@ def test_another_thread_stops_a_wait(way: str, data_path: str) -> None:
 @pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", ["asap", "in order"])
 def test_the_child_of_a_fork_has_no_reader(way: str, data_path: str) -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         take = taking(reader, way)
         for value in (1, 2):
             publish(writer, value)
@@ -267,9 +267,9 @@ def test_the_child_of_a_fork_has_no_reader(way: str, data_path: str) -> None:
 @pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", ["asap", "in order"])
 def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str, data_path: str) -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
 
-        def frames() -> Iterator[Frame]:
+        def frames() -> Iterator[Sample]:
             return reader.frames(timeout_s=0.01) if way == "asap" else reader.in_order(timeout_s=0.01)
 
         publish(writer, 1)
@@ -288,7 +288,7 @@ def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str, data_path:
 @pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 def test_a_killed_writer_is_noticed_by_a_loop(data_path: str) -> None:
     writer = ServiceWriter("x", COLUMNS)
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         take = taking(reader, "asap")
         publish(writer, 1)
         take()
@@ -366,7 +366,7 @@ def test_a_reader_beside_a_thread_that_computes_gets_every_frame() -> None:
             sum(range(1000))
 
     thread = threading.Thread(target=compute)
-    with ServiceWriter("x", COLUMNS, slots=64) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS, slots=64) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         take = taking(reader, "in order")
         take()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, StructureChanged
 from skinware.memory import file_layout, native_ring, ring, ring_writer, segments
 from skinware.service import _ownership
@@ -24,7 +24,7 @@ OTHER = {"values": ("<u8", 3)}
 
 def test_a_request_that_is_answered_by_another_structure_says_so() -> None:
     """Not with a frame of the old generation, which was acquired before the request."""
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         reader.read()
         writer.request_server()
@@ -45,7 +45,7 @@ def test_a_request_that_is_answered_by_another_structure_says_so() -> None:
 
 
 def test_a_request_that_is_answered_by_a_new_generation_gets_its_frame() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         reader.read()
         writer.request_server()
@@ -78,17 +78,17 @@ def test_pausing_in_the_middle_of_it_holds_for_the_new_one(paused: bool, monkeyp
             thread.join(0.1)  # it may have to wait for the end of this
             publish_file(*arguments)
 
-        with ServiceReader[Frame]("x") as old, monkeypatch.context() as patched:
+        with ServiceReader[Sample]("x") as old, monkeypatch.context() as patched:
             patched.setattr(segments, "publish", in_the_middle)
             writer.restructure(OTHER)
             threads[0].join()
             assert old._ring.state & file_layout.STATE_SUPERSEDED
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert (writer.paused, reader.paused) == (paused, paused)
 
 
 def test_pausing_an_old_generation_does_not_hide_that_there_is_a_new_one() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         writer._ring.set_state(file_layout.STATE_SUPERSEDED)
         writer.pause()
         writer.resume()
@@ -102,7 +102,7 @@ def test_a_failure_before_it_is_there_leaves_the_old_one(
     def fail(*_: object) -> None:
         raise MemoryError if where == "ring_writer" else NamespaceError("no")
 
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         inode = namespace.ring_path("x").stat().st_ino
         with monkeypatch.context() as patched:
@@ -140,7 +140,7 @@ class Interrupt:
 def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice(data_path: str) -> None:
     seen: dict[int, int] = {}
     interrupted = 0
-    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 0)
 
         def look() -> None:
@@ -177,17 +177,17 @@ def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(
     copy = ring_class.copy
     overruns = iter([True] * 3)
 
-    def sometimes(self: ring.RingReader[Frame], sequence: int | None = None) -> Frame | None:
+    def sometimes(self: ring.RingReader[Sample], sequence: int | None = None) -> Sample | None:
         if next(overruns, False):
             raise Overrun("too fast")
-        frame: Frame | None = copy(self, sequence)
+        frame: Sample | None = copy(self, sequence)
         return frame
 
     monkeypatch.setattr(ring_class, "copy", sometimes)
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         with threads.start_reader(reader, lambda frame: seen.append(frame.sequence)) as worker:
             wait_until(lambda: seen == [1])
             assert worker.error is None

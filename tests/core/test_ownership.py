@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, NameInUse, NamespaceError, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
 from skinware.memory.locks import Descriptor, ForkGuard, is_locked
@@ -60,7 +60,7 @@ def test_a_forked_child_does_not_make_a_dead_driver_look_alive(tmp_path: Path, n
     board, until = Board(tmp_path / "board", 1), tmp_path / "stop"
     with Crew() as crew:
         process = crew.start(wait_forked, board.path, until)
-        with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+        with ServiceReader[Sample]("x", timeout_s=PATIENCE_S) as reader:
             frame = reader.read(timeout_s=PATIENCE_S)
             wait_until(lambda: board.rows[0, BEGUN] > 2, PATIENCE_S)
             pending = reader.ask("acquire")
@@ -93,7 +93,7 @@ def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
     with Crew() as crew, contextlib.ExitStack() as at_end:
         at_end.callback(until.touch)
         process = crew.start(victim_driver, "x", board.path, 0, ROUTINE, 0, until, fork_in_c)
-        with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+        with ServiceReader[Sample]("x", timeout_s=PATIENCE_S) as reader:
             wait_until(lambda: board.rows[0, BEGUN] > 2, PATIENCE_S)
             frames = reader.frames(timeout_s=PATIENCE_S)
             assert not any(next(frames).stale for _ in range(5))
@@ -163,7 +163,7 @@ def test_a_driver_whose_namespace_was_removed_gives_way_to_one_that_took_its_nam
     with ServiceWriter("x", COLUMNS) as first, ServiceWriter("y", COLUMNS) as other:
         first.request_server()
         shutil.rmtree(namespace.path)
-        with ServiceWriter("x", COLUMNS) as second, ServiceReader[Frame]("x") as reader:
+        with ServiceWriter("x", COLUMNS) as second, ServiceReader[Sample]("x") as reader:
             second.request_server()
             first._next_file_check_ns = other._next_file_check_ns = 0  # now instead of within a second
             with pytest.raises(NameInUse):
@@ -180,7 +180,7 @@ def test_a_driver_whose_namespace_was_removed_gives_way_to_one_that_took_its_nam
 
 
 def test_a_forked_child_changes_nothing(namespace: Namespace) -> None:
-    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         writer.begin()
         writer.commit(1)
         generation = writer.generation

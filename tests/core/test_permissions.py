@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import SkinwareError
 from skinware.memory.announcement import living_readers
 from skinware.memory.locks import _FLOCK
@@ -48,7 +48,7 @@ def refusals(attempts: dict[str, Callable[[], object]]) -> dict[str, str]:
 
 def take_part() -> tuple[int, bool, bool]:
     place = Namespace()
-    with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+    with ServiceReader[Sample]("x", timeout_s=PATIENCE_S) as reader:
         frames = reader.in_order(timeout_s=PATIENCE_S)
         whole = all((frame.column("values") == frame.sequence).all() for frame in itertools.islice(frames, 20))
         seen = [record.pid for record in living_readers(place)] == [os.getpid()]
@@ -78,7 +78,7 @@ def forbidden() -> dict[str, str]:
         if libc.mprotect(ctypes.c_void_p(address), 4096, mmap.PROT_READ | mmap.PROT_WRITE) != 0:
             raise OSError(ctypes.get_errno(), "mprotect")
 
-    driver = int(ServiceReader[Frame]("x", announce=False).writer_pid)
+    driver = int(ServiceReader[Sample]("x", announce=False).writer_pid)
     attempts: dict[str, Callable[[], object]] = {
         f"open {path.name} {flags}": lambda path=path, flags=flags: os.open(path, flags)  # type: ignore[misc]
         for path in (ring, lock)
@@ -133,7 +133,7 @@ def strange() -> dict[str, str]:
     attempts: dict[str, Callable[[], object]] = {
         "list": lambda: os.listdir(place.path),
         "services": place.services,
-        "attach": lambda: ServiceReader[Frame]("x"),
+        "attach": lambda: ServiceReader[Sample]("x"),
         "write": lambda: ServiceWriter("x", COLUMNS),
         "open": lambda: os.open(place.ring_path("x"), os.O_RDONLY),
         "stat": lambda: os.stat(place.ring_path("x")),

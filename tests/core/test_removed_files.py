@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, Paused, PeerGone, RequestRefused, ServiceNotFound
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
@@ -48,7 +48,7 @@ def running(loop: Callable[[ServiceWriter], None]) -> Iterator[ServiceWriter]:
 
 def answers() -> bool:
     try:
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             return reader.request().sequence > 0
     except Paused:
         return True
@@ -70,7 +70,7 @@ def test_every_kind_of_writer_makes_them_again(
         assert not answers()
         writer._next_file_check_ns = 0  # now instead of within a second
         wait_until(answers)
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert reader.alive
             assert reader.paused == paused
 
@@ -102,5 +102,5 @@ def test_files_that_cannot_be_made_again_are_tried_again_and_told_once(
         assert caplog.text.count("shared memory is full; readers cannot find 'x'") == 1
         writer._next_file_check_ns = 0
         publish(writer, 2)
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert reader.read().column("values")[0] == 2

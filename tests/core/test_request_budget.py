@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import RequestRefused
 from skinware.service import RequestServer, _server
 from skinware.service._server import MOST_TURN_NS, short_path
@@ -141,7 +141,7 @@ def test_another_users_arguments_must_be_cheap_to_decode(
 ) -> None:
     """Decoding cannot be interrupted, and thousands of new lists wake the garbage collector."""
     monkeypatch.setattr(_server, "_user_of", lambda _: os.geteuid() + 1)
-    with serving() as (writer, _, _), ServiceReader[Frame]("x") as reader:
+    with serving() as (writer, _, _), ServiceReader[Sample]("x") as reader:
         pending = reader.ask("echo", value=value)
         found = writer.requests(1.0)
         if words:
@@ -170,7 +170,7 @@ def test_no_number_takes_long_to_decode() -> None:
 
 
 def test_without_descriptors_nobody_is_let_in_and_nothing_spins() -> None:
-    with serving() as (writer, server, _), ServiceReader[Frame]("x", announce=False) as reader:
+    with serving() as (writer, server, _), ServiceReader[Sample]("x", announce=False) as reader:
         pending = reader.ask("echo", value=7)  # connected, and waits to be let in
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         free = os.open("/dev/null", os.O_RDONLY)

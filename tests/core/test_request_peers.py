@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import PeerGone, RequestTimeout
 from skinware.realtime import now_ns
 from skinware.service._server import short_path
@@ -40,7 +40,7 @@ def served() -> Iterator[Any]:
 
 def test_a_killed_writer_is_a_clear_error_and_its_successor_answers(namespace: Namespace) -> None:
     with served() as first:
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         assert reader.call("pid") == first.pid
         pending = reader.ask("hang")
         assert not pending.done()
@@ -60,7 +60,7 @@ def test_a_killed_writer_is_a_clear_error_and_its_successor_answers(namespace: N
 
 
 def test_a_stopped_writer_times_out() -> None:
-    with served() as process, ServiceReader[Frame]("x") as reader:
+    with served() as process, ServiceReader[Sample]("x") as reader:
         reader.request()
         os.kill(process.pid, signal.SIGSTOP)
         with pytest.raises(RequestTimeout, match="busy, hung or stopped"):
@@ -73,7 +73,7 @@ def test_a_stopped_writer_times_out() -> None:
 
 def test_a_forked_child_keeps_no_connection_open() -> None:
     """Otherwise a child of the writer would hide its death from requesters."""
-    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
         pending = reader.ask("add", a=1, b=2)
         (request,) = writer.requests(1.0)
@@ -104,14 +104,14 @@ def raw_connection(namespace: Namespace) -> Iterator[socket.socket]:
 
 @pytest.mark.parametrize("packet", [b"nonsense", b"{}", b"[1]", b'{"id":"a","operation":"add"}', b"\xff" * 60_000])
 def test_nonsense_ends_the_connection_of_the_one_who_sent_it(namespace: Namespace, packet: bytes) -> None:
-    with on_request(), ServiceReader[Frame]("x") as reader, raw_connection(namespace) as connection:
+    with on_request(), ServiceReader[Sample]("x") as reader, raw_connection(namespace) as connection:
         connection.send(packet)
         assert connection.recv(100) == b""
         assert reader.call("add", a=1, b=2) == 3
 
 
 def test_a_peer_that_reads_no_answers_is_dropped_and_holds_nobody_up(namespace: Namespace) -> None:
-    with on_request(), ServiceReader[Frame]("x") as reader, raw_connection(namespace) as connection:
+    with on_request(), ServiceReader[Sample]("x") as reader, raw_connection(namespace) as connection:
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
             _ask_for_ever(connection)
         assert reader.call("add", a=1, b=2) == 3
@@ -124,7 +124,7 @@ def _ask_for_ever(connection: socket.socket) -> None:
 
 def test_too_many_peers(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skinware.service._server._IDLE_NS", 1 << 62)  # none makes room while the others connect
-    with on_request(), ServiceReader[Frame]("x") as reader:
+    with on_request(), ServiceReader[Sample]("x") as reader:
         assert reader.call("add", a=1, b=2) == 3
         connections = []
         for _ in range(100):
@@ -138,7 +138,7 @@ def test_too_many_peers(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -
         assert reader.call("add", a=1, b=2) == 3
         for connection in connections:
             connection.close()
-        with ServiceReader[Frame]("x") as another:
+        with ServiceReader[Sample]("x") as another:
             wait_until(lambda: _answers(another))
 
 
@@ -151,7 +151,7 @@ def _connected(connection: socket.socket, namespace: Namespace) -> bool:
     return True
 
 
-def _answers(reader: ServiceReader[Frame]) -> bool:
+def _answers(reader: ServiceReader[Sample]) -> bool:
     try:
         return bool(reader.call("add", a=1, b=2) == 3)
     except PeerGone:  # the writer has not yet noticed that the others hung up

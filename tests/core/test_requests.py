@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import (
     Closed,
     Paused,
@@ -27,7 +27,7 @@ from tests.core.services import OPERATIONS, SMALL, on_request
 
 
 def test_a_frame_on_request() -> None:
-    with on_request(), ServiceReader[Frame]("x") as reader:
+    with on_request(), ServiceReader[Sample]("x") as reader:
         for number in (1, 2, 3):
             asked_ns = now_ns()
             frame = reader.request()
@@ -40,7 +40,7 @@ def test_several_requesters_at_once_each_get_their_answer() -> None:
     failures: list[str] = []
 
     def ask(base: int) -> None:
-        with ServiceReader[Frame]("x", announce=False) as reader:
+        with ServiceReader[Sample]("x", announce=False) as reader:
             for i in range(200):
                 if reader.call("add", a=base, b=i) != base + i:
                     failures.append(f"{base} + {i}")
@@ -67,7 +67,7 @@ def test_periodic_writers_answer_too() -> None:
 
     thread = threading.Thread(target=work)
     thread.start()
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         asked_ns = now_ns()
         assert reader.request().acquired_ns >= asked_ns
         assert reader.call("add", a=1, b=2) == 3
@@ -88,14 +88,14 @@ def test_closing_between_two_steps_ends_the_loop_without_an_error() -> None:
 
         thread = threading.Thread(target=work)
         thread.start()
-        with ServiceReader[Frame]("x") as reader, pytest.raises(PeerGone):
+        with ServiceReader[Sample]("x") as reader, pytest.raises(PeerGone):
             reader.call("close")
         thread.join()
         assert ended.is_set()
 
 
 def test_a_service_tells_what_it_can_do() -> None:
-    with on_request(), ServiceReader[Frame]("x") as reader:
+    with on_request(), ServiceReader[Sample]("x") as reader:
         assert reader.operations() == {
             "add": "The sum of two numbers.",
             "fail": "Goes wrong.",
@@ -118,14 +118,14 @@ def test_a_service_tells_what_it_can_do() -> None:
     ],
 )
 def test_what_goes_wrong_is_told(operation: str, arguments: dict[str, Any], error: type[Exception], words: str) -> None:
-    with on_request(), ServiceReader[Frame]("x") as reader:
+    with on_request(), ServiceReader[Sample]("x") as reader:
         with pytest.raises(error, match=words):
             reader.call(operation, **arguments)
         assert reader.call("add", a=1, b=1) == 2  # and the next one works
 
 
 def test_paused() -> None:
-    with on_request() as writer, ServiceReader[Frame]("x") as reader:
+    with on_request() as writer, ServiceReader[Sample]("x") as reader:
         reader.request()
         writer.pause()
         assert writer.paused
@@ -141,7 +141,7 @@ def test_paused() -> None:
 
 
 def test_no_answer_in_time_and_never_an_old_one_for_a_new_request() -> None:
-    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
         with pytest.raises(RequestTimeout, match=r"no answer to 'add' within 0\.05 s"):
             reader.call("add", timeout_s=0.05, a=1, b=2)
@@ -161,7 +161,7 @@ def test_no_answer_in_time_and_never_an_old_one_for_a_new_request() -> None:
 
 
 def test_cancelled() -> None:
-    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
         pending = reader.ask("add", a=1, b=2)
         (request,) = writer.requests(1.0)
@@ -181,7 +181,7 @@ def test_cancelled() -> None:
 def test_a_service_without_requests_says_so() -> None:
     with (
         ServiceWriter("x", SMALL),
-        ServiceReader[Frame]("x") as reader,
+        ServiceReader[Sample]("x") as reader,
         pytest.raises(RequestRefused, match="service 'x' takes no requests"),
     ):
         reader.request()
@@ -190,7 +190,7 @@ def test_a_service_without_requests_says_so() -> None:
 def test_closed_and_gone(namespace: Namespace) -> None:
     writer = ServiceWriter("x", SMALL, operations=OPERATIONS)
     writer.request_server()
-    reader = ServiceReader[Frame]("x")
+    reader = ServiceReader[Sample]("x")
     pending = reader.ask("add", a=1, b=2)
     writer.close()
     assert not namespace.socket_path("x").exists()
@@ -217,12 +217,12 @@ def idle_programs(count: int) -> list[socket.socket]:
 
 def test_a_full_service_says_so_and_idle_programs_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     with on_request(), contextlib.ExitStack() as open_connections:
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             reader.request()
             for connection in idle_programs(63):
                 open_connections.callback(connection.close)
                 reader.request()  # the service has seen it
-            with ServiceReader[Frame]("x") as late:
+            with ServiceReader[Sample]("x") as late:
                 with pytest.raises(RequestRefused, match="64 programs are connected"):
                     late.request()
                 monkeypatch.setattr("skinware.service._server._IDLE_NS", 0)
@@ -237,7 +237,7 @@ def test_the_longest_names_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         server = writer.request_server()
         assert isinstance(server, RequestServer)
-        with ServiceReader[Frame](name, namespace=place) as reader:
+        with ServiceReader[Sample](name, namespace=place) as reader:
             pending = reader.ask("add", a=1, b=2)
             writer.requests(5.0)[0].reply(3)
             assert pending.result(5.0).result == 3
@@ -250,7 +250,7 @@ def test_the_longest_names_fit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_writer_may_answer_from_its_own_loop() -> None:
-    with ServiceWriter("x", SMALL, operations={"tare": lambda: None}) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, operations={"tare": lambda: None}) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
         pending = reader.ask("acquire")
         wait_until(lambda: _publish_for(writer))
@@ -272,7 +272,7 @@ def test_a_writer_that_closes_after_the_look_at_its_life_is_gone() -> None:
     """It is not one that takes no requests."""
     writer = ServiceWriter("x", SMALL, operations=OPERATIONS)
     writer.request_server()
-    with ServiceReader[Frame]("x") as reader, pytest.MonkeyPatch.context() as patched:
+    with ServiceReader[Sample]("x") as reader, pytest.MonkeyPatch.context() as patched:
         patched.setattr(reader._client, "listen", lambda _: writer.close())  # what is done before connecting
         with pytest.raises(PeerGone, match="the writer of 'x' is dead"):
             reader.ask("add", a=1, b=2)
@@ -291,7 +291,7 @@ def test_a_writer_whose_socket_is_withdrawn_counts_as_gone() -> None:
         found.append(writer.closed)
 
     found: list[bool] = []
-    with ServiceReader[Frame]("x") as reader, pytest.MonkeyPatch.context() as patched:
+    with ServiceReader[Sample]("x") as reader, pytest.MonkeyPatch.context() as patched:
         patched.setattr(server, "close", close_and_be_asked)
         writer.close()
     assert found == [False]

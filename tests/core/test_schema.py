@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
 from skinware.memory.file_layout import plan
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
@@ -35,7 +35,7 @@ def test_structures_and_shapes_come_out_as_they_went_in() -> None:
         frame["image"][2, 3] = 7
         frame["count"][0] = 1 << 60
         writer.commit(1)
-        with ServiceReader[Frame]("hands") as reader:
+        with ServiceReader[Sample]("hands") as reader:
             got = reader.read()
             assert got.column("poses").dtype == POSE
             assert got.column("poses")["position"].tolist() == [[1, 2, 3], [4, 5, 6]]
@@ -55,7 +55,7 @@ def test_structures_and_shapes_come_out_as_they_went_in() -> None:
 
 
 def test_a_plain_service_describes_itself_too() -> None:
-    with ServiceWriter("x", {"values": ("<u2", 7)}), ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"values": ("<u2", 7)}), ServiceReader[Sample]("x") as reader:
         assert STATIC_NAME not in reader.static()
         assert reader.schema == Schema({"values": Column(np.dtype("<u2"), (7,))})
 
@@ -65,7 +65,7 @@ def test_tables_of_structures_keep_their_dtype() -> None:
     poses["valid"] = 1, 0, 1
     numbers = np.arange(5, dtype="<i4")
     with ServiceWriter("x", {"values": ("<u2", 7)}, static={"poses": poses, "numbers": numbers}) as writer:
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert reader.static()["poses"].dtype == POSE
             assert reader.static()["poses"]["valid"].tolist() == [1, 0, 1]
             assert reader.static()["numbers"].tolist() == [0, 1, 2, 3, 4]
@@ -99,7 +99,7 @@ def test_any_structure_and_shape(dtype: np.dtype[np.void], shape: tuple[int, ...
         dtype, more = dtype.subdtype
         shape += more
     content = data.draw(hnp.arrays(dtype, shape))
-    with ServiceWriter("x", {"a": (dtype, shape), "end": ("u1", 1)}) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"a": (dtype, shape), "end": ("u1", 1)}) as writer, ServiceReader[Sample]("x") as reader:
         columns = writer.begin()
         columns["a"][...] = content
         columns["end"][:] = 77
@@ -143,7 +143,7 @@ def test_a_schema_that_contradicts_the_file_is_refused(namespace: Namespace) -> 
         assert len(wrong) <= end - at, "the test's own text must fit"
         namespace.ring_path("x").write_bytes(data[:at] + wrong.ljust(end - at) + data[end:])
         with pytest.raises(BadServiceFile, match=words):
-            ServiceReader[Frame]("x")
+            ServiceReader[Sample]("x")
 
     try:
         for field, value, words in [
@@ -168,7 +168,7 @@ def test_a_schema_that_contradicts_the_file_is_refused(namespace: Namespace) -> 
 
 def test_part_of_a_frame_can_be_changed() -> None:
     """A writer that begins from the last frame changes what it wants and keeps the rest."""
-    with ServiceWriter("x", {"a": ("<i8", 3), "b": ("u1", 2)}, slots=3) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", {"a": ("<i8", 3), "b": ("u1", 2)}, slots=3) as writer, ServiceReader[Sample]("x") as reader:
         columns = writer.begin(from_last=True)  # there is none yet
         columns["a"][:], columns["b"][:] = [1, 2, 3], [4, 5]
         writer.commit(1)

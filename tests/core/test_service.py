@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter, native
+from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory import _fences, file_layout, segments
 from skinware.memory import ring as ring_module
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("data_path")
 
 
 def test_a_column_that_there_is_not_is_refused_with_those_that_there_are() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         writer.begin()
         writer.commit(now_ns())
         with pytest.raises(KeyError, match="no column 'velocity'; there are values"):
@@ -34,7 +34,7 @@ def test_a_column_that_there_is_not_is_refused_with_those_that_there_are() -> No
 
 
 def test_a_slot_that_is_being_filled_is_never_handed_out() -> None:
-    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         publish(writer, 2)
         writer.begin()["values"][:256] = 3
@@ -44,7 +44,7 @@ def test_a_slot_that_is_being_filled_is_never_handed_out() -> None:
 
 
 def test_a_view_says_when_it_was_overwritten() -> None:
-    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         view = reader.view()
         frame = view.__enter__()
@@ -60,13 +60,13 @@ def test_a_view_says_when_it_was_overwritten() -> None:
 
 
 def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
-    def look(reader: ServiceReader[Frame], writer: ServiceWriter) -> None:
+    def look(reader: ServiceReader[Sample], writer: ServiceWriter) -> None:
         with reader.view() as frame:
             publish(writer, 2)
             publish(writer, 3)
             frame.column("colour")
 
-    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         with pytest.raises(KeyError, match="no column 'colour'"):
             look(reader, writer)
@@ -76,7 +76,7 @@ def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
 def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch, compiled: native.Library | None) -> None:
     fence = _fences.fence_for("aarch64", compiled)
     monkeypatch.setattr(ring_module, "fence", fence)
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 7)
         assert reader.read().column("values")[0] == 7
     with pytest.raises(PlatformError, match="libatomic1"):
@@ -87,7 +87,7 @@ def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch, compiled: 
 
 
 def test_losses_are_counted_exactly() -> None:
-    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         assert reader.read().sequence == 1
         for value in range(2, 12):
@@ -99,7 +99,7 @@ def test_losses_are_counted_exactly() -> None:
 
 
 def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> None:
-    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Sample]("x") as reader:
         frames = reader.in_order(timeout_s=5)
         publish(writer, 1)
         assert next(frames).sequence == 1
@@ -116,7 +116,7 @@ def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> N
 def test_the_first_view_after_a_restart_shows_the_new_life() -> None:
     with ServiceWriter("a", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("a")
+        reader = ServiceReader[Sample]("a")
         with reader.view() as frame:
             assert frame.column("values")[0] == 1
     with ServiceWriter("a", SMALL) as writer, reader:
@@ -129,7 +129,7 @@ def test_the_first_view_after_a_restart_shows_the_new_life() -> None:
 def test_losses_over_a_restart_are_counted() -> None:
     writer = ServiceWriter("x", SMALL)
     publish(writer, 1)
-    with ServiceReader[Frame]("x") as reader:
+    with ServiceReader[Sample]("x") as reader:
         frame = reader.read()
         publish(writer, 2)
         writer.close()
@@ -150,7 +150,7 @@ def test_readers_wake_on_publication_from_any_thread() -> None:
         seen: list[int] = []
 
         def follow() -> None:
-            with ServiceReader[Frame]("x") as reader:
+            with ServiceReader[Sample]("x") as reader:
                 for frame in reader.frames(timeout_s=30):
                     seen.append(frame.sequence)
                     if frame.sequence >= 3:
@@ -174,13 +174,13 @@ def test_a_signal_ends_a_wait() -> None:
     def ring(_number: int, _frame: object) -> None:
         raise Alarm
 
-    def wait_until_it_rings(reader: ServiceReader[Frame]) -> None:
+    def wait_until_it_rings(reader: ServiceReader[Sample]) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.1)
         reader.read(newer_than=reader.read(), timeout_s=60)
 
     before = signal.signal(signal.SIGALRM, ring)
     try:
-        with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
             publish(writer, 1)
             with pytest.raises(Alarm):
                 wait_until_it_rings(reader)
@@ -191,7 +191,7 @@ def test_a_signal_ends_a_wait() -> None:
 
 def test_a_frame_that_is_still_to_come_is_waited_for() -> None:
     """Also past those that are published while the reader sleeps."""
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         got: list[int] = []
         wanted = writer.generation, 30
@@ -208,7 +208,7 @@ def test_a_frame_that_is_still_to_come_is_waited_for() -> None:
 
 
 def test_a_timeout_is_not_early() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         with pytest.raises(ServiceTimeout, match="published nothing so far"):
             reader.read(timeout_s=0.05)
         publish(writer, 1)
@@ -219,7 +219,7 @@ def test_a_timeout_is_not_early() -> None:
 
 
 def test_a_periodic_writer_publishes_until_closed() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for count, columns in enumerate(writer.periodic(200)):
             columns["values"][:] = count
             if count == 5:
@@ -229,7 +229,7 @@ def test_a_periodic_writer_publishes_until_closed() -> None:
 
 
 def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for columns in writer.periodic(200):
             columns["values"][:] = 1
             if writer.sequence == 3:
@@ -244,7 +244,7 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
     writer = ring_writer(segment)
     segments.publish(segment, namespace, "x")
-    reader = ring_reader(segments.attach(namespace, "x"), Frame)
+    reader = ring_reader(segments.attach(namespace, "x"), Sample)
     writer._half_words[file_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1
     assert writer.commit(5) == 1
@@ -258,7 +258,7 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
 
 
 def test_a_periodic_reader_is_told_of_another_structure() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish_one(writer)
         frames = reader.frames(200, timeout_s=10)
         assert next(frames).sequence == 1
@@ -278,7 +278,7 @@ def publish_one(writer: ServiceWriter) -> None:
 
 
 def test_requests_reach_a_writer_with_another_structure() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish_one(writer)
         reader.read()
         writer.restructure({"values": ("<u2", 9)})
@@ -291,11 +291,11 @@ def test_requests_reach_a_writer_with_another_structure() -> None:
 
 
 def test_a_pause_in_the_middle_of_a_frame_does_not_publish_it() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
 
         def resume_once_the_loop_has_come_round() -> None:
-            with ServiceReader[Frame]("x") as other, pytest.raises(Paused):
+            with ServiceReader[Sample]("x") as other, pytest.raises(Paused):
                 other.request(timeout_s=60)  # the loop hears it after the frame that was paused
             writer.resume()
 
@@ -315,7 +315,7 @@ def test_a_namespace_by_name_and_a_dtype_by_code() -> None:
     name = os.environ["SKINWARE_NAMESPACE"]
     with (
         ServiceWriter("x", {"values": Column("<f8", 7)}, namespace=name) as writer,  # type: ignore[arg-type]
-        ServiceReader[Frame]("x", namespace=name) as reader,
+        ServiceReader[Sample]("x", namespace=name) as reader,
     ):
         publish_one(writer)
         assert reader.read().column("values").dtype == np.float64
@@ -332,7 +332,7 @@ def test_commit_without_begin_is_refused() -> None:
 
 
 def test_a_loop_may_restructure_its_service() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         sizes = []
         for count, columns in enumerate(writer.periodic(500)):
             sizes.append(len(columns["values"]))

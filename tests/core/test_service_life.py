@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory import file_layout
 from skinware.memory.announcement import living_readers
@@ -45,7 +45,7 @@ def lone_writer(fill_only: bool = False) -> Iterator[Any]:
 
 @pytest.mark.parametrize("fill_only", [False, True])
 def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) -> None:
-    with lone_writer(fill_only) as process, ServiceReader[Frame]("x") as reader:
+    with lone_writer(fill_only) as process, ServiceReader[Sample]("x") as reader:
         frame = reader.read()
         assert reader.alive
         assert not frame.stale
@@ -56,7 +56,7 @@ def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) ->
         last = reader.read()
         assert last.stale
         assert set(last.column("values").tolist()) == {10}
-        with ServiceReader[Frame]("x") as late:
+        with ServiceReader[Sample]("x") as late:
             assert late.read().sequence == 10
         with ServiceWriter("x", SMALL) as writer:
             publish(writer, 1)
@@ -65,7 +65,7 @@ def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) ->
 
 
 def test_another_structure_is_told_and_old_data_stays_readable() -> None:
-    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
+    with lone_writer() as process, ServiceReader[Sample]("x") as reader:
         last = reader.read()
         kill(process)
         with ServiceWriter("x", {"values": ("<u8", 3)}) as writer:
@@ -79,7 +79,7 @@ def test_another_structure_is_told_and_old_data_stays_readable() -> None:
 
 
 def test_a_stopped_process_is_alive_but_silent() -> None:
-    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
+    with lone_writer() as process, ServiceReader[Sample]("x") as reader:
         os.kill(process.pid, signal.SIGSTOP)
         frame = reader.read()
         with pytest.raises(ServiceTimeout, match="is running, but is silent"):
@@ -104,7 +104,7 @@ def test_a_forked_child_neither_writes_nor_keeps_the_writer_alive() -> None:
         os._exit(0)
     try:
         assert os.read(ready[0], 5) == b"refus"
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert reader.alive
             writer.close()
             assert not reader.alive
@@ -143,7 +143,7 @@ def test_a_ring_of_large_frames_holds_less_than_a_second(megabytes: float, slots
 
 
 def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         frame = reader.read()
         writer.namespace.ring_path("x").unlink()
@@ -167,7 +167,7 @@ def test_what_a_killed_creator_left_is_removed(namespace: Namespace) -> None:
 def test_readers_are_seen_while_they_live(namespace: Namespace) -> None:
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         reader.read()
         (record,) = living_readers(namespace)
         assert (record.service, record.pid) == ("x", os.getpid())
@@ -179,7 +179,7 @@ def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: N
     seen = threading.Event()
 
     def read() -> None:
-        with ServiceReader[Frame]("x", timeout_s=30) as reader:
+        with ServiceReader[Sample]("x", timeout_s=30) as reader:
             for _ in reader.frames(timeout_s=30):
                 if seen.is_set():
                     return
@@ -208,7 +208,7 @@ def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: N
 def test_a_dead_readers_announcement_is_removed_by_whoever_looks(
     namespace: Namespace, look: Callable[[Namespace], object]
 ) -> None:
-    with ServiceWriter("y", SMALL) as writer, ServiceReader[Frame]("y") as reader:
+    with ServiceWriter("y", SMALL) as writer, ServiceReader[Sample]("y") as reader:
         publish(writer, 1)
         reader.read()
         dead = namespace.readers_path / "x.1.deadbeef"

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.memory import ring
 from skinware.memory.announcement import living_readers
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
@@ -49,7 +49,7 @@ def test_a_spread_has_extremes_and_a_mean() -> None:
 
 def test_a_writer_tells_how_long_it_takes_and_how_old_its_data_is() -> None:
     old_ns = now_ns() // 2  # half as old as this machine's uptime
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         assert reader.writer_statistics.wall == Spread()
         for pause_s, age_ns in ((0.0, 0), (0.02, old_ns), (0.0, old_ns)):
             writer.begin()
@@ -64,7 +64,7 @@ def test_a_writer_tells_how_long_it_takes_and_how_old_its_data_is() -> None:
 
 
 def test_a_periodic_writer_tells_how_late_its_periods_begin() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for count, _ in enumerate(writer.periodic(100)):
             if count == 3:
                 time.sleep(0.1)  # misses about nine periods
@@ -76,7 +76,7 @@ def test_a_periodic_writer_tells_how_late_its_periods_begin() -> None:
 
 
 def test_thousands_of_dead_readers_hide_no_living_one(namespace: Namespace) -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         reader.read()
         for number in range(3000):
@@ -89,7 +89,7 @@ def test_readers_that_are_dropped_leave_nothing(namespace: Namespace) -> None:
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
         for _ in range(20):
-            ServiceReader[Frame]("x").read()
+            ServiceReader[Sample]("x").read()
         gc.collect()
         assert list(namespace.reader_files()) == []
 
@@ -106,7 +106,7 @@ def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
 
     thread = threading.Thread(target=publish)
     thread.start()
-    with ServiceReader[Frame]("x", timeout_s=60.0) as reader:
+    with ServiceReader[Sample]("x", timeout_s=60.0) as reader:
         for count, frame in enumerate(reader):
             if count == 2:
                 time.sleep(0.03)
@@ -135,19 +135,19 @@ def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
     thread.join()
 
 
-def _lags(reader: ServiceReader[Frame], frame: Frame) -> bool:
+def _lags(reader: ServiceReader[Sample], frame: Sample) -> bool:
     """Whether the next frame will be lost."""
     generation, sequence = reader.latest or frame.position
     return generation == frame.generation and sequence >= frame.sequence + 2
 
 
-def _seen(namespace: Namespace, reader: ServiceReader[Frame]) -> int:
+def _seen(namespace: Namespace, reader: ServiceReader[Sample]) -> int:
     reader.read()
     return next(record.frames for record in living_readers(namespace))
 
 
 def _read_for_ever() -> None:
-    with ServiceReader[Frame]("x", timeout_s=30.0) as reader:
+    with ServiceReader[Sample]("x", timeout_s=30.0) as reader:
         for _ in reader.frames(50):
             pass
 
@@ -168,7 +168,7 @@ def test_a_killed_reader_vanishes_by_itself(namespace: Namespace) -> None:
 def test_overruns_are_counted() -> None:
     from skinware.errors import Overrun
 
-    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         writer.begin()
         writer.commit(now_ns())
         reader.read()
@@ -192,7 +192,7 @@ def test_overruns_are_counted() -> None:
 def test_a_rate_is_that_of_the_data_where_it_was_held_up(
     published_ms: float, acquired_ms: float, rate_hz: float
 ) -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for number in range(20):
             writer.begin()
             sequence = writer.commit(round((5 + number * acquired_ms) * MS))
@@ -202,7 +202,7 @@ def test_a_rate_is_that_of_the_data_where_it_was_held_up(
 
 
 def test_a_rate_after_a_pause_of_the_device() -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for number in range(20):
             writer.begin()
             writer.commit(round((5 + number * 20 + 10_000 * (number > 16)) * MS))

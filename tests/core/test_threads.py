@@ -8,7 +8,7 @@ from typing import Any
 import numpy.typing as npt
 import pytest
 
-from skinware import Frame, ServiceReader, ServiceWriter, threads
+from skinware import Sample, ServiceReader, ServiceWriter, threads
 from skinware.errors import NameInUse, Paused
 from skinware.memory.announcement import living_readers
 from skinware.memory.namespace import Namespace
@@ -28,7 +28,7 @@ def test_a_reader_is_called_with_the_newest(options: dict[str, Any], kind: str, 
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         with threads.start_reader(
             reader, lambda frame: seen.append(int(frame.column("values")[0])), **options
         ) as worker:
@@ -46,7 +46,7 @@ def test_a_reader_that_wants_every_frame_gets_it() -> None:
     seen: list[int] = []
     with ServiceWriter("x", SMALL, slots=64) as writer:
         publish(writer, 0)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         with threads.start_reader(reader, lambda frame: seen.append(int(frame.column("values")[0])), in_order=True):
             wait_until(lambda: seen == [0])
             for value in range(1, 50):
@@ -59,7 +59,7 @@ def test_a_paused_reader_is_not_called() -> None:
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         with threads.start_reader(reader, lambda frame: seen.append(int(frame.column("values")[0]))) as worker:
             wait_until(lambda: seen == [1])
             worker.pause()
@@ -78,7 +78,7 @@ def test_another_structure_is_followed() -> None:
     sizes: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
+        reader = ServiceReader[Sample]("x")
         with threads.start_reader(reader, lambda frame: sizes.append(len(frame.column("values")))):
             wait_until(lambda: sizes == [4])
             writer.restructure({"values": ("<i8", 9)})
@@ -96,7 +96,7 @@ def test_a_writer_is_called_to_fill(rate_hz: float | None) -> None:
         columns["values"][0] = count
 
     with threads.start_writer(ServiceWriter("x", SMALL), fill, rate_hz=rate_hz, from_last=True) as worker:
-        with ServiceReader[Frame]("x") as reader:
+        with ServiceReader[Sample]("x") as reader:
             assert reader.request().column("values")[0] >= 1
             assert reader.request().column("values")[0] >= 2
             worker.pause()
@@ -127,12 +127,12 @@ def test_an_error_ends_a_worker_and_is_told(caplog: pytest.LogCaptureFixture) ->
 
 def test_a_worker_that_waits_is_stopped() -> None:
     with ServiceWriter("x", SMALL):
-        worker = threads.start_reader(ServiceReader[Frame]("x"), lambda _: None)
+        worker = threads.start_reader(ServiceReader[Sample]("x"), lambda _: None)
         stopper = threading.Thread(target=worker.stop)
         stopper.start()
         stopper.join(30)
         assert not stopper.is_alive()
-        paused = threads.start_reader(ServiceReader[Frame]("x"), lambda _: None)
+        paused = threads.start_reader(ServiceReader[Sample]("x"), lambda _: None)
         paused.pause()
         paused.stop()
         assert not paused.active
@@ -146,4 +146,4 @@ def test_names_of_the_version_before_go_on_with_a_warning() -> None:
         writer = threads.write(ServiceWriter("x", SMALL), fill, rate_hz=100)
     with writer:
         with pytest.warns(DeprecationWarning, match=r"threads\.start_reader"):
-            threads.read(ServiceReader[Frame]("x"), lambda _: None, rate_hz=100).stop()
+            threads.read(ServiceReader[Sample]("x"), lambda _: None, rate_hz=100).stop()

@@ -45,7 +45,7 @@ def test_turns_that_are_shorter_already_stay_so() -> None:
     ids=["newest", "in order"],
 )
 def test_a_loop_over_frames_shortens_them_for_as_long_as_it_lives(
-    loop: Callable[[skinware.ServiceReader], Iterator[skinware.Frame]],
+    loop: Callable[[skinware.ServiceReader], Iterator[skinware.Sample]],
 ) -> None:
     before_s = sys.getswitchinterval()
     with skinware.ServiceWriter("turns", {"a": (np.int64, (1,))}) as writer, skinware.ServiceReader("turns") as reader:

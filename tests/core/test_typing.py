@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 PROGRAM = """
-from skinware import DriverReader, Frame, ServiceReader
+from skinware import DriverReader, Sample, ServiceReader
 
 reader = ServiceReader("arm", timeout_s=10.0)
 reveal_type(reader)
@@ -16,7 +16,7 @@ for frame in reader.frames(rate_hz=30):
     reveal_type(frame)
 reveal_type(DriverReader("skin").read())
 
-def use(any_reader: ServiceReader) -> Frame:
+def use(any_reader: ServiceReader) -> Sample:
     return any_reader.read()
 """
 
@@ -29,8 +29,8 @@ def test_a_reader_of_plain_frames_needs_no_annotation(tmp_path: Path) -> None:
     revealed = [line.partition('type is "')[2].rstrip('"') for line in done.stdout.splitlines() if "Revealed" in line]
     assert done.returncode == 0, done.stdout
     assert revealed == [
-        "skinware.service._reader.ServiceReader[skinware.memory.ring.Frame]",
+        "skinware.service._reader.ServiceReader[skinware.memory.ring.Sample]",
         "skinware.memory.ring.Frame",
         "skinware.memory.ring.Frame",
-        "skinware.driver_frame.DriverFrame",
+        "skinware.driver_snapshot.DriverSnapshot",
     ]

@@ -11,7 +11,7 @@ from typing import Any
 import canopen
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState, Status
+from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware_drivers.can.canopen_patch import CanopenDriver, CanopenOptions, MappingChanged
 from skinware_drivers.notice import Notice
@@ -78,7 +78,7 @@ class Stage:
         self._context.__exit__(None, None, None)
         del self.reader, self.running, self._context  # pytest keeps this object for longer than it may keep descriptors
 
-    def read(self, condition: Any) -> DriverFrame:
+    def read(self, condition: Any) -> DriverSnapshot:
         return read_until(self.reader, condition)
 
     def do(self, method: str, *arguments: Any) -> None:

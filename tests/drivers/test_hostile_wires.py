@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.status import Status
 from skinware_drivers.loading import registered
 from skinware_drivers.registry import DRIVERS
@@ -150,11 +150,11 @@ def _meet(driver: str, case: Case, place: Place, amount: int) -> None:
             assert "Traceback" not in run.errors
 
 
-def _is_fresh(frame: DriverFrame) -> bool:
+def _is_fresh(frame: DriverSnapshot) -> bool:
     return not (frame.status & _NOT_FRESH).any()
 
 
-def _refusals(reader: DriverReader, frame: DriverFrame | None = None) -> int:
+def _refusals(reader: DriverReader, frame: DriverSnapshot | None = None) -> int:
     """Everything that came and was not used."""
     shown = reader.read() if frame is None else frame
     names = ("unknown", "bad_length", "bad_content", "refused", "bad_form", "checksum_errors", "skipped_bytes")

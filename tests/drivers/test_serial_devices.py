@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState, Status
+from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.status import BusState
 from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.serial.bus import SerialBus
@@ -37,7 +37,7 @@ GLOVE_TWO = bytes.fromhex("3c010abc00 7b01f00100")  # taxel 0: 0xABC; taxel 63: 
 CELLS = bytes.fromhex("5510000001 558f7fffff 5511ffffff 5520800000")
 
 
-def is_fresh(frame: DriverFrame) -> bool:
+def is_fresh(frame: DriverSnapshot) -> bool:
     return not (frame.status & BAD).any()
 
 
@@ -139,7 +139,7 @@ def test_flipped_bits_and_garbage_are_survived_and_accounted_for(driver: Any, ha
 # -- drivers, on pseudo terminals
 
 
-def shown(adapter: Any, stream: bytes, n_seen: int) -> tuple[DriverFrame, dict[str, Any]]:
+def shown(adapter: Any, stream: bytes, n_seen: int) -> tuple[DriverSnapshot, dict[str, Any]]:
     """What a driver shows of a stream that comes again and again, once so many sensors are seen."""
     with (
         line() as port,
@@ -147,7 +147,7 @@ def shown(adapter: Any, stream: bytes, n_seen: int) -> tuple[DriverFrame, dict[s
     ):
         with DriverReader("it", timeout_s=30) as reader:
 
-            def is_seen(frame: DriverFrame) -> bool:
+            def is_seen(frame: DriverSnapshot) -> bool:
                 return int(((frame.status & Status.NEVER_SEEN) == 0).sum()) == n_seen
 
             port.write(stream * 4)

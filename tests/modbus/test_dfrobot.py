@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader
+from skinware import DriverReader, DriverSnapshot
 from skinware.errors import BusError, ConfigurationError
 from skinware.status import Status
 from skinware_drivers.description import assemble
@@ -87,7 +87,7 @@ def answer(question: str, values: Sequence[int], **options: Any) -> bytes:
     return b"".join(frame.payload for frame in arrays.emit(2 * 10**9))
 
 
-def is_current(frame: DriverFrame) -> bool:
+def is_current(frame: DriverSnapshot) -> bool:
     return not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any()
 
 

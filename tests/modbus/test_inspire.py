@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader
+from skinware import DriverReader, DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.description import assemble
@@ -57,7 +57,7 @@ def reading(name: str, **options: Any) -> Iterator[DriverReader]:
         yield reader
 
 
-def is_current(frame: DriverFrame) -> bool:
+def is_current(frame: DriverSnapshot) -> bool:
     return not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any()
 
 
@@ -261,7 +261,7 @@ def test_bytes_in_the_other_order_are_told_and_put_right_by_an_option(caplog: An
             read_until(reader, lambda frame: not frame.status.any() and (frame.values == right()).all())
 
 
-def doubted(frame: DriverFrame) -> list[str]:
+def doubted(frame: DriverSnapshot) -> list[str]:
     """The modules of which all values are suspect; none may be so in part."""
     is_doubted = (frame.status & DOUBT) != 0
     modules = np.unique(frame.structure.sensor_module[is_doubted])

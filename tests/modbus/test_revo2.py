@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader
+from skinware import DriverReader, DriverSnapshot
 from skinware.errors import BusError, ConfigurationError
 from skinware.status import Status
 from skinware_drivers.description import assemble
@@ -44,7 +44,7 @@ def told(hand: EmulatedRevo2, command: str, now_ns: int) -> bytes:
     return b"".join(frame.payload for frame in hand.emit(now_ns + 10**9))
 
 
-def has_no_data(frame: DriverFrame) -> bool:
+def has_no_data(frame: DriverSnapshot) -> bool:
     return bool(((frame.status & Status.NOT_CONNECTED) != 0).all())
 
 

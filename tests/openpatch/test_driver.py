@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState, Skin, Status
+from skinware import DriverReader, DriverSnapshot, PatchState, Skin, Status
 from skinware.errors import RequestFailed
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
@@ -37,11 +37,11 @@ def driven(*patches: Microcontroller, wait: bool = True, **options: float) -> It
             yield running, reader
 
 
-def is_fresh(frame: DriverFrame) -> bool:
+def is_fresh(frame: DriverSnapshot) -> bool:
     return not (frame.status & BAD).any()
 
 
-def is_live_again(frame: DriverFrame, since_ns: int) -> bool:
+def is_live_again(frame: DriverSnapshot, since_ns: int) -> bool:
     return frame.patch_state[0] == PatchState.LIVE and bool((frame.module_time_ns[:4] > since_ns).all())
 
 
@@ -78,7 +78,7 @@ def test_a_hand_with_all_it_says_of_itself(firmware: Path) -> None:
         read_until(reader, lambda f: len(set(samples_of(f))) == 1)
 
 
-def samples_of(frame: DriverFrame) -> list[int]:
+def samples_of(frame: DriverSnapshot) -> list[int]:
     """The sample (modulo 251) that each module of a hand shows; every one must be whole."""
     structure = frame.structure
     kept = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11]  # channel 6 is padding

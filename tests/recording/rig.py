@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import skinware.recording
-from skinware import Frame, ServiceReader, ServiceWriter
+from skinware import Sample, ServiceReader, ServiceWriter
 from skinware.recording.files import Files, Target
 from skinware.recording.recorder import Recorder
 from skinware.recording.replaying import Replayer
@@ -62,14 +62,14 @@ def publish(skin: FakeSkin, count: int, period_s: float = 0.004) -> Contents:
     contents: Contents = {}
     for _ in range(count):
         skin.publish()
-        with ServiceReader[Frame](skin.writer.name, announce=False) as reader:
+        with ServiceReader[Sample](skin.writer.name, announce=False) as reader:
             frame = reader.read()
             contents[frame.position] = contents_of(frame)
         time.sleep(period_s)
     return contents
 
 
-def contents_of(frame: Frame) -> dict[str, bytes]:
+def contents_of(frame: Sample) -> dict[str, bytes]:
     """The bytes of every column, and the times."""
     columns = {name: frame.column(name).tobytes() for name in frame._columns}
     return columns | {"times": np.array([frame.acquired_ns, frame.published_ns, frame.flags]).tobytes()}

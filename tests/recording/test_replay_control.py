@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import skinware.recording
-from skinware import DriverReader, Frame, Namespace, ServiceReader
+from skinware import DriverReader, Namespace, Sample, ServiceReader
 from skinware.errors import Paused, RequestFailed, RequestRefused, ServiceNotFound
 from skinware.recording.replaying import Replayer
 from skinware_drivers.testing.waiting import wait_until
@@ -42,15 +42,15 @@ def file(made: dict[str, bytes], tmp_path: Path) -> Path:
 
 
 @contextmanager
-def controlling(file: Path, **options: Any) -> Iterator[ServiceReader[Frame]]:
+def controlling(file: Path, **options: Any) -> Iterator[ServiceReader[Sample]]:
     """A replay that waits, and a reader of whichever of its services is there first."""
     with replaying(file, paused=True, **options) as replayer:
         wait_until(lambda: bool(replayer.frames))
-        with ServiceReader[Frame](next(iter(replayer.frames)), timeout_s=30) as reader:
+        with ServiceReader[Sample](next(iter(replayer.frames)), timeout_s=30) as reader:
             yield reader
 
 
-def values(frame: Frame) -> dict[str, bytes]:
+def values(frame: Sample) -> dict[str, bytes]:
     """What does not depend on when it is replayed."""
     contents = contents_of(frame)
     return {name: value for name, value in contents.items() if name not in ("times", "module_time_ns", "bus_since_ns")}
@@ -60,7 +60,7 @@ def there() -> dict[str, dict[str, bytes]]:
     """What every service tells now."""
     found = {}
     for name in Namespace().services():
-        with ServiceReader[Frame](name, announce=False) as reader:
+        with ServiceReader[Sample](name, announce=False) as reader:
             if reader.alive:
                 found[name] = values(reader.read())
     return found
@@ -108,7 +108,7 @@ def test_playing_goes_on_from_there_without_a_gap(file: Path) -> None:
     expected = [contents for time_s, service, contents in frames if service == "torso" and time_s >= middle_s]
     with controlling(file, stays=True) as control:
         control.call("seek", time_s=middle_s)
-        with ServiceReader[Frame]("torso") as torso:
+        with ServiceReader[Sample]("torso") as torso:
             last = torso.read()
             control.call("resume")
             found = []
@@ -196,7 +196,7 @@ def test_a_speed_is_told_to_readers_as_a_rate(tmp_path: Path) -> None:
 def test_a_loop_begins_again_with_the_same_generation(file: Path) -> None:
     with replaying(file, speed=4.0) as replayer:
         wait_until(lambda: bool(replayer.frames))
-        with ServiceReader[Frame]("torso", timeout_s=30) as torso:
+        with ServiceReader[Sample]("torso", timeout_s=30) as torso:
             assert torso.call("loop")["loop"]
             first = torso.read()
             last = torso.read()

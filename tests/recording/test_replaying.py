@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import skinware.recording
-from skinware import DriverReader, Frame, Namespace, ServiceReader, Skin
+from skinware import DriverReader, Namespace, Sample, ServiceReader, Skin
 from skinware.errors import NameInUse
 from skinware.recording import Recording
 from skinware.recording.replaying import Replayer
@@ -107,7 +107,7 @@ def test_twice_as_fast_takes_half_the_time_and_keeps_ages(tmp_path: Path) -> Non
         wait_until(lambda: recorder.messages.get("/skin/pose/frame", 0) == 20)
     begun_s = time.monotonic()
     with replaying(file, speed=4.0) as replayer:
-        with ServiceReader[Frame]("pose", timeout_s=30) as reader:
+        with ServiceReader[Sample]("pose", timeout_s=30) as reader:
             assert reader.read().period_ns == 50_000_000 // 4
         wait_until(lambda: replayer.frames["pose"] == 20)
         assert time.monotonic() - begun_s > 0.9 * lasted_s / 4 * 19 / 20

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import BusReason, BusState, DriverReader, Frame, Namespace, ServiceReader, Skin, aio, threads
+from skinware import BusReason, BusState, DriverReader, Namespace, Sample, ServiceReader, Skin, aio, threads
 from skinware.errors import ServiceTimeout, StructureChanged
 from skinware.geometry import Geometry
 from skinware.memory.announcement import living_readers
@@ -43,7 +43,7 @@ OF_THE_MOMENT = {
 Told = dict[str, list[Any]]
 
 
-def ages(frame: Frame) -> Any:
+def ages(frame: Sample) -> Any:
     """Which times there are, and how far they are apart."""
     if "module_time_ns" not in frame._columns:
         return frame.flags
@@ -52,7 +52,7 @@ def ages(frame: Frame) -> Any:
     return [np.where(known, age, -1).tolist() for known, age in zip(there, since, strict=True)], frame.flags
 
 
-def told_by(frame: Frame) -> Any:
+def told_by(frame: Sample) -> Any:
     """All that is in a frame, but the moment."""
     contents = {name: data for name, data in contents_of(frame).items() if name not in TIMES}
     return contents, ages(frame), frame.sequence, frame.stale, frame.period_ns
@@ -83,7 +83,7 @@ class Programs:
         return [
             lambda: self._in_order(DriverReader("torso", timeout_s=60), "torso"),
             lambda: self._in_order(DriverReader("arm", timeout_s=60), "arm"),
-            lambda: self._in_order(ServiceReader[Frame]("pose", timeout_s=60), "pose"),
+            lambda: self._in_order(ServiceReader[Sample]("pose", timeout_s=60), "pose"),
             self._skin,
             lambda: asyncio.run(self._aio()),
         ]
@@ -124,7 +124,7 @@ class Programs:
 
     async def _aio(self) -> None:
         tell = self._list("aio", told_by)
-        with ServiceReader[Frame]("pose", timeout_s=60) as pose:
+        with ServiceReader[Sample]("pose", timeout_s=60) as pose:
             async with aio.Reader(pose) as reader:
                 frame = None
                 while not self._stopping:
@@ -227,7 +227,7 @@ def test_programs_cannot_tell_a_replay_from_life(
         live(recorder, begin, look)
     with replaying(file, paused=True) as replayer:
         wait_until(lambda: bool(replayer.frames))
-        with ServiceReader[Frame](next(iter(replayer.frames)), announce=False) as control:
+        with ServiceReader[Sample](next(iter(replayer.frames)), announce=False) as control:
             while replayer.frames.keys() != {"arm", "pose", "torso"}:
                 control.call("step")
             with programs(namespace) as running_now:

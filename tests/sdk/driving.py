@@ -11,8 +11,8 @@ from unittest import mock
 import msgspec
 
 from skinware import freshness
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver
@@ -74,7 +74,7 @@ class EveryFrame:
     def __init__(self, running: Driving, name: str = "roboskin") -> None:
         assert running.runner is not None
         assert running.runner.writer is not None
-        self.taken: list[DriverFrame] = []
+        self.taken: list[DriverSnapshot] = []
         self.reader: DriverReader = DriverReader(name)
         assert running.runner.generation is not None
         generation = running.runner.generation

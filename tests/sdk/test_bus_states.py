@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import pytest
 
-from skinware import BusReason, BusState, DriverFrame, DriverReader, Status
+from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
 from skinware_drivers.can.adapter import CanAdapter
@@ -116,7 +116,7 @@ def test_a_live_bus_tells_what_is_wrong_with_it(caplog: pytest.LogCaptureFixture
         for wrong in (BusReason.ERROR_WARNING, BusReason.ERROR_PASSIVE, BusReason.OVERFLOW):
             bus.wrong = wrong
 
-            def fresh_and_told(frame: DriverFrame, wrong: BusReason = wrong) -> bool:
+            def fresh_and_told(frame: DriverSnapshot, wrong: BusReason = wrong) -> bool:
                 is_live = frame.bus_state[0] == BusState.LIVE and not (frame.status & Status.STALE).any()
                 return bool(is_live and frame.bus_reason[0] == wrong)
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState, Status
+from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin_options import RoboskinOptions, SpecialBoards
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
@@ -99,7 +99,7 @@ def test_an_accelerometer_of_an_mtb3_that_is_not_there_says_so() -> None:
     assert not state.status[192:198].any()
 
 
-def gravity(frame: DriverFrame) -> float:
+def gravity(frame: DriverSnapshot) -> float:
     axes = [frame.structure.physical(frame.values, name) for name in ACCELERATION]
     return float(np.linalg.norm(np.array(axes), axis=0).max())
 

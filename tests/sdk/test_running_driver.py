@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
+from skinware import BusState, DriverReader, DriverSnapshot, PatchState, Skin, Status
 from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.testing.waiting import wait_until
@@ -239,7 +239,7 @@ def test_damaged_and_foreign_frames_are_counted() -> None:
     bus = emulated(boards=(7,), wrong_length=0.05, foreign_hz=200)
     with driving(bus) as running, DriverReader("roboskin") as reader:
 
-        def both_counted(frame: DriverFrame) -> bool:
+        def both_counted(frame: DriverSnapshot) -> bool:
             (counters,) = reader.bus_counters(frame)
             return counters["bad_length"] > 5 and counters["unknown"] > 5
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, Status
+from skinware import DriverReader, DriverSnapshot, Status
 from skinware_drivers.serial.ability_hand import AbilityHandDriver, AbilityHandOptions
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.testing.driving import emulated_skin
@@ -65,7 +65,7 @@ def test_no_flipped_bit_makes_an_answer() -> None:
 
 def shown(
     stream: bytes, listen_only: bool = False, at_least: int = 1, **options: Any
-) -> tuple[DriverFrame, dict[str, Any]]:
+) -> tuple[DriverSnapshot, dict[str, Any]]:
     """What a driver shows of a line on which this comes again and again, and what its bus counts by so many answers."""
     driver = AbilityHandDriver(AbilityHandOptions(**options))
     with line() as port:
@@ -74,7 +74,7 @@ def shown(
             wait_until(lambda: running.runner is not None and running.runner.writer is not None)
             with DriverReader("hand", timeout_s=30) as reader:
 
-                def is_seen(frame: DriverFrame) -> bool:
+                def is_seen(frame: DriverSnapshot) -> bool:
                     port.write(stream)
                     return not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any()
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, Status
+from skinware import DriverReader, DriverSnapshot, Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.flexitac import FlexiTacDriver, FlexiTacOptions
@@ -120,7 +120,7 @@ def test_text_in_pieces_is_the_same() -> None:
 # -- the driver, on pseudo terminals
 
 
-def shown(stream: bytes, **options: Any) -> DriverFrame:
+def shown(stream: bytes, **options: Any) -> DriverSnapshot:
     """A frame of what a driver shows of a stream that comes again and again."""
     driver = FlexiTacDriver(FlexiTacOptions(**options))
     with line() as port:
@@ -134,7 +134,7 @@ def shown(stream: bytes, **options: Any) -> DriverFrame:
             wait_until(is_shown)
             with DriverReader("pad", timeout_s=30) as reader:
 
-                def is_seen(frame: DriverFrame) -> bool:
+                def is_seen(frame: DriverSnapshot) -> bool:
                     port.write(stream)
                     return not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any()
 

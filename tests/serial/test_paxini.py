@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState, Status
+from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError, RequestFailed, StructureChanged
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
@@ -48,15 +48,15 @@ HAND: dict[str, Any] = {"board": "high_speed", "slots": (0, 6, 21), "points": 9}
 OTHER_PART = "PAXINI PXSR-STDIP03B-v1.0.5"
 
 
-def is_fresh(frame: DriverFrame) -> bool:
+def is_fresh(frame: DriverSnapshot) -> bool:
     return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
 
 
-def is_live(frame: DriverFrame) -> bool:
+def is_live(frame: DriverSnapshot) -> bool:
     return bool((frame.patch_state == PatchState.LIVE).all()) and is_fresh(frame)
 
 
-def following(reader: DriverReader, condition: Callable[[DriverFrame], bool]) -> DriverFrame:
+def following(reader: DriverReader, condition: Callable[[DriverSnapshot], bool]) -> DriverSnapshot:
     """As ``read_until``, also if the structure changes meanwhile."""
     try:
         return read_until(reader, condition)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from skinware import DriverFrame, DriverReader
+from skinware import DriverReader, DriverSnapshot
 from skinware.cli.info import command as info
 from skinware.errors import ConfigurationError
 from skinware.status import BusReason, BusState, Status
@@ -47,7 +47,7 @@ def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(lines, "LOOP", request.param)
 
 
-def fresh(frame: DriverFrame, tip: int) -> bool:
+def fresh(frame: DriverSnapshot, tip: int) -> bool:
     part = slice(tip * N_TAXELS, (tip + 1) * N_TAXELS)
     return not frame.status[part].any()
 

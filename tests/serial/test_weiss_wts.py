@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, PatchState
+from skinware import DriverSnapshot, PatchState
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions, _runs
 from skinware_drivers.testing.driving import emulated_skin
@@ -56,7 +56,7 @@ def test_a_sensor_that_streams_already_and_its_operations() -> None:
         assert reader.call("system") == {"bus0": "04 01 00 10 2a 00"}
         frame = read_until(reader, lambda f: int(f.values[0]) > 20)
 
-        def behind_ns(later: DriverFrame) -> int:
+        def behind_ns(later: DriverSnapshot) -> int:
             """How much less the values have grown than they do without tare: by one in each 10 ms."""
             grown = int(later.values[0]) - int(frame.values[0])
             return int(later.module_time_ns[0] - frame.module_time_ns[0]) - 10 * MS * grown

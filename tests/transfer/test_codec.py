@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from skinware.errors import BadRecording
 from skinware.memory import file_layout
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.transfer.codec import HEADER, CodedColumn, Encoder, Run, runs
 
 DTYPES = ["u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<u8", "<i8", "<f8", "S7", "V13"]
@@ -34,14 +34,14 @@ class Source:
         }
         self.coded = [CodedColumn.of(column) for column in self.layout.slot]
 
-    def frame(self, sequence: int, contents: list[bytes]) -> Frame:
+    def frame(self, sequence: int, contents: list[bytes]) -> Sample:
         """One with these bytes in its columns."""
         slot = bytearray(self.layout.slot_stride)
         head = np.frombuffer(slot, file_layout.SLOT, 1)
         head["sequence"], head["acquired_ns"], head["published_ns"], head["flags"] = sequence, 5, 1 << 61, 1 << 63
         for column, data in zip(self.layout.slot, contents, strict=True):
             slot[column.offset : column.offset + len(data)] = data
-        return Frame(self, slot)
+        return Sample(self, slot)
 
 
 def changing(generator: np.random.Generator, dtype: np.dtype[Any], count: int, frames: int, step: int) -> list[bytes]:

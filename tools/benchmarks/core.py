@@ -25,7 +25,7 @@ from core_products import NAMES, products
 from core_run import Cell, Result, measure
 from processes import RunFailed, may_use_fifo, own_namespace
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.realtime import now_ns
 
 OURS, PEER, IN_C = "skinware", "iceoryx2", "c"
@@ -44,7 +44,7 @@ def view_costs(namespace: Namespace, sensors: Iterable[int], rounds: int) -> dic
             with ServiceWriter("view", {"values": ("<u2", count)}, namespace=namespace) as writer:
                 writer.begin()["values"][:] = 1
                 writer.commit(now_ns())
-                with ServiceReader[Frame]("view", namespace=namespace, announce=False) as reader:
+                with ServiceReader[Sample]("view", namespace=namespace, announce=False) as reader:
                     passed = []
                     for _ in range(_VIEWS):
                         begin_ns = now_ns()

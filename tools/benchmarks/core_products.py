@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 import skinware
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter, native
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import ServiceTimeout
 from skinware.realtime import now_ns
 
@@ -126,7 +126,7 @@ class _SkinwarePublisher:
 
 class _SkinwareSubscriber:
     def __init__(self, topic: str, namespace: Namespace) -> None:
-        self._reader: ServiceReader[Frame] = ServiceReader(topic, namespace=namespace, timeout_s=10)
+        self._reader: ServiceReader[Sample] = ServiceReader(topic, namespace=namespace, timeout_s=10)
 
     def messages(self) -> Iterator[Message]:
         try:

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from processes import READY, CpuShare, Processes, answer, use_fifo
 
 import skinware
-from skinware import BusState, DriverFrame, DriverReader, DriverWriter, Namespace, PatchState, Skin, Structure
+from skinware import BusState, DriverReader, DriverSnapshot, DriverWriter, Namespace, PatchState, Skin, Structure
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.sensor_types import PRESSURE
 
@@ -168,7 +168,7 @@ def publish(writer: DriverWriter, sequence: int) -> None:
     writer.commit(acquired_ns)
 
 
-def is_torn(frame: DriverFrame) -> bool:
+def is_torn(frame: DriverSnapshot) -> bool:
     """Whether a frame of :func:`publish` is not whole, by its first and last sensor."""
     values, expected = frame.values, frame.sequence & 0xFFFF
     return int(values[0]) != expected or int(values[-1]) != expected
@@ -272,7 +272,7 @@ def _use_c(pipe: Connection, program: Path, namespace: Namespace, names: list[st
     pipe.send((found, cpu_s * NS_PER_S / (end_ns - begin_ns)))
 
 
-def _attend(turns: Iterator[tuple[DriverFrame, ...]], begin_ns: int, end_ns: int) -> Readings:
+def _attend(turns: Iterator[tuple[DriverSnapshot, ...]], begin_ns: int, end_ns: int) -> Readings:
     """Take what comes until the end; ``turns`` yields the frames of one turn of the loop."""
     found = Readings([], [])
     before_ns = time.thread_time_ns()

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from processes import Processes, answer, own_namespace
 
 import skinware.recording
-from skinware import DriverReader, DriverWriter, Frame, Structure
+from skinware import DriverReader, DriverWriter, Sample, Structure
 from skinware.conversion import FORMATS
 from skinware.geometry import Geometry
 from skinware.memory.statistics import BUCKETS
@@ -174,7 +174,7 @@ def witness(pipe: Connection, namespace: str) -> None:
     pipe.send(seen)
 
 
-def digest(frame: Frame, columns: Iterable[str]) -> bytes:
+def digest(frame: Sample, columns: Iterable[str]) -> bytes:
     state = hashlib.blake2b(struct.pack("<qQ", frame.acquired_ns, frame.flags), digest_size=16)
     for name in columns:
         state.update(frame.column(name).tobytes())

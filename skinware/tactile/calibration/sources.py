@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, Overrun, ServiceTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
@@ -68,7 +68,7 @@ class LoadSource:
         """The part of the sensors that have no baseline yet because they move; 0: none."""
         return 0.0 if self._chain is None else self._chain.baselines[self.type_name].refused_share
 
-    def loads(self, frame: DriverFrame) -> ArrayF:
+    def loads(self, frame: DriverSnapshot) -> ArrayF:
         """(n,) the loads in a frame; NaN where they are not known."""
         if self._chain is None:
             values, status = frame.physical(self.type_name), frame.status_of(self.type_name)

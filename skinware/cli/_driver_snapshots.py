@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.skin import Skin
@@ -43,7 +43,7 @@ def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReade
     return DriverReader(driver, namespace=namespace)
 
 
-def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverFrame]:
+def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverSnapshot]:
     """The driver's newest frames, each once.
 
     Args:
@@ -54,7 +54,7 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
         ServiceTimeout: no frame came for 5 s.
         StructureChanged: the driver has other sensors now.
     """
-    newest: DriverFrame | None = None
+    newest: DriverSnapshot | None = None
     heard_s = time.monotonic()
     while not is_over():
         try:
@@ -67,7 +67,7 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
         yield newest
 
 
-def physical_of(frame: DriverFrame, type_name: str) -> npt.NDArray[np.float32]:
+def physical_of(frame: DriverSnapshot, type_name: str) -> npt.NDArray[np.float32]:
     """(n_sensors,) float32: the physical values of the sensors of a type; 0 for those of other types."""
     physical = np.zeros(frame.structure.n_sensors, np.float32)
     physical[frame.structure.index(type_name)] = frame.physical(type_name)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.freshness import is_fresh
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Sample
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
@@ -16,7 +16,7 @@ from skinware.status import DataPath
 from skinware.structure import Structure
 
 
-class DriverFrame(Frame):
+class DriverSnapshot(Sample):
     """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
 
     All arrays are coherent: they were published together. Properties are whole columns of the

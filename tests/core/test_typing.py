@@ -30,7 +30,7 @@ def test_a_reader_of_plain_frames_needs_no_annotation(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
     assert revealed == [
         "skinware.service._reader.ServiceReader[skinware.memory.ring.Sample]",
-        "skinware.memory.ring.Frame",
-        "skinware.memory.ring.Frame",
+        "skinware.memory.ring.Sample",
+        "skinware.memory.ring.Sample",
         "skinware.driver_snapshot.DriverSnapshot",
     ]

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 BENCHMARKS = ROOT / "tools" / "benchmarks"
 SHARED = Path("/dev/shm")
@@ -66,6 +68,7 @@ def scale(*options: str, status: int = 0, path: str | None = None) -> tuple[list
     return [json.loads(line) for line in out.splitlines()], messages
 
 
+@pytest.mark.thorough
 def test_a_large_skin_over_a_slow_link_is_one_row() -> None:
     options = ("--sensors", "64", "--link", "slow", "--mode", "pull", "--loopback")
     ((row,), _) = scale("sizes", *options)
@@ -89,6 +92,7 @@ def test_a_row_that_does_not_work_says_why_and_ends() -> None:
     assert "StructureError" in row["failed"]
 
 
+@pytest.mark.thorough
 def test_a_skin_goes_through_the_whole_chain() -> None:
     figures, _ = scale("chain", "--sensors", "64", "--loopback")
     told = {figure["step"]: figure["value"] for figure in figures}

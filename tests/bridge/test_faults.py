@@ -166,6 +166,7 @@ def bridged(there: Namespace, mode: str, generator: random.Random) -> Iterator[t
         yield bridge, witness
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mode", ["push", "pull"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_whatever_breaks_readers_know_and_it_comes_back(namespace: Namespace, mode: str, seed: int) -> None:

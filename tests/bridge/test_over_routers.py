@@ -83,6 +83,7 @@ def until_told(listed: Running, *robots: str) -> dict[str, Any]:
     )
 
 
+@pytest.mark.thorough
 def test_robots_of_two_labs_meet(namespace: Namespace) -> None:
     lab, other_lab = free_port(), free_port()
     with place(namespace, "other") as other, place(namespace, "here") as here, driver(other), pump(other):
@@ -105,6 +106,7 @@ def test_robots_of_two_labs_meet(namespace: Namespace) -> None:
                 assert service.call("tare", timeout_s=PATIENCE_S) == "tared"
 
 
+@pytest.mark.thorough
 def test_a_router_says_who_may_serve_and_who_may_call(namespace: Namespace, tmp_path: Path) -> None:
     authority, port = trustme.CA(), free_port()
     tls = {name: ("--tls", certificates(authority, tmp_path / name, name)) for name in ("router", "icub", "guest")}

@@ -127,6 +127,7 @@ def test_either_end_goes_and_comes_back(namespace: Namespace, here: Namespace, e
             sweep(namespace)
 
 
+@pytest.mark.thorough
 def test_a_slow_link_has_the_newest_and_a_fast_one_has_all(namespace: Namespace, here: Namespace) -> None:
     """Frames of 30,848 sensors take twenty times what the link has."""
     port = free_port()
@@ -153,6 +154,7 @@ def certificates(authority: trustme.CA, folder: Path, name: str) -> str:
     return str(folder)
 
 
+@pytest.mark.thorough
 def test_only_who_has_a_certificate_sees_and_only_who_is_named_calls(
     namespace: Namespace, here: Namespace, tmp_path: Path
 ) -> None:

@@ -28,6 +28,7 @@ def published_by_a_process() -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "tests.browser.sleeve", "sleeve"], cwd=ROOT)
 
 
+@pytest.mark.quick
 def test_a_killed_driver_is_shown_within_a_second(namespace: Namespace, address: str, open_page: OpenPage) -> None:
     """Of three kills at least one: a machine that is busy may keep the page waiting, but not each time."""
     page = open_page(address)

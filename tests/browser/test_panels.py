@@ -207,6 +207,7 @@ def test_keys_do_what_buttons_do(sleeve: Sleeve, address: str, open_page: OpenPa
     until(page, "skin.theme !== a[0]", theme)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("size", [PHONE, (320, 568), (844, 390), DESKTOP])
 def test_nothing_is_wider_than_the_window(
     sleeve: Sleeve, address: str, open_page: OpenPage, size: tuple[int, int]

@@ -89,6 +89,7 @@ def come(page: Page, at: npt.NDArray[np.float64], happens: Callable[[], object])
     pytest.fail("nothing comes onto the screen, or it does not stay as it is")
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_press_moves_over_the_right_taxels(sleeve: Sleeve, address: str, open_page: OpenPage, view: str) -> None:
     page = open_page(f"{address}#{RAW_SCALE}&theme=dark{'&flat=1' * (view == 'flat')}")

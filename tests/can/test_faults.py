@@ -51,6 +51,7 @@ def goes_on_without(frame: DriverSnapshot, reason: BusReason, state: BusState) -
     return told and bool((frame.status[FIRST] & Status.STALE).all()) and is_fresh(frame, SECOND)
 
 
+@pytest.mark.quick
 def test_set_down_and_up(vcan: Callable[[], str], caplog: pytest.LogCaptureFixture) -> None:
     name = vcan()
     with caplog.at_level(logging.WARNING), skin(name, vcan()), DriverReader("tip") as reader:
@@ -191,6 +192,7 @@ def test_error_frames_become_a_reason(vcan: Callable[[], str], kind: int, detail
         assert driver.status()["buses"][0]["errors"] == 2
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("restarted", [True, False])
 def test_bus_off_and_the_way_back(vcan: Callable[[], str], caplog: pytest.LogCaptureFixture, restarted: bool) -> None:
     name = vcan()

@@ -48,6 +48,7 @@ def test_without_a_filter_what_is_foreign_is_counted(vcan: Callable[[], str]) ->
         wait_until(lambda: driver.status()["buses"][0]["unknown"] == before + len(FOREIGN))
 
 
+@pytest.mark.quick
 def test_a_listener_says_nothing_at_all(vcan: Callable[[], str]) -> None:
     """From its start to its end."""
     name = vcan()

@@ -74,6 +74,7 @@ def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
     assert updates >= MINUTE_FRAMES
 
 
+@pytest.mark.quick
 def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], str], tmp_path: Path) -> None:
     bus, log = vcan(), tmp_path / "faults.jsonl"
     options = ("--boards", "7,8", "--pattern", "cycle", "--lose", "0.01", "--log", str(log))
@@ -133,6 +134,7 @@ def test_link_down_and_up_and_interface_deleted_and_made_again(vcan: Callable[[]
                 assert back.generation == frame.generation
 
 
+@pytest.mark.quick
 def test_a_killed_driver_and_its_restart_with_the_reader_kept(vcan: Callable[[], str]) -> None:
     bus = vcan()
     # idle: who is pressed while a board is set up again reads out of range once the press ends
@@ -226,6 +228,7 @@ def without_repetitions(values: Sequence[tuple[int, ...]]) -> list[tuple[int, ..
     return [one for n, one in enumerate(values) if n == 0 or one != values[n - 1]]
 
 
+@pytest.mark.quick
 def test_real_fingertip_data_reaches_a_reader_unchanged(vcan: Callable[[], str]) -> None:
     slices, _ = fingertip_trial()
     assert len(slices) >= 10

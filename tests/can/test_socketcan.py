@@ -38,6 +38,7 @@ def receive(bus: SocketCanBus, batch: FrameBatch, count: int) -> None:
     wait_until(enough)
 
 
+@pytest.mark.quick
 def test_frames_arrive_whole_in_order_and_stamped(vcan: Callable[[], str]) -> None:
     bus = SocketCanBus(vcan())
     bus.open()
@@ -108,6 +109,7 @@ def test_a_layout_of_every_fd_length_is_received(vcan: Callable[[], str], length
     out.close()
 
 
+@pytest.mark.quick
 def test_drops_are_counted_exactly(vcan: Callable[[], str]) -> None:
     bus = SocketCanBus(vcan(), {"buffer": "40000"})
     bus.open()

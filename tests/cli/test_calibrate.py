@@ -118,6 +118,7 @@ def probing(probe: Probe) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.thorough
 def test_a_probe_a_driver_and_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Driver, probe, skin-calibrate touch: interrupted, gone on with, and compared with where the taxels are."""
     file, layout = tmp_path / "skin.toml", tmp_path / "cad.toml"

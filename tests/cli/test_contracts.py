@@ -48,6 +48,7 @@ def test_sigterm_ends_a_driver_in_good_order(namespace: Namespace) -> None:
     assert namespace.services() == []
 
 
+@pytest.mark.thorough
 def test_skin_dump_and_skin_info_keep_their_contracts() -> None:
     untouched = ("--bus", "virtual?boards=7,8&pattern=idle")  # a deep touch is out of range, and not fresh
     with running("skin-driver", *untouched, "--name", "torso", "--slots", "64") as driver:

@@ -97,6 +97,7 @@ def test_mistakes_are_one_line(
     assert file.read_bytes() == before
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("format_name", ["csv", "npz", "lerobot"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, number: int) -> None:
@@ -112,6 +113,7 @@ def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, num
     assert list(tmp_path.iterdir()) == [file]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("format_name", sorted([*FORMATS, *LEARNING_FORMATS]))
 def test_no_room_is_one_line_and_leaves_nothing(file: Path, tmp_path: Path, format_name: str) -> None:
     done = subprocess.run(

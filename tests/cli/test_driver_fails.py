@@ -26,6 +26,7 @@ class MySkin(RoboskinDriver):
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("place", "fault", "words"),
     [

@@ -308,6 +308,7 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
     check("`skin-replay --wire`", *printing(replay, str(wire), "--wire", "--bus", "can+virtual:json"))
 
 
+@pytest.mark.thorough
 def test_bridge(namespace: Namespace) -> None:
     here, port = f"{namespace.name}-here", free_port()
     serving = (
@@ -341,6 +342,7 @@ def test_bridge(namespace: Namespace) -> None:
         shutil.rmtree(Namespace(here).path, ignore_errors=True)
 
 
+@pytest.mark.thorough
 def test_many_robots() -> None:
     at = f"tcp/127.0.0.1:{free_port()}"
     routing = ("skin-bridge", "route", "--listen", at, "--connect", "tcp/127.0.0.1:9")
@@ -430,6 +432,7 @@ def test_press(printing: Print) -> None:
         check("`skin-press`", *printing(press, "0.07", "0.0225", "0"))
 
 
+@pytest.mark.thorough
 def test_a_capture_and_a_proof(tmp_path: Path) -> None:
     with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", f"{tmp_path}/it.mcap") as driver:
         driver.wait_for("ready")

@@ -248,6 +248,7 @@ def test_a_file_that_may_not_grow_ends_the_recording_with_one_line(tmp_path: Pat
         assert sequence.tolist() == list(range(int(sequence[0]), int(sequence[-1]) + 1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sensors", ["few", "many"])
 def test_a_kill_costs_no_frame_that_was_written_and_little_time(tmp_path: Path, sensors: str) -> None:
     structure = fake_structure(*((2, 4) if sensors == "few" else (64, 16)))

@@ -103,6 +103,7 @@ def test_what_cannot_be_read_is_a_problem(namespace: Namespace, capsys: pytest.C
         assert told(capsys, *here) == {"health": [], "problems": []}  # its driver has just changed
 
 
+@pytest.mark.thorough
 def test_a_broken_taxel_of_a_real_driver_is_named(
     namespace: Namespace, calm_namespace: Namespace, tmp_path: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

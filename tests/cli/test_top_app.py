@@ -102,6 +102,7 @@ def test_nobody_runs_then_somebody_does_then_nobody() -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", SIZES)
 def test_it_fits_every_terminal(size: tuple[int, int]) -> None:
     async def scene() -> None:
@@ -155,6 +156,7 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 def test_what_does_not_fit_is_told_of() -> None:
     async def scene() -> None:
         with publishing(FakeSkin("torso", fake_structure(20, 16))):

@@ -60,6 +60,7 @@ def test_systemd_finds_nothing_wrong_with_it(tmp_path: Path) -> None:
         assert (not said) == is_right, done.stderr
 
 
+@pytest.mark.thorough
 def test_what_it_runs_is_a_driver_that_starts_reloads_and_stops(tmp_path: Path) -> None:
     found = settings(printed())
     (command,), (reload,), (never_again,) = found["ExecStart"], found["ExecReload"], found["RestartPreventExitStatus"]

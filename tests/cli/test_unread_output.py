@@ -73,6 +73,7 @@ def started(*command: str, stdout: int, stderr: int | None = None) -> Iterator[s
         process.wait()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("errors_too", [False, True])
 def test_a_driver_whose_output_nobody_reads_publishes_and_ends(namespace: object, errors_too: bool) -> None:
     with unread_pipe() as (_, writing):
@@ -84,6 +85,7 @@ def test_a_driver_whose_output_nobody_reads_publishes_and_ends(namespace: object
                 wait_until(lambda: reader.read().sequence >= begin + 40)  # two seconds: two lines that nobody takes
 
 
+@pytest.mark.thorough
 def test_a_recorder_whose_output_nobody_reads_loses_nothing(namespace: object, tmp_path: Path) -> None:
     file = tmp_path / "long.mcap"
     with unread_pipe() as (_, writing), unread_pipe() as (_, other):

@@ -122,6 +122,7 @@ def compare(board: Path, row: int, way: str, wanted: int) -> None:
         assert reader.statistics.overruns == mine[OVERRUNS]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slots", [2, 3, 8])
 @pytest.mark.parametrize("way", WAYS)
 def test_no_torn_frame_from_a_writer_flat_out(way: str, slots: int, tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def is_whole(snapshot: Snapshot) -> bool:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(6))
 def test_both_ways_see_the_same_whatever_happens(seed: int, skins: dict[str, Skin]) -> None:
     """Drivers publish, fall silent, close, are killed, come back with the same structure or another."""

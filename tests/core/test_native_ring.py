@@ -337,6 +337,7 @@ def test_a_program_chooses_by_its_environment(given: str | None, path: str) -> N
 # -- the protocol under the checkers -------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slots", [2, 3, 8])
 @pytest.mark.parametrize("checked", ["c11", "c11 sanitized", "c11 races"])
 def test_no_frame_is_torn_whatever_is_checked(

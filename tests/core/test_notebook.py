@@ -14,6 +14,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "asyncio.md"
 NOTHING_LEFT = 'assert "skinware wake-ups" not in [t.name for t in __import__("threading").enumerate()]'
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")  # of the packages that run notebooks
 def test_the_page_runs_in_a_kernel(tmp_path: Path) -> None:
     import nbclient

@@ -135,6 +135,7 @@ def test_a_killed_driver_leaves_and_comes_back(namespace: Any) -> None:
     ] == ["+dying", "+living", "-dying", "+dying", "-dying"]
 
 
+@pytest.mark.thorough
 def test_a_replica_is_whole_for_every_thread() -> None:
     """Two drivers publish flat out, one of them changes its structure; four threads look at every element."""
     stop = threading.Event()

@@ -69,6 +69,7 @@ def test_what_is_no_recording_is_one_clear_line(name: str, tmp_path: Path, capsy
         assert name in error
 
 
+@pytest.mark.thorough
 def test_bad_arguments() -> None:
     for arguments in (["--seconds", "soon"], ["--seconds", "-1"], ["no-such.mcap"], ["--namespace", "a/b"]):
         done = run("skin-doctor", *arguments)

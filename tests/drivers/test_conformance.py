@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5UdpDriver
 from skinware_drivers.can.barrett import BarrettDriver
@@ -78,6 +79,7 @@ class TestXela(DriverConformance):
     emulator = EmulatedXela
 
 
+@pytest.mark.thorough
 class TestXela4x6(DriverConformance):
     driver = XelaDriver
     emulator = EmulatedXela
@@ -110,6 +112,7 @@ class TestBarrett(DriverConformance):
     emulator = EmulatedBarrett
 
 
+@pytest.mark.thorough
 class TestBarrettTop10(DriverConformance):
     driver = BarrettDriver
     emulator = EmulatedBarrett
@@ -132,6 +135,7 @@ class TestLinkerHand(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0}
 
 
+@pytest.mark.thorough
 class TestLinkerHandBesideItsProgram(DriverConformance):
     """Two hands of ten by four, whose own program asks."""
 
@@ -141,6 +145,7 @@ class TestLinkerHandBesideItsProgram(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"hands": (0x27, 0x28), "touch": "10x4"}
 
 
+@pytest.mark.thorough
 class TestLinkerHandFingers(DriverConformance):
     driver = LinkerHandDriver
     emulator = EmulatedLinkerHand
@@ -148,6 +153,7 @@ class TestLinkerHandFingers(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "fingers_90"}
 
 
+@pytest.mark.thorough
 class TestLinkerHandWhole(DriverConformance):
     """Matrices in runs of five, those of the palm longer than those of the fingers."""
 
@@ -162,11 +168,13 @@ class TestAllegroV5(DriverConformance):
     emulator = EmulatedAllegroV5
 
 
+@pytest.mark.thorough
 class TestAllegroV5Tips(DriverConformance):
     driver = AllegroV5Driver
     emulator = EmulatedAllegroV5Tips
 
 
+@pytest.mark.thorough
 class TestAllegroV5Udp(DriverConformance):
     driver = AllegroV5UdpDriver
     emulator = EmulatedAllegroV5Udp
@@ -216,6 +224,7 @@ class TestOpenPatch(DriverConformance):
     emulator = EmulatedOpenPatch
 
 
+@pytest.mark.thorough
 class TestFdPatch(DriverConformance):
     """CAN FD and 29-bit identifiers."""
 
@@ -255,6 +264,7 @@ class TestTesollo(DriverConformance):
     emulator = EmulatedTesollo
 
 
+@pytest.mark.thorough
 class TestTesolloShort(DriverConformance):
     """Three of five fingers have sensors of 16 bits; the fingertips are asked for alone."""
 
@@ -272,6 +282,7 @@ class TestXelaServer(DriverConformance):
         return [value / 256 for value in felt]
 
 
+@pytest.mark.thorough
 class TestXelaServerCounts(DriverConformance):
     driver = XelaServerDriver
     emulator = EmulatedXelaServer
@@ -284,6 +295,7 @@ class TestYarp(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"length": 41, "envelope": False}
 
 
+@pytest.mark.thorough
 class TestYarpOfARobotsFiles(DriverConformance):
     driver = YarpDriver
     emulator = EmulatedYarp
@@ -299,6 +311,7 @@ class TestIcubEth(DriverConformance):
     emulator = EmulatedIcubEth
 
 
+@pytest.mark.thorough
 class TestIcubEthSecondPort(DriverConformance):
     driver = IcubEthDriver
     emulator = EmulatedIcubEth
@@ -324,6 +337,7 @@ class TestFlexiTac(DriverConformance):
     emulator = EmulatedFlexiTac
 
 
+@pytest.mark.thorough
 class TestFlexiTacText(DriverConformance):
     """The older firmware, in its own size."""
 
@@ -361,6 +375,7 @@ class TestPaxiniConverter(DriverConformance):
         return with_resultant(felt)
 
 
+@pytest.mark.thorough
 class TestPaxiniHighSpeed(DriverConformance):
     """Modules of different size on two fingers and the palm, streamed together."""
 
@@ -388,6 +403,7 @@ class TestDfrobot(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"units": (1, 31)}
 
 
+@pytest.mark.thorough
 class TestDfrobot4x8(DriverConformance):
     """Whose shape is not asked, and whose cells are read alone."""
 
@@ -410,6 +426,7 @@ class EmulatedPressureRevo2(EmulatedRevo2):
     full_scale = 0xFFFF
 
 
+@pytest.mark.thorough
 class TestRevo2Pressure(DriverConformance):
     driver = Revo2Driver
     emulator = EmulatedPressureRevo2
@@ -420,18 +437,21 @@ class EmulatedForce3dRevo2(EmulatedRevo2):
     full_scale = 127
 
 
+@pytest.mark.thorough
 class TestRevo2Force3d(DriverConformance):
     driver = Revo2Driver
     emulator = EmulatedForce3dRevo2
     emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "force3d"}
 
 
+@pytest.mark.thorough
 class TestRevo2ArrayPressure(DriverConformance):
     driver = Revo2Driver
     emulator = EmulatedPressureRevo2
     emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "array_pressure"}
 
 
+@pytest.mark.thorough
 class TestRevo2ThatIsSwitchedOn(TestRevo2):
     driver_options: ClassVar[Mapping[str, Any]] = {"enable": True}
     emulator_options: ClassVar[Mapping[str, Any]] = {"enabled": False}
@@ -442,12 +462,14 @@ class TestRevo3(DriverConformance):
     emulator = EmulatedRevo3
 
 
+@pytest.mark.thorough
 class TestRevo3Sums(DriverConformance):
     driver = Revo3Driver
     emulator = EmulatedRevo3
     emulator_options: ClassVar[Mapping[str, Any]] = {"sums": True, "side": "left"}
 
 
+@pytest.mark.thorough
 class TestRevo3Matrix(DriverConformance):
     driver = Revo3Driver
     emulator = EmulatedRevo3
@@ -459,6 +481,7 @@ class EmulatedPackedRevo3(EmulatedRevo3):
     full_scale = 0xFF
 
 
+@pytest.mark.thorough
 class TestRevo3Packed(DriverConformance):
     driver = Revo3Driver
     emulator = EmulatedPackedRevo3

@@ -201,6 +201,7 @@ def listened(emulated: dict[str, Any]) -> list[Patch]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("touch", TOUCH)
 def test_what_a_hand_has_is_heard(touch: str) -> None:
     patches = listened({"touch": touch, "hands": (0x28,), "program_ms": 100})
@@ -231,6 +232,7 @@ def test_a_period_that_is_given_is_not_learnt() -> None:
     play(scenario())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("touch", "palm"), [("hand_12x6", "14x16"), ("hand_23x9", "28x20"), ("12x6", "12x6")])
 def test_a_palm_is_heard(touch: str, palm: str) -> None:
     (hand,) = listened({"touch": touch, "palm": True, "program_ms": 100})

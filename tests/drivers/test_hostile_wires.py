@@ -102,12 +102,14 @@ def test_every_driver_has_its_case() -> None:
     assert sorted({*CASES, *CAN_CASES}) == sorted(registered(DRIVERS))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driver", sorted(CASES))
 def test_bad_devices(driver: str, tmp_path: Path) -> None:
     case = CASES[driver]
     _meet(driver, case, case.place(tmp_path), _FLOOD_BYTES)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driver", sorted(CAN_CASES))
 def test_bad_devices_on_can_over_multicast(driver: str) -> None:
     name = f"udp_multicast:239.74.163.2?port={free_port(socket.SOCK_DGRAM)}"

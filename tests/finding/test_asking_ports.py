@@ -52,6 +52,7 @@ def test_these_drivers_ask() -> None:
     assert {name for name, driver in known_drivers("serial").items() if can_ask(driver)} >= set(DEVICES)
 
 
+@pytest.mark.thorough
 def test_each_device_answers_its_driver_and_no_other() -> None:
     drivers = known_drivers("serial", DEVICES)
 

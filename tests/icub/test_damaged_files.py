@@ -125,6 +125,7 @@ def test_other_trees(a: str, b: str) -> None:
     check({"skin.xml": f"<devices>{skin}{b}</devices>".encode(), "a.xml": a.encode(), "b.xml": b.encode()})
 
 
+@pytest.mark.thorough
 @settings(max_examples=100, deadline=None)
 @given(
     changes=st.lists(
@@ -174,6 +175,7 @@ def variants(data: bytes, chance: random.Random, count: int) -> Iterator[bytes]:
         yield b"\n".join(lines)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_damaged_real_files(robots: Path, geometry: Path, seed: int) -> None:
     chance = random.Random(seed)

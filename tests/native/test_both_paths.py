@@ -64,6 +64,7 @@ def playing(
         event(f"{min(pair.frames, 10)} frames or more")
 
 
+@pytest.mark.thorough
 @examples(150)
 @given(design=skins(), publishing=publishings, script=scripts, watch=st.sampled_from([Marking, MarkingAll]))
 def test_whatever_comes(
@@ -73,6 +74,7 @@ def test_whatever_comes(
         player.play(script)
 
 
+@pytest.mark.thorough
 @examples(100)
 @given(
     design=plain_skins(),
@@ -107,6 +109,7 @@ def test_cycles(
         player.play_senders(senders, cuts, is_watched=True)
 
 
+@pytest.mark.thorough
 @examples(100)
 @given(design=skins_of_frames())
 def test_values_and_flags(clock: HandClock, design: SkinDesign) -> None:

@@ -47,6 +47,7 @@ def run(library: Path, *arguments: str, **more: str) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, timeout=280)
 
 
+@pytest.mark.thorough
 def test_what_lies_beside_the_buffers_is_found(library: Path, namespace: Namespace) -> None:
     """Else the other tests here would prove nothing."""
     done = run(library, "-c", BESIDE)
@@ -57,6 +58,7 @@ def test_what_lies_beside_the_buffers_is_found(library: Path, namespace: Namespa
     assert "AddressSanitizer: heap-buffer-overflow" in done.stderr
 
 
+@pytest.mark.thorough
 def test_both_paths(library: Path) -> None:
     """The tests of both paths, fewer of each."""
     tests = str(Path(__file__).with_name("test_both_paths.py"))
@@ -66,6 +68,7 @@ def test_both_paths(library: Path) -> None:
     assert re.search(r"^6 passed", done.stdout, re.MULTILINE)
 
 
+@pytest.mark.thorough
 def test_bytes_at_random() -> None:
     """A little of what ``tools/test fuzz`` does for longer."""
     command = [sys.executable, "tools/fuzzing/data_path.py", "--seconds", "5", "--seed", "1"]

@@ -40,6 +40,7 @@ def build(source: Path, *options: str, environ: Mapping[str, str] | None = None)
     return run_in(source, "setup.py", "build_ext", "--build-lib", "built", *options, environ=environ)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiler")
 def test_a_wheel_has_the_libraries_and_serves_every_python(tmp_path_factory: pytest.TempPathFactory) -> None:
     wheel = built_wheel(tmp_path_factory)
@@ -58,6 +59,7 @@ def test_without_a_compiler_one_line_says_so(source: Path, tmp_path: Path, reaso
     assert not libraries_in(source / "built")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiler")
 def test_what_an_earlier_build_left_is_not_taken_for_the_new_one(source: Path) -> None:
     assert "did not compile" not in build(source)
@@ -66,6 +68,7 @@ def test_what_an_earlier_build_left_is_not_taken_for_the_new_one(source: Path) -
     assert not libraries_in(source / "built")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiler")
 def test_a_build_beside_the_sources_changes_no_library_that_is_in_use(source: Path) -> None:
     build(source, "--inplace")
@@ -88,6 +91,7 @@ def test_the_source_distribution_has_what_is_compiled(source: Path) -> None:
     assert there >= SOURCES | {"setup.py", "pyproject.toml"}
 
 
+@pytest.mark.thorough
 def test_an_installation_without_a_compiler_runs(source: Path, tmp_path: Path) -> None:
     wheel = make_wheel(source, tmp_path, NO_COMPILER)
     stranger = Stranger(tmp_path / "stranger", wheel, tmp_path / "mypy_cache")

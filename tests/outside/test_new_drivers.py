@@ -46,6 +46,7 @@ MODBUS = "modbus:tcp://127.0.0.1:{free}", "modbus:tcp://127.0.0.1:{free}"
 TCP = "tcp://127.0.0.1:{free}", "tcp://127.0.0.1:{free}"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("transport", "sensors", "ends"),
     [("can", 12, None), ("serial", 24, PORT), ("modbus", 24, MODBUS), ("tcp", 24, TCP), ("virtual", 100, None)],
@@ -73,6 +74,7 @@ def test_a_new_driver_passes_its_tests_and_runs_at_once(
         assert len(frame_of(stranger, name)["values"]) == sensors
 
 
+@pytest.mark.thorough
 def test_the_example_is_a_driver_like_any_other(stranger: Stranger, tmp_path: Path) -> None:
     package = tmp_path / "optoforce"
     leave = shutil.ignore_patterns("*.egg-info", "__pycache__", ".*_cache")

@@ -13,6 +13,7 @@ from tests.wheel import ROOT
 PAGES = ["docs/tutorials/first-can-driver.md", "docs/tutorials/first-serial-driver.md"]
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("page", PAGES)
 def test_a_tutorial_leads_to_what_it_promises(stranger: Stranger, page: str, tmp_path: Path) -> None:

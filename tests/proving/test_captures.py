@@ -164,6 +164,7 @@ def test_what_cannot_be_compared(capture: Path, tmp_path: Path, mistaken: Path) 
     assert (alone.returncode, "--save is for --captured" in alone.stderr) == (2, True)
 
 
+@pytest.mark.thorough
 def test_a_folder_of_captures_is_a_test_for_each(capture: Path, tmp_path: Path) -> None:
     folder = tmp_path / "captures"
     folder.mkdir()

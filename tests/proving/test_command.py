@@ -100,6 +100,7 @@ def is_there(pid: int) -> bool:
     return False
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("interrupted", "number"),
     [
@@ -197,6 +198,7 @@ def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Pa
         assert recording.is_whole
 
 
+@pytest.mark.thorough
 def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(tmp_path: Path) -> None:
     """What was seen until then is shown, whatever became of the files."""
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:

@@ -48,6 +48,7 @@ def received(path: Path) -> list[WireItem]:
         return [item for wire in recording.wires for item in wire.items() if not item.is_sent]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_capture_is_whole_and_begins_with_the_first_question(tmp_path: Path, number: signal.Signals) -> None:
     path = tmp_path / "hand.mcap"
@@ -114,6 +115,7 @@ def test_a_bus_on_which_nothing_comes_is_in_the_capture_too(tmp_path: Path) -> N
         assert recording.about("xela")["listen_only"] is True
 
 
+@pytest.mark.thorough
 def test_a_capture_of_modbus_is_decoded_again_with_its_options_and_without_its_host(tmp_path: Path) -> None:
     path, name = tmp_path / "hand.mcap", f"modbus:tcp://{LOCAL}:{free_port()}"
     with running("skin-emulate", "--driver", ARRAY, "--bus", name) as devices:
@@ -146,6 +148,7 @@ def readable(path: Path) -> bytes:
     return b"".join([*texts, *channels])
 
 
+@pytest.mark.thorough
 def test_driver_and_options_come_from_the_file_unless_they_are_given(tmp_path: Path) -> None:
     path = tmp_path / "hand.mcap"
     options = ("--driver", "xela", "--rows", "2", "--bus", "virtual")

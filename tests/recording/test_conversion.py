@@ -384,6 +384,7 @@ def newer_parquet(folder: Path) -> None:
     told.write_bytes(_newer(told.read_bytes()))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("format_name", "make_newer"), [("npz", newer_npz), ("hdf5", newer_hdf5), ("parquet", newer_parquet)]
 )
@@ -450,6 +451,7 @@ def test_what_is_no_recording_is_one_line(tmp_path: Path, contents: bytes, words
         convert(tmp_path / "mine.h5", None, "mcap")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("format_name", [*BOTH_WAYS, "csv"])
 def test_memory_does_not_grow_with_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_name: str

@@ -214,6 +214,7 @@ def test_reading_whole_columns_is_bounded_by_the_size_of_the_file(path: Path, mo
         assert len(opened["big"].read([])) == 3
 
 
+@pytest.mark.thorough
 def test_forged_contents_are_an_error_of_ours(tmp_path: Path, made: dict[str, bytes]) -> None:
     original, forged = tmp_path / "original.mcap", tmp_path / "forged.mcap"
     if not made:

@@ -206,6 +206,7 @@ def differences(one: Any, other: Any, where: str) -> Iterator[str]:
         yield f"{where}: {one!r} in life, {other!r} in the replay"
 
 
+@pytest.mark.thorough
 def test_programs_cannot_tell_a_replay_from_life(
     tmp_path: Path, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

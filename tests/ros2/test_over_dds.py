@@ -120,6 +120,7 @@ def test_a_service_tares(namespace: Namespace, domain: int) -> None:
             wait_until(lambda: bool((reader.read().values == 2).all()))
 
 
+@pytest.mark.thorough
 def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: Namespace, domain: int) -> None:
     """Of a topic whose messages fill what is kept for a reader that acknowledges nothing."""
     skin = FakeSkin("arm", placed(fake_structure(20, 64)))

@@ -310,6 +310,7 @@ def test_what_cannot_be_is_refused(graph: Graph) -> None:
         graph.skin.service("/skin/*", TRIGGER, lambda request: request)
 
 
+@pytest.mark.thorough
 def test_a_router_that_comes_late_goes_and_comes_back(sessions_end: None) -> None:
     """The node publishes all the time and is not told of any of it; people are, once each time."""
     told: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
@@ -339,6 +340,7 @@ def next_of(told: queue.SimpleQueue[tuple[bool, str]]) -> tuple[bool, str]:
     return is_there, line.partition(": ")[0] + ": "
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_subscriber_that_dies_or_hangs_costs_others_nothing(graph: Graph, how: signal.Signals) -> None:
     """Messages are large: what one subscriber does not take fills its queue within a few of them."""

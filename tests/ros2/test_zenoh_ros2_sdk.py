@@ -148,6 +148,7 @@ def check_tare(sdk: SdkPeer, tared: list[bool]) -> None:
     assert tared
 
 
+@pytest.mark.thorough
 def test_the_sdk_lists_topics_decodes_them_and_tares(tmp_path: Path, texts: dict[str, str]) -> None:
     tared: list[bool] = []
     with router() as at, driver(tared), bridge(at, "--tare") as ros2, sdk_peer(at.port, tmp_path, texts) as sdk:

@@ -118,6 +118,7 @@ def check_bursts(
             desk.close()
 
 
+@pytest.mark.thorough
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(clocks=st.tuples(*[senders(40)] * 3), cuts=batches)
 def test_a_frame_holds_whole_bursts_of_drifting_boards(

@@ -6,6 +6,8 @@ import os
 import signal
 import time
 
+import pytest
+
 from skinware import DriverReader
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import Running, running
@@ -20,6 +22,7 @@ def recalibrations(boards: Running) -> int:
     return int(boards.wait_for("status")["recalibrations"])
 
 
+@pytest.mark.thorough
 def test_boards_are_not_set_up_again_because_the_driver_was_stopped() -> None:
     with (
         running("skin-emulate", "--driver", "roboskin", "--bus", BUS, "--boards", "7,8") as boards,

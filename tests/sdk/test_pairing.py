@@ -205,6 +205,7 @@ def test_cycles_are_those_that_an_oracle_finds_wherever_batches_end(data: st.Dat
     assert counters["updates"] == len(joined)
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_with_a_counter_halves_of_different_cycles_are_never_joined(data: st.DataObject) -> None:

@@ -173,6 +173,7 @@ wire_frames = st.tuples(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=200, deadline=None)
 @given(frames=st.lists(wire_frames, max_size=60), cuts=st.lists(st.integers(0, 60), max_size=6))
 def test_how_frames_are_cut_into_batches_changes_nothing(

@@ -61,6 +61,7 @@ FOREIGN = [(0x7F1, b"")]
 ONE_TRIANGLE = [(0x473, b"\x40" + bytes(7)), (0x473, b"\xc0" + bytes(7))]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("hurry")
 @pytest.mark.parametrize("frames", [FOREIGN, ONE_TRIANGLE])
 def test_a_flood_on_one_bus_holds_up_no_other(

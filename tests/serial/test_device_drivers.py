@@ -65,6 +65,7 @@ def plugged_in(link: Path, emulator: Any, options: dict[str, Any]) -> Iterator[N
             link.unlink()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "emulator", "first", "second", "sensors"), DEVICES)
 def test_it_is_unplugged_and_comes_back_as_another(
     kind: type[SerialAdapter[Any]],

@@ -9,6 +9,8 @@ import random
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from tests.serial.framings import EXAMPLES, ONLY_IN_PYTHON
 from tests.serial.fuzzing import changed, examples_of_drivers, known_examples, run
 
@@ -28,6 +30,7 @@ def test_every_framing_has_seeds() -> None:
     assert {*EXAMPLES, *ONLY_IN_PYTHON} | ours & set(examples_of_drivers()) == set(NAMES)
 
 
+@pytest.mark.thorough
 def test_seeds_and_what_comes_of_them() -> None:
     known = known_examples()
     for name in NAMES:

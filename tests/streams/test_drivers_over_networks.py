@@ -58,6 +58,7 @@ def test_the_commands_take_such_buses(namespace: object) -> None:
             driver.wait_for("status", lambda event: event["buses"][0]["state"] == "live")
 
 
+@pytest.mark.thorough
 def test_a_driver_of_can_takes_the_datagrams_of_its_hand(namespace: object) -> None:
     port = free_port(socket.SOCK_DGRAM)
     with running("skin-driver", "--driver", "allegro_v5", "--bus", f"udp://:{port}", "--side", "left") as driver:
@@ -66,6 +67,7 @@ def test_a_driver_of_can_takes_the_datagrams_of_its_hand(namespace: object) -> N
             assert status["buses"][0]["bad_content"] == status["buses"][0]["bad_length"] == 0
 
 
+@pytest.mark.thorough
 def test_what_is_no_bus_of_this_kind_is_said_to_be_none(namespace: object) -> None:
     refused = run("skin-driver", "--driver", "roboskin", "--bus", f"tcp://{LOCAL}:9")
     assert refused.returncode == 2

@@ -44,6 +44,7 @@ def fails(marks: Marks, drift: str) -> set[str]:
     return {name for name, is_reached in reached.items() if not is_reached}
 
 
+@pytest.mark.thorough
 def test_baselines_hold_in_every_world_where_the_rules_of_others_do_not() -> None:
     worlds = Worlds(20, SEEDS)
     found = judge({"ours": Ours(worlds), **peers(20)}, worlds, END_S)
@@ -59,6 +60,7 @@ def test_baselines_hold_in_every_world_where_the_rules_of_others_do_not() -> Non
         assert {"hold_on", "slow"} <= fails(found["QTouch", drift], drift)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("rate_hz", "count"), [(50, 5), (100, 2)])
 def test_the_rate_makes_no_difference(rate_hz: float, count: int) -> None:
     """The same at other rates, up to the end of the long hold and 30 s more; ``tools/bench tactile`` has all of it."""

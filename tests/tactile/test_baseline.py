@@ -166,6 +166,7 @@ def test_a_glitch_does_not_end_a_light_touch() -> None:
     assert np.mean(seen) > 0.99
 
 
+@pytest.mark.thorough
 def test_a_light_touch_stays_for_as_long_as_it_lasts() -> None:
     bench = Bench()
     bench.run(6)
@@ -231,6 +232,7 @@ def test_hold_keeps_baselines_where_they_are_but_for_common_drift() -> None:
     assert abs(calm.baseline[3] - 17.5) < 0.5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", ["nan", "stale", "huge"])
 def test_a_patch_without_data_touches_nobody_else(what: str) -> None:
     """Not by one bit, and its own state is kept."""
@@ -355,6 +357,7 @@ def test_a_second_contact_in_the_module_outlives_the_first() -> None:
     assert all(seen)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("held_s", "grip", "eased"), [(60, 50, 8), (60, 150, 8), (240, 100, 15)])
 def test_an_eased_grip_stays_felt(held_s: int, grip: float, eased: float) -> None:
     bench = Bench()
@@ -412,6 +415,7 @@ def test_a_drivers_frames_with_their_status() -> None:
     assert not calm.touched[30:40].any(), "a jump that the hardware tells of"
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(st.data())
 def test_whatever_comes_nothing_is_raised_and_nothing_is_said_of_the_unknown(data: st.DataObject) -> None:

@@ -26,6 +26,7 @@ def with_hand(given: Presses, seed: int) -> Presses:
     return Presses(given.n, pose, given.press, given.taxel, given.load)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrong", [0.0, 0.1])
 def test_tip_and_modules_are_found(wrong: float) -> None:
     surface = arm((0, 1))

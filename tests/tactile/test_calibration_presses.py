@@ -154,6 +154,7 @@ def test_confidence_is_what_it_says() -> None:
             assert abs(confidence_of(placement.error_m[known], PITCH_M) - within) < 0.12
 
 
+@pytest.mark.thorough
 @with_data
 @pytest.mark.parametrize("name", PARTS)
 @pytest.mark.parametrize("seed", range(2))

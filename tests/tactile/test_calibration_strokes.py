@@ -38,6 +38,7 @@ def flat() -> tuple[Surface, StrokeSums]:
     return surface, stroked(surface, 1, 2.0)
 
 
+@pytest.mark.thorough
 @with_data
 @pytest.mark.parametrize("name", PARTS)
 def test_the_parts_of_an_icub(name: str) -> None:
@@ -51,6 +52,7 @@ def test_the_parts_of_an_icub(name: str) -> None:
     assert marks.geodesic <= 0.07
 
 
+@pytest.mark.thorough
 def test_a_flat_skin_comes_out_as_it_is() -> None:
     surface, sums = flat()
     topology = topology_of(sums)
@@ -62,6 +64,7 @@ def test_a_flat_skin_comes_out_as_it_is() -> None:
     assert off_m.mean() < 0.003
 
 
+@pytest.mark.thorough
 def test_pieces_that_are_apart_are_apart() -> None:
     surface = arm((3,))  # palm and back of a hand
     topology = topology_of(stroked(surface, 2, 2.0))

@@ -123,6 +123,7 @@ def test_operations_and_what_they_refuse() -> None:
         assert skin.writer.sequence
 
 
+@pytest.mark.thorough
 def test_it_survives_the_driver_and_tells_that_it_is_gone(namespace: Namespace) -> None:
     with calming_process() as calm:
         with fake_process("fake", "--rate", "50") as process:

@@ -35,6 +35,7 @@ def fingers(random: np.random.Generator) -> list[Wander]:
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_a_skin_that_is_touched_from_the_start_begins_and_shows_every_finger(seed: int) -> None:
     world = World(arm(BOARDS), seed=seed, rate_hz=20, sensitivity=24)

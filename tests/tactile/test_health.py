@@ -119,6 +119,7 @@ def test_the_evidence_says_why(faulty: tuple[npt.NDArray[np.int64], HealthReport
     assert report.evidence(np.flatnonzero(~report.faulty)[0]) == ""
 
 
+@pytest.mark.thorough
 def test_healthy_skins_have_no_faults_in_25_minutes() -> None:
     """20 bench worlds of each drift, with a hold of 10 minutes, covers, sags and strokes."""
     worlds = Worlds(5, 20)
@@ -139,6 +140,7 @@ def test_healthy_skins_have_no_faults_in_25_minutes() -> None:
     assert not of_module[:, 6].any(), "strokes went over all of it"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("how", [{"gain_spread": 0.3, "drift_per_min": 3.0}, {"noise": 0.05}], ids=["uneven", "quiet"])
 def test_healthy_plates_have_no_faults(how: dict[str, float]) -> None:
     report = judged(plates(2, **how), QUICK)
@@ -146,6 +148,7 @@ def test_healthy_plates_have_no_faults(how: dict[str, float]) -> None:
     assert np.isfinite(report.shown).mean() > 0.8, "most of them could be judged"
 
 
+@pytest.mark.thorough
 def test_what_nobody_can_tell() -> None:
     """A dead taxel at a corner lies between no others: it may be that nobody touches it. Exchanged taxels look dead."""
     world = plates(3)
@@ -220,6 +223,7 @@ def test_what_is_known_goes_with_the_taxels() -> None:
             other.restore(wrong, rows)
 
 
+@pytest.mark.thorough
 def test_what_was_mended_is_good_again() -> None:
     world = plates(4)
     middle = 3 * SIDE + 3

@@ -119,6 +119,7 @@ def identities(fingers: list[Lane]) -> Iterator[tuple[int, int, int]]:
             yield finger, frame, identity_at(found, place)
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(lanes(fastest_m_s=0.6))
 def test_contacts_3_pitches_apart_are_never_swapped(fingers: list[Lane]) -> None:
@@ -131,6 +132,7 @@ def test_contacts_3_pitches_apart_are_never_swapped(fingers: list[Lane]) -> None
         newest[finger] = frame, identity
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(lanes(fastest_m_s=0.25))
 def test_they_keep_their_identities_through_gaps_too(fingers: list[Lane]) -> None:

@@ -107,6 +107,7 @@ def test_devices_are_brought_to_a_can_interface(
     assert len(frame.values) == 12
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fixture", ["vcan", "can_pair"])
 @pytest.mark.skipif(os.path.exists("/sys/module/can"), reason="this kernel has CAN")
 def test_without_can_tests_are_skipped_and_say_how_to_get_it(fixture: str, tmp_path: Path) -> None:

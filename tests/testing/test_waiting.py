@@ -38,6 +38,7 @@ def test_how_many_frames_is_no_longer_asked() -> None:
             read_until(reader, lambda frame: True, frames=5)
 
 
+@pytest.mark.thorough
 def test_values_are_tested_first_and_silence_last() -> None:
     """So that with ``pytest -x`` the byte order is told, and not a silence that comes of it."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", test_cells.__file__]

@@ -136,6 +136,7 @@ def test_only_this_machine_is_loopback() -> None:
     assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.2", "robot", "")))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "request_bytes",
     [

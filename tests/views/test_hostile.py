@@ -95,6 +95,7 @@ def test_a_huge_message_ends_only_its_sender(serving: Serve) -> None:
         page.pull_picture()
 
 
+@pytest.mark.thorough
 def test_who_never_reads_holds_up_nobody(serving: Serve) -> None:
     """It asks for thousands of turns and takes none."""
     with publishing(FakeSkin("torso", fake_structure(8, 32))) as skin, serving() as url, page_of(url) as page:

@@ -263,6 +263,7 @@ class Chaos:
 
 
 @pytest.mark.alone
+@pytest.mark.thorough
 def test_killed_drivers_readers_and_requesters(
     tmp_path: Path, namespace: Namespace, request: pytest.FixtureRequest
 ) -> None:

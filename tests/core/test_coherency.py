@@ -241,6 +241,7 @@ def sleep_in_the_loop(board: Path, row: int, way: str) -> None:
 
 
 @pytest.mark.alone
+@pytest.mark.thorough
 def test_readers_that_sleep_half_a_second_cost_a_100_hz_writer_nothing(tmp_path: Path) -> None:
     """Beside it runs the same writer with no reader: what the machine does to one, it does to the other."""
     board = Board(tmp_path / "board", 7)

@@ -24,8 +24,7 @@ from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
 from skinware.structure import Structure
 from skinware.transfer.codec import Encoder
-from skinware.transfer.frames import RecordedSample, frame_of
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
 
 class TimedFrame(NamedTuple):

@@ -30,10 +30,9 @@ from skinware.conversion.learning import (
     interval_of,
     join_of,
     read_intervals,
-    statistics,
 )
+from skinware.conversion.learning.features import Moments, Statistics
 from skinware.conversion.learning.joined import Joined, matched
-from skinware.conversion.learning.statistics import Moments, Statistics
 from skinware.conversion.mcap_files import write_recording
 from skinware.conversion.tables import Table
 from skinware.errors import BadRecording, ConfigurationError
@@ -611,11 +610,11 @@ def test_many_files_and_batches_are_the_same_set(made: Made, tmp_path: Path, mon
 def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: int, seed: int) -> None:
     generator, total = np.random.default_rng(seed), sum(lengths)
     rows = (generator.normal(1e4, 3, (total, 2, 3))).astype(np.float32)
-    least, statistics._LEAST_ROWS = statistics._LEAST_ROWS, 1
+    least, features._LEAST_ROWS = features._LEAST_ROWS, 1
     try:
         each = Statistics((2, 3), np.float32, total, kept * 24)
     finally:
-        statistics._LEAST_ROWS = least
+        features._LEAST_ROWS = least
     for part in np.split(rows, np.cumsum(lengths)[:-1]):
         each.add(part, Moments.of(part))
     told, exact = each.told(), rows.astype(np.float64)

@@ -22,8 +22,7 @@ from skinware.conversion import Selection, convert, ros_messages
 from skinware.conversion.showing import RATE_HZ, Viewers
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.recording.files import Files
-from skinware.recording.recovery import recover
+from skinware.recording.files import Files, recover
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.made import START_NS, MadeTable, made_recording

@@ -628,7 +628,7 @@ def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: in
 
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "_BATCH_BYTES", 1 << 16)
-    monkeypatch.setattr(statistics, "_SAMPLE_ROWS", 40)
+    monkeypatch.setattr(features, "_SAMPLE_ROWS", 40)
     peaks = []
     for n in (200, 1000):
         made = write(tmp_path / f"{n}.mcap", table_of("torso", fake_structure(2, 8), range(n)))

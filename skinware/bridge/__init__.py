@@ -9,8 +9,7 @@ from skinware.errors import MissingExtra
 if find_spec("zenoh") is None:
     raise MissingExtra("bridges need packages that are not installed: pip install 'skinware[zenoh]'")
 
-from skinware.bridge.access import Rules
-from skinware.bridge.endpoints import DEFAULT_LISTEN, DEFAULT_ROUTER, Endpoints, endpoints
+from skinware.bridge.endpoints import DEFAULT_LISTEN, DEFAULT_ROUTER, Endpoints, Rules, endpoints
 from skinware.bridge.joining import Joiner
 from skinware.bridge.link import Link
 from skinware.bridge.messages import Wish

@@ -27,8 +27,7 @@ from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
-from skinware.transfer.frames import RecordedSample, frame_of
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
 Slot = npt.NDArray[np.uint8]
 _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0

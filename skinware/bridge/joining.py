@@ -13,8 +13,7 @@ from skinware.bridge.following import Follower, Traffic
 from skinware.bridge.link import Link, Priority
 from skinware.bridge.messages import Answered, Keys, Service, Services, Wish, read_text
 from skinware.bridge.mirror import Mirror
-from skinware.bridge.peer import ANSWER_S, Peer
-from skinware.bridge.turns import Turns
+from skinware.bridge.peer import ANSWER_S, Peer, Turns
 from skinware.bridge_state import BridgeState, BridgeStateWriter, ServiceState
 from skinware.errors import BridgeError, SkinwareError
 from skinware.memory.namespace import Namespace

@@ -12,8 +12,7 @@ from skinware.bridge.messages import Answered
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
-from skinware.transfer.frames import RecordedSample
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedSample
 from skinware.transfer.republishing import Published, Republisher
 
 Position = tuple[int, int]

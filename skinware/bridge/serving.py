@@ -14,9 +14,9 @@ from typing import Any
 import msgspec
 
 from skinware.bridge.calling import Calls
-from skinware.bridge.giving import Stream
-from skinware.bridge.guarding import Guard
-from skinware.bridge.link import Link, Question
+from skinware.bridge.clock import answering
+from skinware.bridge.giving import Stream, Summaries, Summarised
+from skinware.bridge.link import Guard, Link, Question
 from skinware.bridge.messages import (
     About,
     Head,
@@ -31,8 +31,6 @@ from skinware.bridge.messages import (
     read_text,
 )
 from skinware.bridge.parts import Parts
-from skinware.bridge.pinging import answering
-from skinware.bridge.summaries import Summaries, Summarised
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.limits import LIMITS
 from skinware.memory import segments

@@ -8,9 +8,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from skinware.bridge.clock import Exchange, PeerClock
-from skinware.bridge.guarding import Guard
-from skinware.bridge.link import Link
+from skinware.bridge.clock import Exchange, PeerClock, Pinger
+from skinware.bridge.link import Guard, Link
 from skinware.bridge.messages import (
     ALL_SUMMARIES,
     ALL_TOKENS,
@@ -21,7 +20,6 @@ from skinware.bridge.messages import (
     read_text,
     token_parts,
 )
-from skinware.bridge.pinging import Pinger
 from skinware.errors import BridgeError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns

@@ -174,7 +174,7 @@ class _Listed:
         self.why = ""
 
     def tell(self) -> None:
-        from skinware.bridge.diagnosis import why_unreachable
+        from skinware.bridge.endpoints import why_unreachable
 
         self._seconds += 1
         robots = self._watcher.robots()

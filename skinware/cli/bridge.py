@@ -183,7 +183,7 @@ def join(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.bridge import Joiner, Link, endpoints
-    from skinware.bridge.diagnosis import why_unreachable
+    from skinware.bridge.endpoints import why_unreachable
     from skinware.bridge.messages import Keys
     from skinware.memory.namespace import Namespace
 

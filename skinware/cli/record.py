@@ -122,7 +122,7 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.conversion.viewers import Viewers
+    from skinware.conversion.showing import Viewers
     from skinware.memory.namespace import Namespace, check_name
     from skinware.recording.recorder import Recorder
 

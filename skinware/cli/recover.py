@@ -34,7 +34,7 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
     All that is undamaged is written into a new file, which other tools then read too; FILE is only read. Skinware's own
     reader reads such files without this.
     """
-    from skinware.recording.recovery import recover
+    from skinware.recording.files import recover
 
     target = output or file.with_name(f"{file.stem}.recovered.mcap")
     recovered = recover(file, target)

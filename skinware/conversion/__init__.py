@@ -6,8 +6,7 @@ time; each format writes what a source gives. So whatever can be read can be wri
 
 from __future__ import annotations
 
-from skinware.conversion.converting import FORMATS, Converted, convert
+from skinware.conversion.converting import FORMATS, WIRE_FORMATS, Converted, convert, convert_wires
 from skinware.conversion.selection import Selection
-from skinware.conversion.wires import WIRE_FORMATS, convert_wires
 
 __all__ = ["FORMATS", "WIRE_FORMATS", "Converted", "Selection", "convert", "convert_wires"]

@@ -1,4 +1,4 @@
-"""Conversions: a file into another, which is there only when it is complete."""
+"""Convert a recording: write it in another format under a name that appears when all is written."""
 
 from __future__ import annotations
 
@@ -10,21 +10,16 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from skinware.conversion.csv_text import csv_without, write_csv
-from skinware.conversion.hdf5 import Hdf5Source, write_hdf5
-from skinware.conversion.npz import NpzSource, write_npz
-from skinware.conversion.parquet import DESCRIPTION, ParquetSource, write_parquet
-from skinware.conversion.recorded import RecordedSource
+from skinware.conversion.arrays import write_hdf5, write_npz
+from skinware.conversion.mcap_files import ros2_without, viewers_without, write_foxglove, write_recording, write_ros2
+from skinware.conversion.rows import csv_without, write_csv, write_parquet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import TIME, Block, DerivedSource, Source, Table
-from skinware.conversion.to_recording import write_recording
-from skinware.conversion.to_viewers import ros2_without, viewers_without, write_foxglove, write_ros2
+from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Source, Table
 from skinware.errors import BadRecording, ConfigurationError
-
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_ZIP_MAGIC = b"PK"
+from skinware.recording import Recording
+from skinware.recording.wire import Chosen, Exported, export_candump, export_pcapng
 
 
 class Format(NamedTuple):
@@ -79,10 +74,10 @@ def convert(
     end_s: float | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Converted:
-    """Write what is in a recording, or in a file that was made of one, in another format.
+    """Write a recording in another format.
 
     Args:
-        path: a recording, or an NPZ or HDF5 file or Parquet folder that this function wrote; it is only read.
+        path: a recording; it is only read.
         target: the new file or folder, at which nothing may be; None: beside the old one, with the format's suffix.
         format_name: one of :data:`FORMATS`.
         selection: what of it; None: all.
@@ -98,7 +93,7 @@ def convert(
     """
     form = FORMATS[format_name]
     target = new_target(path, target, form.suffix)
-    with contextlib.closing(opened(path, start_s, end_s)) as whole:
+    with contextlib.closing(RecordedSource(path, start_s, end_s)) as whole:
         if not whole.tables:
             raise BadRecording(f"{path}: no frames in it that can be used")
         source = Watched((selection or Selection()).of(whole), is_stopped)
@@ -108,30 +103,6 @@ def convert(
                 raise ConfigurationError(f"{path}: nothing was recorded of what was asked for in that time")
         notes = [f"{target}: {note}" for note in form.without(source)]
         return Converted(target, source.frames, [*source.problems, *notes])
-
-
-def opened(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Source:
-    """A file as a source, by what is in it.
-
-    Args:
-        path: as for :func:`convert`.
-        start_s: likewise.
-        end_s: likewise.
-
-    Raises:
-        BadRecording, MissingExtra, OSError: likewise.
-    """
-    if path.is_dir():
-        if (path / DESCRIPTION).exists():
-            return ParquetSource(path, start_s, end_s)
-        raise BadRecording(f"{path}: a folder, but not one of Parquet files that skin-convert wrote")
-    with path.open("rb") as file:
-        magic = file.read(len(_HDF5_MAGIC))
-    if magic == _HDF5_MAGIC:
-        return Hdf5Source(path, start_s, end_s)
-    if magic[: len(_ZIP_MAGIC)] == _ZIP_MAGIC:
-        return NpzSource(path, start_s, end_s)
-    return RecordedSource(path, start_s, end_s)
 
 
 def new_target(path: Path, target: Path | None, suffix: str) -> Path:
@@ -185,3 +156,52 @@ class _WatchedTable(Table):
                 raise KeyboardInterrupt
             self._frames[self.name] += len(block[TIME])
             yield block
+
+
+class _Export(Protocol):
+    def __call__(self, recording: Recording, path: Path, chosen: Chosen) -> Exported: ...
+
+
+class WireFormat(NamedTuple):
+    """A format that can be written: the suffix of its files, and what writes them."""
+
+    suffix: str
+    export: _Export
+
+
+WIRE_FORMATS = {"candump": WireFormat(".log", export_candump), "pcapng": WireFormat(".pcapng", export_pcapng)}
+
+
+def convert_wires(
+    path: Path,
+    target: Path | None,
+    format_name: str,
+    selection: Selection | None = None,
+    *,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Converted:
+    """Write what went over the wires of drivers.
+
+    Args:
+        path: a recording that ``skin-record --wire`` made; it is only read.
+        target: as for :func:`skinware.conversion.convert`.
+        format_name: one of :data:`WIRE_FORMATS`.
+        selection: which drivers; None: all.
+        start_s: as for :func:`skinware.conversion.convert`.
+        end_s: likewise.
+        is_stopped: likewise.
+
+    Raises:
+        BadRecording: the file is no recording, or one of a newer version, or one without wires.
+        ConfigurationError: no wire of a driver was recorded, or only some sensors are selected: a wire has none.
+        OSError: it cannot be read, or the new one cannot be written.
+    """
+    form, selection = WIRE_FORMATS[format_name], selection or Selection()
+    if selection.sensors:
+        raise ConfigurationError(f"{format_name} has what went over the wires: frames, not sensors, can be selected")
+    target = new_target(path, target, form.suffix)
+    with contextlib.closing(Recording(path)) as recording, begun_beside(target) as begun:
+        exported = form.export(recording, begun, Chosen(selection.services, start_s, end_s, is_stopped))
+        return Converted(target, exported.counts, [*recording.problems, *exported.notes])

@@ -1,4 +1,4 @@
-"""What viewers are shown of a driver: point clouds, images and a state, a few times a second."""
+"""Make the messages that viewers show of a driver: point clouds, images and a state."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,15 +15,16 @@ from mcap.records import Schema
 
 from skinware._columns import Index
 from skinware._names import distinct
-from skinware.conversion import definitions
-from skinware.conversion.cdr import Cdr
-from skinware.conversion.skin_messages import acquired_ns
+from skinware.conversion import ros_messages
+from skinware.conversion.ros_messages import Cdr, acquired_ns
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.matrices import rows_and_columns
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
+from skinware.transfer.generation import Generation
 from skinware.views.shapes import shape_of
 
 _FLOAT32, _UINT8 = 7, 2
@@ -129,8 +131,8 @@ class Showing:
         }
         topic, text = f"/skin/{in_topic(self._name)}/state", json.dumps(state)
         if self._json_state:
-            return Message(topic, "json", definitions.STATE, text.encode())
-        return Message(topic, "cdr", definitions.TEXT, Cdr().text(text).done())
+            return Message(topic, "json", ros_messages.STATE, text.encode())
+        return Message(topic, "cdr", ros_messages.TEXT, Cdr().text(text).done())
 
 
 def in_topic(text: str) -> str:
@@ -149,7 +151,7 @@ def _name(kind: Any, number: int) -> str:
 class _Cloud:
     """Sensors of one type whose places are known in one coordinate frame."""
 
-    schema = definitions.POINTS
+    schema = ros_messages.POINTS
 
     def __init__(
         self, topic: str, type_name: str, frame: str, index: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]
@@ -200,7 +202,7 @@ def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:
 class _Image:
     """Sensors of one type of a patch, side by side; the brighter, the more. Black: no sensor, or no good value."""
 
-    schema = definitions.IMAGE
+    schema = ros_messages.IMAGE
 
     def __init__(
         self, topic: str, frame: str, sensor_type: SensorType, index: Index, pixels: npt.NDArray[np.int64]
@@ -265,3 +267,54 @@ def _side_by_side(parts: Sequence[npt.NDArray[np.int64]]) -> npt.NDArray[np.int6
         top, left = line * (height + 1), column * (width + 1)
         pixels[top : top + part.shape[0], left : left + part.shape[1]] = part
     return pixels
+
+
+RATE_HZ = 30.0
+
+
+@dataclass
+class _Driver:
+    """One that is shown.
+
+    Attributes:
+        generation: that is shown.
+        showing: of it.
+        due_ns: when the next frame is due, wall clock.
+    """
+
+    generation: Generation
+    showing: Showing
+    due_ns: int = 0
+
+
+class Viewers:
+    """Messages for viewers, beside the frames that they are made of.
+
+    Args:
+        json_state: as for :class:`Showing`.
+        rate_hz: of each driver, at most.
+    """
+
+    def __init__(self, *, json_state: bool = True, rate_hz: float = RATE_HZ) -> None:
+        self._json_state, self._period_ns = json_state, round(NS_PER_S / rate_hz)
+        self._drivers: dict[str, _Driver] = {}
+
+    def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[Message]:
+        """What is shown of a frame, if it is time for one.
+
+        Args:
+            service: whose frame.
+            generation: of it.
+            frame: it.
+            time_ns: when it was published, wall clock.
+        """
+        if not isinstance(generation.context, Structure):
+            return
+        driver = self._drivers.get(service)
+        if driver is None or driver.generation is not generation:
+            showing = Showing(service, generation.context, json_state=self._json_state)
+            driver = self._drivers[service] = _Driver(generation, showing, 0 if driver is None else driver.due_ns)
+        if time_ns < driver.due_ns:
+            return
+        driver.due_ns = max(driver.due_ns + self._period_ns, time_ns + self._period_ns // 2)
+        yield from driver.showing.messages(DriverSnapshot(generation, frame.slot), time_ns)

@@ -22,10 +22,9 @@ if find_spec("mcap") is None or find_spec("zstandard") is None:
     raise MissingExtra("recordings need packages that are not installed: pip install 'skinware[record]'")
 
 from skinware.recording.reading import Recording
-from skinware.recording.series import Series
-from skinware.recording.tracks import Track
+from skinware.recording.tracks import Series, Track
 from skinware.recording.wire_tracks import WireItem, WirePiece, WireTrack
-from skinware.transfer.frames import RecordedDriverFrame, RecordedSample, RecordedSnapshot
+from skinware.transfer.generation import RecordedDriverFrame, RecordedSample, RecordedSnapshot
 
 __all__ = [
     "RecordedDriverFrame",

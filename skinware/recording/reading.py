@@ -21,8 +21,7 @@ from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
 from skinware.transfer.collecting import LIVE, PAUSED
-from skinware.transfer.frames import RecordedDriverFrame, RecordedSnapshot
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedDriverFrame, RecordedSnapshot
 
 
 @dataclass

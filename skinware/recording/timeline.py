@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from skinware.recording.mcap_reading import ChunkPlace
 from skinware.transfer.collecting import CLOSED, DEAD
-from skinware.transfer.frames import RecordedSample
+from skinware.transfer.generation import RecordedSample
 
 GONE = (CLOSED, DEAD)
 _KEPT_CHUNKS = 3

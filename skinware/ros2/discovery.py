@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from skinware.conversion.cdr import Cdr
+from skinware.conversion.ros_messages import Cdr
 from skinware.ros2.transport import Distro, Identity
 
 TOPIC = "ros_discovery_info"

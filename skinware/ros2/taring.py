@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from skinware.conversion.cdr import Cdr
+from skinware.conversion.ros_messages import Cdr
 from skinware.errors import RequestTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns

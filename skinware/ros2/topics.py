@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from skinware.conversion import skin_messages
+from skinware.conversion import ros_messages
 from skinware.conversion.showing import Showing, in_topic
 from skinware.conversion.tables import sensor_names
 from skinware.driver_snapshot import DriverSnapshot
@@ -64,7 +64,7 @@ class DriverTopics:
         if frame.generation != self._generation:
             self._take_generation(frame, time_ns)
         if self._frames.is_wanted:
-            self._send(self._frames, skin_messages.skin_frame(frame, time_ns, status))
+            self._send(self._frames, ros_messages.skin_frame(frame, time_ns, status))
         if with_pictures and self._showing is not None:
             wanted = {topic for topic, picture in self._pictures.items() if picture.is_wanted}
             for message in self._showing.pictures(frame, time_ns, status=status, wanted=wanted.__contains__):
@@ -85,7 +85,7 @@ class DriverTopics:
                 if topic not in self._pictures:
                     message_type = types.OF_SCHEMAS[schema.name]
                     self._pictures[topic] = self._node.publisher(self._prefix + topic, message_type, Qos())
-        told = skin_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
+        told = ros_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
         self._send(self._sensors, told)
 
     def _send(self, publisher: Publisher, message: bytes) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 
-from skinware.conversion.cdr import Cdr
+from skinware.conversion.ros_messages import Cdr
 from skinware.ros2 import types
 from skinware.ros2.transport import Node, Qos
 from skinware.structure import Structure

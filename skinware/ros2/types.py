@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skinware.conversion import definitions
+from skinware.conversion import ros_messages
 from skinware.ros2.transport import MessageType, ServiceType
 
 _KEY_VALUE = "string key\nstring value\n"
@@ -28,7 +28,7 @@ rmw_dds_common/Gid[] reader_gid_seq
 rmw_dds_common/Gid[] writer_gid_seq
 """
 TEXTS = {
-    **definitions.TEXTS,
+    **ros_messages.TEXTS,
     "diagnostic_msgs/KeyValue": _KEY_VALUE,
     "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
     "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",

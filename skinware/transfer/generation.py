@@ -1,9 +1,9 @@
-"""One generation of a recorded service: all that is told once, as it stood in the service's file before its slots."""
+"""Keep one generation of a service and its recorded samples, as they stood in the service's file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,15 @@ import numpy.typing as npt
 
 from skinware import driver_service
 from skinware._columns import Index
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadRecording, BadServiceFile, StructureError
 from skinware.limits import LIMITS
 from skinware.memory import segments
+from skinware.memory.ring import Sample
 from skinware.memory.schema import STATIC_NAME, Schema
+from skinware.snapshot import Snapshot
 from skinware.structure import OF_GROUPS, Structure
-from skinware.transfer.codec import CodedColumn
+from skinware.transfer.codec import CodedColumn, Run
 
 _SHORTEST_NS = 10_000
 """Period of a service; see :func:`skinware.realtime.period_ns`."""
@@ -155,3 +158,56 @@ def disguised(head: bytes, name: str, disguise: Callable[[str], str]) -> bytes:
         return head
     structure = generation.context.replace(buses=[disguise(bus) for bus in generation.context.buses])
     return generation.head_with(structure, generation.schema)
+
+
+class RecordedSample(Sample):
+    """A recorded frame of a service. Its age is the one that it had when it was published."""
+
+    __slots__ = ()
+
+    @property
+    def age_ns(self) -> int:
+        """How old the newest data in it was when it was published, ns."""
+        return self.published_ns - self.acquired_ns
+
+
+class RecordedDriverFrame(RecordedSample, DriverSnapshot):
+    """A recorded frame of a driver."""
+
+    __slots__ = ()
+
+    def fresh(
+        self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """As of a live frame, at the moment at which it was published."""
+        return super().fresh(type_name, max_age_s=max_age_s, at_ns=self.published_ns if at_ns is None else at_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSnapshot(Snapshot):
+    """The newest frame of every driver at one moment of a recording.
+
+    Attributes:
+        at_ns: the moment: when the newest of them was published, CLOCK_MONOTONIC of the machine that recorded.
+        time_s: the same, s since the recording began.
+    """
+
+    at_ns: int
+    time_s: float
+
+    def fresh(
+        self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """As of a live snapshot, at its moment."""
+        return super().fresh(type_name, max_age_s=max_age_s, at_ns=self.at_ns if at_ns is None else at_ns)
+
+
+def frames_of(generation: Generation, run: Run) -> Iterator[RecordedSample]:
+    """The frames of a run; they share one piece of memory."""
+    for slot in run.decode_slots(generation.slot_stride):
+        yield frame_of(generation, slot)
+
+
+def frame_of(generation: Generation, slot: npt.NDArray[np.uint8]) -> RecordedSample:
+    """The frame that stands in (stride,) bytes, as it was in the ring."""
+    return (RecordedDriverFrame if generation.is_driver else RecordedSample)(generation, memoryview(slot.data))

@@ -17,8 +17,7 @@ from skinware.memory.schema import STATIC_NAME
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request, ServiceWriter
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
-from skinware.transfer.frames import RecordedSample
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedSample
 
 _TIMES_OF_DRIVERS = ("module_time_ns", "group_time_ns", "bus_since_ns")
 """Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""

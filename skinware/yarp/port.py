@@ -19,8 +19,7 @@ import socket
 import struct
 from dataclasses import dataclass, field
 
-from skinware.yarp.bottles import Value, Word, in_text, of_text, packed, unpacked
-from skinware.yarp.carriers import Carrier, Message, framed, unframed
+from skinware.yarp.carriers import Carrier, Message, Value, Word, framed, in_text, of_text, packed, unframed, unpacked
 from skinware.yarp.names import Contact, NameServer, is_port_name
 
 log: logging.Logger = logging.getLogger("skinware.yarp")

@@ -20,8 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware.bridge.giving import Stream
-from skinware.bridge.guarding import Guard, Room
-from skinware.bridge.link import Reply
+from skinware.bridge.link import Guard, Reply, Room
 from skinware.bridge.messages import (
     About,
     Answered,
@@ -33,7 +32,7 @@ from skinware.bridge.messages import (
     split_generation,
     token_parts,
 )
-from skinware.bridge.turns import Turns
+from skinware.bridge.peer import Turns
 from skinware.bridge.watching import Watcher
 from skinware.errors import BridgeError, RequestError
 from skinware.memory.namespace import Namespace

@@ -12,10 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware import DriverReader, DriverWriter, Sample
-from skinware.bridge.access import Rules
-from skinware.bridge.clock import Exchange, PeerClock
-from skinware.bridge.diagnosis import why_unreachable
-from skinware.bridge.endpoints import endpoints
+from skinware.bridge.clock import QUESTIONS, Exchange, PeerClock
+from skinware.bridge.endpoints import Rules, endpoints, why_unreachable
 from skinware.bridge.messages import (
     CODED,
     RAW,
@@ -31,7 +29,6 @@ from skinware.bridge.messages import (
     split_generation,
 )
 from skinware.bridge.pacing import Pacing
-from skinware.bridge.pinging import QUESTIONS
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from skinware import DriverReader, DriverWriter, Structure
-from skinware.bridge.cutting import Cut
 from skinware.bridge.messages import Wish
+from skinware.bridge.parts import Cut
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace

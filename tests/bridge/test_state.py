@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 
 from skinware import DriverWriter, ServiceWriter
-from skinware.bridge.pinging import answering
+from skinware.bridge.clock import answering
 from skinware.bridge_state import MOST, BridgeReader, BridgeState, BridgeStateWriter, ServiceState, service_name
 from skinware.cli._report import report
 from skinware.cli.info import as_text

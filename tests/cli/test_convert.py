@@ -42,7 +42,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
     assert err == f"skin-convert: {note}\n"
     told = {"event": "converted", "file": "walk-csv", "format": "csv", "frames": {"torso": 30}, "notes": [note]}
     assert json.loads(out) == told
-    assert exit_status(convert, ["walk.npz", "--to", "mcap", "-o", "again.mcap"]) == 0
+    assert exit_status(convert, ["walk.mcap", "--to", "mcap", "-o", "again.mcap"]) == 0
     regions = 'format = "skinware-regions"\nversion = 1\n\n[[region]]\nname = "palm"\nuid = [1000, 1002, 1010]\n'
     Path("regions.toml").write_text(regions)
     options = ["--region", "palm", "--type", "pressure", "-o", "palm.npz"]

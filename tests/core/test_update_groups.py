@@ -11,11 +11,10 @@ import pytest
 
 import skinware.recording
 from skinware import DriverReader, DriverWriter, Structure
-from skinware.bridge.cutting import Cut
+from skinware.bridge.parts import Cut
 from skinware.errors import StructureError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.transfer.frames import RecordedDriverFrame
-from skinware.transfer.generation import Generation
+from skinware.transfer.generation import Generation, RecordedDriverFrame
 from skinware.views.health import status_now
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled

@@ -157,7 +157,7 @@ def _touched(place: range, gone: list[range]) -> bool:
 
 def recover_too(file: Path, target: Path) -> Frames:
     """What is in a damaged file after it was made whole; nothing if that is not possible."""
-    from skinware.recording.recovery import recover
+    from skinware.recording.files import recover
 
     try:
         recover(file, target)

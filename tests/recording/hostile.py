@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import skinware.recording
 from skinware.errors import SkinwareError
+from skinware.recording.files import recover
 from skinware.recording.mcap_reading import McapSource
 from skinware.recording.mcap_writing import McapFile, OpenChunk
-from skinware.recording.recovery import recover
 from skinware.recording.topics import GENERATION
 
 _ODD = (0, 1, 0xFF, 0xFFFF, 0x7FFF_FFFF, 0xFFFF_FFFF, (1 << 62) - 1, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)

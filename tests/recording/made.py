@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import Namespace, ServiceWriter, Structure
+from skinware.conversion.mcap_files import write_recording
 from skinware.conversion.tables import COLUMNS, OF_FRAMES, Block, Table
-from skinware.conversion.to_recording import write_recording
 from skinware.memory import segments
 from skinware.transfer.generation import Generation
 from tests.cli.fake_skin import FakeSkin

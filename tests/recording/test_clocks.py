@@ -11,8 +11,7 @@ from mcap.reader import make_reader
 
 import skinware.recording
 from skinware import Namespace
-from skinware.conversion.recorded import RecordedSource
-from skinware.conversion.tables import TIME
+from skinware.conversion.tables import TIME, RecordedSource
 from skinware.realtime import NS_PER_S
 from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Past, Target

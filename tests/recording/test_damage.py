@@ -10,8 +10,8 @@ from mcap.reader import make_reader
 
 import skinware.recording
 from skinware.errors import BadRecording
+from skinware.recording.files import recover
 from skinware.recording.mcap_reading import McapSource
-from skinware.recording.recovery import recover
 from tests.recording.damaging import Original, frames_of, recover_too, with_a_bad_chunk
 from tests.recording.rig import two_drivers_and_a_service
 

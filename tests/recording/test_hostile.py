@@ -17,9 +17,9 @@ from skinware import Namespace
 from skinware.errors import BadRecording
 from skinware.limits import LIMITS, Limits
 from skinware.memory import file_layout
+from skinware.recording.files import recover
 from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import McapFile, OpenChunk
-from skinware.recording.recovery import recover
 from skinware.recording.replaying import Replayer
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from tests.recording.hostile import Forger, use

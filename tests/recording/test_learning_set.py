@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from skinware import Status, Structure
-from skinware.conversion import Selection, convert
+from skinware.conversion import Selection
 from skinware.conversion.learning import (
     Interval,
     Join,
@@ -30,12 +30,11 @@ from skinware.conversion.learning import (
     interval_of,
     join_of,
     read_intervals,
-    statistics,
 )
+from skinware.conversion.learning.features import Moments, Statistics
 from skinware.conversion.learning.joined import Joined, matched
-from skinware.conversion.learning.statistics import Moments, Statistics
+from skinware.conversion.mcap_files import write_recording
 from skinware.conversion.tables import Table
-from skinware.conversion.to_recording import write_recording
 from skinware.errors import BadRecording, ConfigurationError
 from tests.cli.fake_skin import fake_structure
 from tests.recording.lerobot_format import Read, read_dataset
@@ -185,16 +184,6 @@ def test_a_selection_has_what_was_asked_for(tmp_path: Path) -> None:
     assert np.array_equal(read.features[f"{TACTILE}arm.pressure"], physical(made.tables[1], "pressure")[newest, 20:])
     sensors = pyarrow.parquet.read_table(io.BytesIO((tmp_path / "set/meta/skin/arm.sensors.parquet").read_bytes()))
     assert set(sensors["patch"].to_pylist()) == {"board 8"}
-
-
-def test_arrays_of_a_recording_make_the_same_set(made: Made, tmp_path: Path) -> None:
-    convert(made.path, tmp_path / "walk.npz", "npz")
-    read = learn(made)
-    again = convert_to_learning_set([tmp_path / "walk.npz"], tmp_path / "again", LearningSet())
-    other = read_dataset(again.path)
-    assert again.frames == {"torso": 60}
-    for name, rows in read.features.items():
-        assert np.array_equal(rows, other.features[name]), name
 
 
 # -- episodes -----------------------------------------------------------------------------------------------------
@@ -495,20 +484,27 @@ def test_nothing_to_learn_from(tmp_path: Path) -> None:
     read_dataset(converted.path)
 
 
+class SetBack(MadeTable):
+    """A driver whose recorder's clock was set back by some time after the first half."""
+
+    shift_ns = 0
+
+    def _made(self, name: str, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+        made = super()._made(name, numbers)
+        return made - self.shift_ns * (numbers >= self.n // 2) if name == "frames/time_ns" else made
+
+
 def test_a_clock_that_was_set_back(tmp_path: Path) -> None:
-    made = write(tmp_path / "walk.mcap", table_of("torso", fake_structure(1, 1), range(100)))
-    convert(made.path, tmp_path / "walk.npz", "npz")
-    with np.load(tmp_path / "walk.npz") as arrays:
-        told = dict(arrays)
-    told["torso/frames/time_ns"][50:60] -= 3 * 10**7  # a recorder that was held up
-    np.savez(tmp_path / "walk.npz", **told)
-    read = learn([tmp_path / "walk.npz"], LearningSet(fps=100))
+    whole = table_of("torso", fake_structure(1, 1), range(100))
+    table = SetBack(whole.origin, whole.columns, 100)
+    table.shift_ns = 3 * 10**7  # a recorder that was held up
+    read = learn(write(tmp_path / "held.mcap", table), LearningSet(fps=100))
     assert read.features[f"{TACTILE}torso.age"].min() >= 0
-    assert read.info["total_frames"] == 100
-    told["torso/frames/time_ns"][50:] -= 3 * 10**8
-    np.savez(tmp_path / "walk.npz", **told)
+    assert read.info["total_frames"] == 97
+    table.shift_ns = 3 * 10**8
+    write(tmp_path / "back.mcap", table)
     with pytest.raises(BadRecording, match="torso: the clock was set back while it was recorded"):
-        convert_to_learning_set([tmp_path / "walk.npz"], None, LearningSet())
+        convert_to_learning_set([tmp_path / "back.mcap"], None, LearningSet())
 
 
 @pytest.mark.parametrize("text", ["", "1", "1..", "..2", "2..1", "1..1", "-1..2", "a..b", "0..inf", "0..nan"])
@@ -614,11 +610,11 @@ def test_many_files_and_batches_are_the_same_set(made: Made, tmp_path: Path, mon
 def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: int, seed: int) -> None:
     generator, total = np.random.default_rng(seed), sum(lengths)
     rows = (generator.normal(1e4, 3, (total, 2, 3))).astype(np.float32)
-    least, statistics._LEAST_ROWS = statistics._LEAST_ROWS, 1
+    least, features._LEAST_ROWS = features._LEAST_ROWS, 1
     try:
         each = Statistics((2, 3), np.float32, total, kept * 24)
     finally:
-        statistics._LEAST_ROWS = least
+        features._LEAST_ROWS = least
     for part in np.split(rows, np.cumsum(lengths)[:-1]):
         each.add(part, Moments.of(part))
     told, exact = each.told(), rows.astype(np.float64)
@@ -632,7 +628,7 @@ def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: in
 
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "_BATCH_BYTES", 1 << 16)
-    monkeypatch.setattr(statistics, "_SAMPLE_ROWS", 40)
+    monkeypatch.setattr(features, "_SAMPLE_ROWS", 40)
     peaks = []
     for n in (200, 1000):
         made = write(tmp_path / f"{n}.mcap", table_of("torso", fake_structure(2, 8), range(n)))

@@ -18,12 +18,11 @@ from rosbags.typesys import Stores, get_typestore
 
 import skinware.recording
 from skinware import Structure
-from skinware.conversion import Selection, convert, definitions
-from skinware.conversion.viewers import RATE_HZ, Viewers
+from skinware.conversion import Selection, convert, ros_messages
+from skinware.conversion.showing import RATE_HZ, Viewers
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.recording.files import Files
-from skinware.recording.recovery import recover
+from skinware.recording.files import Files, recover
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.made import START_NS, MadeTable, made_recording
@@ -32,7 +31,7 @@ from tests.recording.rig import recording, two_drivers_and_a_service
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 
 
-def ros_messages(path: Path, topics: list[str] | None = None) -> list[tuple[str, Any]]:
+def decoded_messages(path: Path, topics: list[str] | None = None) -> list[tuple[str, Any]]:
     """(topic, message) of all messages of ROS 2 in a file, decoded by what the file says of them."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -136,14 +135,14 @@ def test_the_reader_of_mcap_for_ros2_reads_the_same(
     with (tmp_path / "bag" / "walk_0.mcap").open("rb") as stream:
         assert make_reader(stream).get_header().profile == "ros2"
     for path in (tmp_path / "bag" / "walk_0.mcap", tmp_path / "x.mcap"):
-        clouds = [each for _, each in ros_messages(path, ["/skin/torso/points/pressure"])]
+        clouds = [each for _, each in decoded_messages(path, ["/skin/torso/points/pressure"])]
         assert len(clouds) in (RATE_HZ, RATE_HZ + 1)
         for cloud in clouds:
             check_points(cloud, table, structure, "pressure")
 
 
 def test_definitions_are_those_of_ros() -> None:
-    for schema in (definitions.POINTS, definitions.IMAGE, definitions.TEXT):
+    for schema in (ros_messages.POINTS, ros_messages.IMAGE, ros_messages.TEXT):
         theirs, _ = ROS.generate_msgdef(schema.name, ros_version=2)
         assert fields_of(schema.data.decode()) == fields_of(theirs)
 
@@ -170,7 +169,7 @@ def test_without_places_there_are_images_only_and_it_says_so(tmp_path: Path) -> 
     assert converted.notes == [f"{converted.path}: torso: no place of a sensor is known: images only, no points"]
     topics = ["/skin/torso/image/board_7/pressure", "/skin/torso/image/board_8/pressure"]
     found = defaultdict(list)
-    for topic, each in ros_messages(converted.path):
+    for topic, each in decoded_messages(converted.path):
         found[topic].append(each)
     assert set(topics) < set(found)
     assert not [topic for topic in found if "points" in topic]
@@ -201,7 +200,7 @@ def test_a_grid_is_an_image_with_a_pixel_for_each_sensor(tmp_path: Path) -> None
     table = made_recording(tmp_path / "x.mcap", placed(structure.replace(types=types)), 10)
     convert(tmp_path / "x.mcap", tmp_path / "shown.mcap", "foxglove", Selection(types=["pressure"]))
     topic = "/skin/torso/image/board_7/pressure"
-    image = ros_messages(tmp_path / "shown.mcap", [topic])[0][1]
+    image = decoded_messages(tmp_path / "shown.mcap", [topic])[0][1]
     assert (image.height, image.width, image.encoding, image.step) == (2, 5, "32FC1", 20)
     pixels = np.frombuffer(bytes(image.data), "<f4")
     good = table.columns["status"][0][:10] == 0
@@ -214,7 +213,7 @@ def test_coordinate_frames_are_clouds_of_their_own(tmp_path: Path) -> None:
     convert(tmp_path / "x.mcap", tmp_path / "shown.mcap", "foxglove")
     frames = {
         topic: each.header.frame_id
-        for topic, each in ros_messages(tmp_path / "shown.mcap")
+        for topic, each in decoded_messages(tmp_path / "shown.mcap")
         if "/points/pressure" in topic
     }
     assert frames == {
@@ -259,7 +258,7 @@ def test_they_are_recorded_live_too_beside_all_frames(tmp_path: Path) -> None:
             assert (opened.services, opened.problems) == (("torso",), [])
             series = opened["torso"].read()
             values = series.physical("pressure")
-        shown = ros_messages(path, ["/skin/torso/points/pressure"])
+        shown = decoded_messages(path, ["/skin/torso/points/pressure"])
         assert 1 <= len(shown) <= RATE_HZ * (series.time_s[-1] - series.time_s[0]) + 2
         for _, each in shown:
             points = points_of(each)

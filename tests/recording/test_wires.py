@@ -20,8 +20,8 @@ from skinware.conversion import convert
 from skinware.memory.announcement import is_wished
 from skinware.memory.segments import living_inode
 from skinware.recording import WireTrack
+from skinware.recording.files import recover
 from skinware.recording.mcap_writing import McapFile, OpenChunk
-from skinware.recording.recovery import recover
 from skinware.recording.topics import Channels
 from skinware.wire import COLUMNS, IS_CUT, IS_FD, KIND, WISH, service_name
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch

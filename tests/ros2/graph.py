@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from skinware.conversion.cdr import Cdr
+from skinware.conversion.ros_messages import Cdr
 from skinware.memory.namespace import Namespace
 from skinware.ros2.serving import Ros2Server
 from skinware.ros2.transport import Handler, MessageType, Qos, ServiceType

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader
-from skinware.conversion import definitions, skin_messages
-from skinware.conversion.cdr import Cdr
+from skinware.conversion import ros_messages
+from skinware.conversion.ros_messages import Cdr
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.ros2 import diagnostics, discovery, types
@@ -40,7 +40,7 @@ def serialised(message: Any, name: str) -> bytes:
 @pytest.mark.parametrize("name", OURS)
 def test_the_message_package_has_our_definitions(name: str) -> None:
     text = (PACKAGE / "msg" / f"{name}.msg").read_text()
-    assert text == definitions.TEXTS[f"skinware_msgs/{name}"]
+    assert text == ros_messages.TEXTS[f"skinware_msgs/{name}"]
     assert f'"msg/{name}.msg"' in (PACKAGE / "CMakeLists.txt").read_text()
 
 
@@ -91,7 +91,7 @@ def test_frames_and_sensors() -> None:
         status=frame.status,
         module_time_ns=frame.module_time_ns,
     )
-    told = skin_messages.skin_frame(frame, SECOND_NS)
+    told = ros_messages.skin_frame(frame, SECOND_NS)
     assert told == serialised(expected, "skinware_msgs/msg/SkinFrame")
     assert len(set(frame.status.tolist())) > 1
 
@@ -115,7 +115,7 @@ def test_frames_and_sensors() -> None:
         y=y,
         z=z,
     )
-    told = skin_messages.sensors(structure, sensor_names(structure), 7, SECOND_NS)
+    told = ros_messages.sensors(structure, sensor_names(structure), 7, SECOND_NS)
     assert told == serialised(expected, "skinware_msgs/msg/Sensors")
 
 

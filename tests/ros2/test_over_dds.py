@@ -166,7 +166,7 @@ def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.Monke
 def made_frame() -> bytes:
     with FakeSkin("leg", fake_structure(1, 1)) as skin, DriverReader("leg") as reader:
         skin.publish()
-        from skinware.conversion.skin_messages import skin_frame
+        from skinware.conversion.ros_messages import skin_frame
 
         return skin_frame(reader.read(), 10**18)
 

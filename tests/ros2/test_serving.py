@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from skinware import DriverReader, DriverWriter, Namespace, Status
-from skinware.conversion.cdr import Cdr
+from skinware.conversion.ros_messages import Cdr
 from skinware.errors import Paused
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, publishing

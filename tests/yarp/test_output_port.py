@@ -15,8 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skinware.yarp.bottles import Word, packed, unpacked
-from skinware.yarp.carriers import Carrier, Message, framed
+from skinware.yarp.carriers import Carrier, Message, Word, framed, packed, unpacked
 from skinware.yarp.names import NameServer
 from skinware.yarp.port import _ADMINISTRATION, _WHICH_YARP, OutputPort
 from skinware_drivers.testing.waiting import wait_until

@@ -33,7 +33,7 @@ from skinware.conversion import FORMATS
 from skinware.geometry import Geometry
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import Periodic, now_ns
-from skinware.recording.recovery import recover
+from skinware.recording.files import recover
 from skinware.sensor_types import PRESSURE
 
 BIN = Path(sys.executable).parent

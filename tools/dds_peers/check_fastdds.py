@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import DriverReader, DriverWriter, Namespace, Structure
-from skinware.conversion import skin_messages
+from skinware.conversion import ros_messages
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.geometry import Geometry
@@ -112,10 +112,10 @@ def made(modules: int, count: int) -> list[tuple[str, MessageType, Qos, list[byt
             columns["module_time_ns"][:] = time.monotonic_ns()
             writer.commit(time.monotonic_ns())
             frame = reader.read()
-            frames.append(skin_messages.skin_frame(frame, time.time_ns()))
+            frames.append(ros_messages.skin_frame(frame, time.time_ns()))
             for picture in showing.pictures(frame, time.time_ns()):
                 topics[picture.topic].append(picture.data)
-        sensors = skin_messages.sensors(of, sensor_names(of), frame.generation, time.time_ns())
+        sensors = ros_messages.sensors(of, sensor_names(of), frame.generation, time.time_ns())
     return [
         *((topic, types.OF_SCHEMAS[showing.topics[topic].name], Qos(), sent) for topic, sent in topics.items()),
         (f"/skin/{name}/frame", types.SKIN_FRAME, Qos(), frames),

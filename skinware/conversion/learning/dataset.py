@@ -11,8 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import pyarrow
-from skinware.conversion.learning.features import IMAGE, Batch, Feature, pixel_count, pixels_of
-from skinware.conversion.learning.statistics import TOLD, Moments, Statistics
+from skinware.conversion.learning.features import (
+    IMAGE,
+    TOLD,
+    Batch,
+    Feature,
+    Moments,
+    Statistics,
+    pixel_count,
+    pixels_of,
+)
 
 VERSION = "v3.0"
 _CHUNK_FILES, _FILE_MB, _VIDEO_MB = 1000, 100, 200

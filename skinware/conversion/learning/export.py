@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import pyarrow
-from skinware.conversion.converting import Converted, Watched, begun_beside, new_target, opened
+from skinware.conversion.converting import Converted, Watched, begun_beside, new_target
 from skinware.conversion.learning.dataset import DatasetWriter
 from skinware.conversion.learning.features import (
     IMAGE,
@@ -29,7 +29,7 @@ from skinware.conversion.learning.joined import Joined
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
 from skinware.conversion.learning.wanted import Interval, LearningSet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import Source, Table, sensor_table
+from skinware.conversion.tables import RecordedSource, Source, Table, sensor_table
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -74,7 +74,7 @@ def convert_to_learning_set(
     joined = [Joined(join) for join in wanted.joins]
 
     def open_one(path: Path) -> Source:
-        whole = opened(path, start_s, end_s)
+        whole = RecordedSource(path, start_s, end_s)
         try:
             return Watched((selection or Selection()).of(whole), is_stopped)
         except BaseException:

@@ -1,22 +1,25 @@
-"""CSV: a folder of texts that anything reads, of each service one with a line for each frame, and more beside it."""
+"""Write CSV and Parquet folders: a line or row for each sample."""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.leaves import Leaf, leaves
+from skinware.conversion._packages import pyarrow
+from skinware.conversion.arrays import description
 from skinware.conversion.tables import (
     COLUMNS,
     FRAMES,
     PHYSICAL,
+    ArrayFormat,
     Output,
     Source,
     Table,
@@ -25,6 +28,54 @@ from skinware.conversion.tables import (
     sensor_table,
 )
 from skinware.realtime import NS_PER_S
+
+
+class Leaf(NamedTuple):
+    """Plain numbers in the rows of an array.
+
+    Attributes:
+        path: names of the fields that lead to them; empty: the rows are plain.
+        shape: of them in a row.
+        dtype: of them: no structure.
+    """
+
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def of(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(m, size) the numbers in m rows, in place where that is possible."""
+        for field in self.path:
+            rows = rows[field]
+        return rows.reshape(len(rows), self.size)
+
+    def name(self, array: str) -> str:
+        return ".".join([array, *self.path])
+
+
+def leaves(each: ArrayFormat) -> list[Leaf]:
+    """Of the rows of an array; those in which there is nothing are left out."""
+    found = [Leaf((), each.shape, each.dtype)]
+    while any(leaf.dtype.names is not None for leaf in found):
+        found = [inner for leaf in found for inner in _opened(leaf)]
+    return [leaf for leaf in found if leaf.size and leaf.dtype.itemsize]
+
+
+def _opened(leaf: Leaf) -> list[Leaf]:
+    if leaf.dtype.names is None:
+        return [leaf]
+    fields = leaf.dtype.fields
+    assert fields is not None  # noqa: S101, it has names
+    opened = []
+    for name in leaf.dtype.names:
+        base, shape = fields[name][0].base, fields[name][0].shape
+        opened.append(Leaf((*leaf.path, name), (*leaf.shape, *shape), base))
+    return opened
+
 
 _OF_DRIVERS = (
     "values", "status", "module_time_ns", "group_time_ns", "patch_state", "bus_state", "bus_reason", "bus_load",
@@ -45,14 +96,14 @@ def write_csv(source: Source, folder: Path) -> None:
             sensors["uid"] = np.array([f"{uid:#x}" for uid in sensors["uid"].tolist()])
             _write_lines(folder / f"{table.name}.sensors.csv", sensors)
         with ExitStack() as open_files:
-            _write_frames(table, folder, open_files, source.start_ns)
+            _write_csv_table(table, folder, open_files, source.start_ns)
 
 
 def csv_without(_: Source) -> list[str]:
     return ["counters, histograms and events are left out: csv does not hold them"]
 
 
-def _write_frames(table: Table, folder: Path, open_files: ExitStack, start_ns: int) -> None:
+def _write_csv_table(table: Table, folder: Path, open_files: ExitStack, start_ns: int) -> None:
     wanted = [output for output in outputs(table) if _is_wanted(table, output)]
     of_frames = [output for output in wanted if output.name.startswith(FRAMES)]
     check_distinct(["frames", "sensors", *map(_file_part, wanted[len(of_frames) :])], "CSV", table)
@@ -158,3 +209,71 @@ def _line(cells: Iterable[object]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\r\n").writerow(cells)  # which has \r in quotes too
     return text.getvalue().removesuffix("\r\n") + "\n"
+
+
+_GROUP_BYTES = 32 << 20
+
+
+def write_parquet(source: Source, folder: Path) -> None:
+    """Write a source into a folder, which is made.
+
+    Raises:
+        MissingExtra: pyarrow is not installed.
+        OSError: it cannot be written.
+    """
+    arrow = pyarrow()
+    folder.mkdir()
+    units = []
+    for table in source.tables:
+        made = outputs(table)
+        _write_parquet_table(arrow, table, made, folder / f"{table.name}.parquet")
+        sensors = sensor_table(table)
+        if sensors:
+            arrow.parquet.write_table(arrow.table(sensors), folder / f"{table.name}.sensors.parquet")
+        units.append({output.name: output.unit for output in made if output.unit})
+    (folder / "recording.json").write_bytes(description(source, units))
+
+
+def _write_parquet_table(arrow: Any, table: Table, made: Sequence[Output], path: Path) -> None:
+    """The rows of a table; a column for each leaf of its arrays, a list for each frame where there are several."""
+    columns = [(output, leaf) for output in made for leaf in leaves(output.format)]
+    check_distinct([leaf.name(output.name) for output, leaf in columns], "Parquet", table)
+    fields = [
+        arrow.field(leaf.name(output.name), _type(arrow, leaf), False, {"unit": output.unit} if output.unit else None)
+        for output, leaf in columns
+    ]
+    schema = arrow.schema(fields)
+    rows_in_group = max(1, _GROUP_BYTES // sum(output.format.row_bytes for output in made))
+    needed = tuple(dict.fromkeys(name for output in made for name in output.needs))
+    with arrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        waiting, count = [], 0
+        for block in table.blocks(needed):
+            arrays = [_column(arrow, leaf, output.of(block)) for output, leaf in columns]
+            waiting.append(arrow.record_batch(arrays, schema=schema))
+            count += len(arrays[0])
+            if count >= rows_in_group:
+                writer.write_table(arrow.Table.from_batches(waiting), row_group_size=count)
+                waiting, count = [], 0
+        if waiting:
+            writer.write_table(arrow.Table.from_batches(waiting), row_group_size=count)
+
+
+def _is_plain(leaf: Leaf) -> bool:
+    """Whether the numbers are ones that Parquet has; others are written as bytes."""
+    return leaf.dtype.kind in "iu" or (leaf.dtype.kind == "f" and leaf.dtype.itemsize in (4, 8))
+
+
+def _type(arrow: Any, leaf: Leaf) -> Any:
+    item = arrow.from_numpy_dtype(leaf.dtype) if _is_plain(leaf) else arrow.binary(leaf.dtype.itemsize)
+    return arrow.list_(arrow.field("item", item, False), leaf.size) if leaf.shape else item
+
+
+def _column(arrow: Any, leaf: Leaf, rows: npt.NDArray[Any]) -> Any:
+    numbers = np.ascontiguousarray(leaf.of(rows)).reshape(-1)
+    if _is_plain(leaf):
+        items = arrow.array(numbers)
+    else:
+        items = arrow.FixedSizeBinaryArray.from_buffers(
+            arrow.binary(leaf.dtype.itemsize), len(numbers), [None, arrow.py_buffer(numbers.tobytes())]
+        )
+    return arrow.FixedSizeListArray.from_arrays(items, type=_type(arrow, leaf)) if leaf.shape else items

@@ -1,30 +1,74 @@
-"""HDF5: one file of compressed arrays in groups, written and read a few rows at a time."""
+"""Write NPZ and HDF5 files: whole arrays, a few rows at a time."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import h5py
-from skinware.conversion.description import described, heads_of
-from skinware.conversion.stored import StoredArrays, StoredSource
-from skinware.conversion.tables import (
-    ArrayFormat,
-    Output,
-    Source,
-    Table,
-    cannot_hold,
-    outputs,
-    sensor_table,
-)
-from skinware.errors import BadRecording
+from skinware.conversion.tables import Output, Source, Table, cannot_hold, outputs, sensor_table
+
+FORMAT, VERSION = "skinware-arrays", 1
+
+
+def description(source: Source, units: Sequence[dict[str, str]]) -> bytes:
+    """Return the JSON text that a file of arrays carries: its format, tables, units, events and clocks."""
+    tables = [
+        {"name": table.name, "service": table.service, "units": of}
+        for table, of in zip(source.tables, units, strict=True)
+    ]
+    head = {"format": FORMAT, "version": VERSION, "start_ns": source.start_ns, "tables": tables}
+    return msgspec.json.encode({**head, "events": source.events, "clock": source.clock})
+
 
 _DESCRIPTION = "recording"
+
+
+def write_npz(source: Source, path: Path) -> None:
+    """Write a source. Each array is a pass over it: it must be whole before the next one begins.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        units = []
+        for table in source.tables:
+            rows = sum(len(block["frames/time_ns"]) for block in table.blocks(["frames/time_ns"]))
+            made = outputs(table)
+            for output in made:
+                _write_streamed(archive, table, output, rows)
+            for name, array in _sensors(table).items():
+                with archive.open(f"{table.name}/{name}.npy", "w") as file:
+                    np.lib.format.write_array(file, array, allow_pickle=False)
+            units.append({output.name: output.unit for output in made if output.unit})
+        with archive.open(f"{_DESCRIPTION}.npy", "w") as file:
+            text = description(source, units).decode()
+            np.lib.format.write_array(file, np.array(text), allow_pickle=False)
+
+
+def _sensors(table: Table) -> dict[str, npt.NDArray[Any]]:
+    return {f"sensors/{name}": array for name, array in sensor_table(table).items()}
+
+
+def _write_streamed(archive: zipfile.ZipFile, table: Table, output: Output, rows: int) -> None:
+    header = {
+        "descr": np.lib.format.dtype_to_descr(output.format.dtype),
+        "fortran_order": False,
+        "shape": (rows, *output.format.shape),
+    }
+    with archive.open(f"{table.name}/{output.name}.npy", "w", force_zip64=True) as file:
+        np.lib.format.write_array_header_2_0(file, header)
+        for block in table.blocks(output.needs):
+            file.write(np.ascontiguousarray(output.of(block)).tobytes())
+
+
 _CHUNK_BYTES = 256 << 10
 """Of an array: what a program reads at least."""
 
@@ -100,7 +144,7 @@ def write_hdf5(source: Source, path: Path) -> None:
     with contextlib.closing(_File(path)) as stream:
         with package.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
-            file.create_dataset(_DESCRIPTION, data=np.frombuffer(described(source, units).to_json(), np.uint8))
+            file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))
         stream.check()
 
 
@@ -119,7 +163,6 @@ def _write_table(group: Any, table: Table, stream: _File) -> dict[str, str]:
     for name, array in sensor_table(table).items():
         texts = array.dtype.kind == "U"
         group.create_dataset(f"sensors/{name}", data=np.char.encode(array, "utf-8") if texts else array)
-    group.create_dataset("generations", data=heads_of(table), compression="gzip")
     return {output.name: output.unit for output in made if output.unit}
 
 
@@ -147,64 +190,3 @@ def _dataset(group: Any, output: Output) -> Any:
     if output.unit:
         dataset.attrs["unit"] = output.unit
     return dataset
-
-
-class Hdf5Source(StoredSource):
-    """An HDF5 file as a source; see :class:`skinware.conversion.stored.StoredSource`.
-
-    Raises:
-        MissingExtra: h5py is not installed; besides what is said there.
-    """
-
-    def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
-        package = h5py()
-        try:
-            self._file = package.File(path, "r")
-        except OSError as error:
-            if error.errno is not None:
-                raise
-            raise BadRecording(f"{path}: not an HDF5 file, or cut off") from None
-        super().__init__(path, start_s, end_s)
-
-    def close(self) -> None:
-        self._file.close()
-
-    def _description(self) -> bytes:
-        return self._array(_DESCRIPTION).tobytes()
-
-    def _heads(self, table: str) -> npt.NDArray[Any]:
-        return self._array(f"{table}/generations")
-
-    def _arrays(self, table: str) -> StoredArrays:
-        return _Arrays(self._file, table, self.path)
-
-    def _array(self, name: str) -> npt.NDArray[Any]:
-        try:
-            return np.asarray(self._file[name])
-        except (KeyError, OSError, RuntimeError, ValueError, TypeError):
-            raise BadRecording(f"{self.path}: not arrays of a recording (no {name!r}, or damaged)") from None
-
-
-class _Arrays:
-    """The arrays of one table in the file."""
-
-    def __init__(self, file: Any, table: str, path: Path) -> None:
-        self._file, self._table, self._path = file, table, path
-
-    def rows_of(self, name: str, each: ArrayFormat) -> int | None:
-        """See :class:`skinware.conversion.stored.StoredArrays`."""
-        try:
-            dataset = self._file[f"{self._table}/{name}"]
-            return dataset.shape[0] if (dataset.shape[1:], dataset.dtype) == each else None
-        except (KeyError, AttributeError, IndexError, RuntimeError, OSError, TypeError):
-            return None
-
-    def pieces(self, formats: Mapping[str, ArrayFormat], rows: int) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
-        datasets = {name: self._file[f"{self._table}/{name}"] for name in formats}
-        total = min(dataset.shape[0] for dataset in datasets.values())
-        for first in range(0, total, rows):
-            try:
-                piece = {name: dataset[first : first + rows] for name, dataset in datasets.items()}
-            except (OSError, RuntimeError, ValueError) as error:
-                raise BadRecording(f"{self._path}: damaged ({error})") from None
-            yield piece

@@ -1,0 +1,320 @@
+"""Write MCAP files from tables: recordings, files for Foxglove, bags of ROS 2."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skinware.conversion import ros_messages
+from skinware.conversion.showing import Message, Showing, Viewers, in_topic
+from skinware.conversion.tables import COLUMNS, TIME, Source, Table
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.errors import ConfigurationError
+from skinware.limits import LIMITS
+from skinware.memory.file_layout import SLOT
+from skinware.realtime import NS_PER_S
+from skinware.recording.files import Head, RecordingFile
+from skinware.recording.mcap_writing import McapFile, OpenChunk
+from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
+from skinware.structure import Structure
+from skinware.transfer.codec import Encoder
+from skinware.transfer.generation import Generation, RecordedSample, frame_of
+
+
+class TimedFrame(NamedTuple):
+    """A frame of a table.
+
+    Attributes:
+        time_ns: when it was published, on the axis of the recording.
+        service: whose it is.
+        generation: of it.
+        frame: it.
+    """
+
+    time_ns: int
+    service: str
+    generation: Generation
+    frame: RecordedSample
+
+
+def timed_frames(tables: Sequence[Table]) -> Iterator[TimedFrame]:
+    return heapq.merge(*map(_of_table, tables), key=lambda each: each.time_ns)
+
+
+def _of_table(table: Table) -> Iterator[TimedFrame]:
+    generations = {generation.generation: generation for generation in table.generations}
+    origin = table.origin
+    for block in table.blocks(table.arrays):
+        slots = np.zeros((len(block[TIME]), origin.slot_stride), np.uint8)
+        heads = slots[:, : SLOT.itemsize].view(SLOT)[:, 0]
+        for name in ("sequence", "acquired_ns", "published_ns", "flags"):
+            heads[name] = block[f"frames/{name}"]
+        for name, (_, _, offset) in origin.columns.items():
+            rows = block.get(COLUMNS + name)
+            if rows is not None:
+                data = np.frombuffer(rows.tobytes(), np.uint8).reshape(len(slots), -1)
+                slots[:, offset : offset + data.shape[1]] = data
+        numbers, times = block["frames/generation"].tolist(), block[TIME].tolist()
+        for slot, number, time_ns in zip(slots, numbers, times, strict=True):
+            generation = generations[number]
+            yield TimedFrame(time_ns, table.service, generation, frame_of(generation, slot))
+
+
+_CHUNK_NS = NS_PER_S // 4
+_CHUNK_BYTES = 8 << 20
+
+
+class _Told(NamedTuple):
+    """An event, or what the clocks were.
+
+    Attributes:
+        time_ns: on the axis of the recording.
+        topic: of which.
+        data: as JSON has it.
+    """
+
+    time_ns: int
+    topic: str
+    data: dict[str, Any]
+
+
+def write_recording(source: Source, path: Path) -> None:
+    """Write a source.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    file = RecordingFile(path)
+    writer = _RecordingWriter(file)
+    items: list[Iterator[TimedFrame | _Told]] = [
+        *(timed_frames([table]) for table in source.tables),
+        _told(EVENTS, source.events),
+        _told(CLOCK, source.clock),
+    ]
+    try:
+        for item in heapq.merge(*items, key=lambda item: item.time_ns):
+            writer.close_chunk_before(item.time_ns)
+            if isinstance(item, TimedFrame):
+                writer.add_frame(item)
+            else:
+                writer.add_json(item)
+        writer.close_chunk()
+    finally:
+        file.finish()
+
+
+def _told(topic: str, told: list[dict[str, Any]]) -> Iterator[_Told]:
+    for each in told:
+        yield _Told(each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"})
+
+
+@dataclass
+class _Stream:
+    """The frames of one service as they are coded."""
+
+    head: Head
+    generation: Generation
+    encoder: Encoder
+
+
+class _RecordingWriter:
+    """Codes frames and fills chunks.
+
+    Args:
+        file: where they go.
+    """
+
+    def __init__(self, file: RecordingFile) -> None:
+        self._file = file
+        self._channels = Channels()
+        self._streams: dict[str, _Stream] = {}
+        self._chunk, self._heads, self._begun_ns = OpenChunk(), set[Head](), 0
+        self._frames_size = 0  # of the chunk, decoded
+
+    def add_frame(self, timed: TimedFrame) -> None:
+        stream = self._streams.get(timed.service)
+        if stream is None or stream.generation is not timed.generation:
+            stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
+        channel, schema = self._channels.of_service(timed.service, FRAME)
+        if not self._chunk.has(channel):
+            stream.encoder.next_is_key()
+        self._heads.add(stream.head)
+        self._frames_size += len(timed.frame.slot)
+        self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
+
+    def add_json(self, told: _Told) -> None:
+        channel, schema = self._channels.of_all(told.topic)
+        self._chunk.add(channel, schema, 0, told.time_ns, json.dumps(told.data).encode())
+
+    def close_chunk_before(self, time_ns: int) -> None:
+        """End the chunk at hand if a message of a time is not to be in it."""
+        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
+        if is_large or time_ns >= self._begun_ns + _CHUNK_NS:
+            self.close_chunk()
+            self._begun_ns = time_ns
+
+    def close_chunk(self) -> None:
+        if not self._chunk.is_empty:
+            self._file.add(self._chunk.close(), self._heads)
+            self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
+
+    def _stream(self, service: str, generation: Generation, before: _Stream | None) -> _Stream:
+        number = 1 if before is None else before.head.sequence + 1
+        channel, schema = self._channels.of_service(service, GENERATION)
+        return _Stream(Head(channel, schema, number, generation.head), generation, Encoder(generation.coded))
+
+
+_MESSAGE_CHUNK_BYTES = 4 << 20
+_BAG_VERSION = 5
+"""Of metadata.yaml: that of ROS 2 Humble, which later ones read."""
+
+
+def write_foxglove(source: Source, path: Path) -> None:
+    """Write what viewers show of drivers, at most 30 times a second, and what happened to them.
+
+    Raises:
+        ConfigurationError: no driver is in it.
+        OSError: it cannot be written.
+    """
+    viewers = Viewers()
+    writer = _MessageWriter(path, "")
+    try:
+        for event in source.events:
+            writer.add(Message(EVENTS, "json", SCHEMAS[EVENTS], json.dumps(event).encode()), event["log_time_ns"])
+        for timed in timed_frames(_drivers(source)):
+            for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
+                writer.add(message, timed.time_ns)
+    finally:
+        writer.finish()
+
+
+def viewers_without(source: Source) -> list[str]:
+    notes = []
+    for table in source.tables:
+        structure = table.structure
+        if structure is None:
+            notes.append(f"{table.name} is left out: it has no sensors")
+        elif not Showing(table.service, structure).has_points:
+            notes.append(f"{table.name}: no place of a sensor is known: images only, no points")
+    return notes
+
+
+def write_ros2(source: Source, folder: Path) -> None:
+    """Write a bag of ROS 2 (rosbag2, storage mcap) into a folder, which is made: every frame, and what viewers show.
+
+    Raises:
+        ConfigurationError: no driver is in it.
+        OSError: it cannot be written.
+    """
+    drivers = _drivers(source)
+    folder.mkdir()
+    name = f"{source.path.stem}_0.mcap"
+    viewers = Viewers(json_state=False)
+    writer = _MessageWriter(folder / name, "ros2")
+    told: set[Generation] = set()
+    tables = {generation: table for table in drivers for generation in table.generations}
+    try:
+        for timed in timed_frames(drivers):
+            if timed.generation not in told:
+                told.add(timed.generation)
+                writer.add(_sensors(timed, tables[timed.generation]), timed.time_ns)
+            writer.add(_skin_frame(timed), timed.time_ns)
+            for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
+                writer.add(message, timed.time_ns)
+    finally:
+        writer.finish()
+    (folder / "metadata.yaml").write_text(writer.metadata(name), encoding="utf-8")
+
+
+def ros2_without(source: Source) -> list[str]:
+    return [*viewers_without(source), "counters, histograms and events are left out: ros2 does not hold them"]
+
+
+def _drivers(source: Source) -> list[Table]:
+    drivers = [table for table in source.tables if table.structure is not None]
+    if not drivers:
+        raise ConfigurationError(f"{source.path}: no driver is in it, and nothing else can be shown")
+    return drivers
+
+
+def _skin_frame(timed: TimedFrame) -> Message:
+    data = ros_messages.skin_frame(DriverSnapshot(timed.generation, timed.frame.slot), timed.time_ns)
+    return Message(f"/skin/{in_topic(timed.service)}/frame", "cdr", ros_messages.SKIN_FRAME, data)
+
+
+def _sensors(timed: TimedFrame, table: Table) -> Message:
+    structure = timed.generation.context
+    assert isinstance(structure, Structure)  # noqa: S101, of a driver
+    data = ros_messages.sensors(structure, table.sensor_names, timed.generation.generation, timed.time_ns)
+    return Message(f"/skin/{in_topic(timed.service)}/sensors", "cdr", ros_messages.SENSORS, data)
+
+
+class _MessageWriter:
+    """An MCAP file of messages in any order.
+
+    Args:
+        path: of the file.
+        profile: of it.
+    """
+
+    def __init__(self, path: Path, profile: str) -> None:
+        self._file = McapFile(path, profile)
+        self._channels = Channels()
+        self._chunk = OpenChunk()
+        self._types: dict[int, tuple[str, str]] = {}
+        self._begin_ns, self._end_ns = 1 << 63, 0
+
+    def add(self, message: Message, time_ns: int) -> None:
+        channel, schema = self._channels.of(message.topic, message.encoding, message.schema)
+        self._types[channel.id] = message.topic, schema.name
+        self._begin_ns, self._end_ns = min(self._begin_ns, time_ns), max(self._end_ns, time_ns)
+        self._chunk.add(channel, schema, 0, time_ns, message.data)
+        if self._chunk.size > _MESSAGE_CHUNK_BYTES:
+            self._close_chunk()
+
+    def finish(self) -> None:
+        try:
+            self._close_chunk()
+        finally:
+            self._file.finish()
+
+    def metadata(self, name: str) -> str:
+        """What rosbag2 wants to know of the file, which has that name."""
+        begin_ns = min(self._begin_ns, self._end_ns)
+        times = [
+            ("duration", f"{{nanoseconds: {self._end_ns - begin_ns}}}"),
+            ("starting_time", f"{{nanoseconds_since_epoch: {begin_ns}}}"),
+            ("message_count", str(self._file.counts.total())),
+        ]
+        lines = ["rosbag2_bagfile_information:", f"  version: {_BAG_VERSION}", "  storage_identifier: mcap"]
+        lines += [f"  {key}: {value}" for key, value in times]
+        lines += ["  topics_with_message_count:", *self._topics()]
+        lines += [
+            '  compression_format: ""',
+            '  compression_mode: ""',
+            "  relative_file_paths:",
+            f"    - {_quoted(name)}",
+        ]
+        lines += ["  files:", f"    - path: {_quoted(name)}", *(f"      {key}: {value}" for key, value in times[::-1])]
+        return "\n".join(lines) + "\n"
+
+    def _topics(self) -> Iterator[str]:
+        for channel, (topic, type_name) in self._types.items():
+            yield f"    - topic_metadata: {{name: {_quoted(topic)}, type: {_quoted(type_name)},"
+            yield '        serialization_format: cdr, offered_qos_profiles: ""}'
+            yield f"      message_count: {self._file.counts[channel]}"
+
+    def _close_chunk(self) -> None:
+        if not self._chunk.is_empty:
+            chunk, self._chunk = self._chunk, OpenChunk()
+            self._file.add(chunk.close())
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text)

@@ -12,9 +12,8 @@ from skinware.bridge.giving import Stream
 from skinware.bridge.link import Sender
 from skinware.bridge.messages import DriverSummary, State, Summary, host_name
 from skinware.driver_service import counters_of
-from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState, PatchState
+from skinware.status import BusState, PatchState, is_fresh
 from skinware.structure import Structure
 from skinware.transfer.frames import RecordedDriverFrame
 from skinware.transfer.generation import Generation

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import StructureError
-from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S
+from skinware.status import is_fresh
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
 

@@ -7,12 +7,11 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from skinware.freshness import is_fresh
 from skinware.memory.ring import Sample
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
-from skinware.status import DataPath
+from skinware.status import DataPath, is_fresh
 from skinware.structure import Structure
 
 

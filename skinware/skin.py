@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, Self
+from typing import Self
 
-from skinware._renamed import renamed
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import (
@@ -18,15 +17,15 @@ from skinware.errors import (
     ServiceNotFound,
     ServiceTimeout,
 )
-from skinware.freshness import age_limit_ns
 from skinware.geometry import Geometry
 from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
-from skinware.memory.native_look import Look, PythonsTurn, look_at
+from skinware.memory.native_ring import Look, PythonsTurn, look_at
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
+from skinware.status import age_limit_ns
 from skinware.structure import Structure
 
 log = logging.getLogger("skinware.skin")
@@ -402,10 +401,3 @@ def _call(callback: DriverCallback | None, name: str, structure: Structure) -> N
         callback(name, structure)
     except Exception:
         log.exception("what was to be called about driver %r failed; the skin goes on", name)
-
-
-def __getattr__(name: str) -> Any:
-    if name == "Told":
-        renamed("skinware.skin.Told", "DriverCallback")
-        return DriverCallback
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

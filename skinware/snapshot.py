@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware._renamed import renamed
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import StructureError
 from skinware.realtime import NS_PER_S, now_ns
@@ -110,15 +109,3 @@ class Snapshot:
 
     def _frames_with(self, type_name: str) -> list[DriverSnapshot]:
         return [self.frames[driver] for driver, _ in self.layout.parts(type_name)]
-
-    # -- names of version 0.1.0 -------------------------------------------------------------------------------------
-
-    def values(self, type_name: str) -> npt.NDArray[Any]:
-        """Deprecated: ``raw``."""
-        renamed("Snapshot.values", "Snapshot.raw")
-        return self.raw(type_name)
-
-    def status(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """Deprecated: ``status_of``."""
-        renamed("Snapshot.status", "Snapshot.status_of")
-        return self.status_of(type_name)

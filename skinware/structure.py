@@ -12,11 +12,11 @@ import numpy.typing as npt
 from skinware import _names
 from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
 from skinware.errors import StructureError
-from skinware.freshness import LONGEST_PERIOD_S, age_limit_ns
 from skinware.geometry import Geometry
 from skinware.matrices import Matrices
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
+from skinware.status import LONGEST_PERIOD_S, age_limit_ns
 
 VALUE_DTYPES = tuple(np.dtype(code) for code in ("u1", "<i2", "<u2", "<i4", "<f4"))
 """The dtypes that values of a service may have."""

@@ -22,7 +22,6 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy.typing as npt
 
-from skinware._renamed import renamed
 from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
@@ -205,18 +204,6 @@ class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
 
     def resume(self) -> None:
         self._owned.resume()
-
-
-def read(reader: ServiceReader[F], function: Callable[[F], object], **options: Any) -> Worker[F]:
-    """Deprecated: ``start_reader``."""
-    renamed("threads.read", "threads.start_reader")
-    return start_reader(reader, function, **options)
-
-
-def write(writer: ServiceWriter, function: Callable[[dict[str, npt.NDArray[Any]]], object], **options: Any) -> Any:
-    """Deprecated: ``start_writer``."""
-    renamed("threads.write", "threads.start_writer")
-    return start_writer(writer, function, **options)
 
 
 class SkinReplica(Worker[Snapshot]):

@@ -28,11 +28,9 @@ if TYPE_CHECKING:
         Values,
     )
     from skinware_drivers.link import Link, Match
-    from skinware_drivers.notice import Notice
     from skinware_drivers.operations import operation
     from skinware_drivers.options import NoOptions, check_options
-    from skinware_drivers.polling import Poll
-    from skinware_drivers.watch import Watch
+    from skinware_drivers.polling import Notice, Poll, Watch
 
 __all__ = [
     "EXTENDED_FLAG",
@@ -67,7 +65,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("layout", "bus", "description", "link", "notice", "watch", "operations", "options", "polling")
+_MODULES = ("layout", "bus", "description", "link", "operations", "options", "polling")
 
 
 def get_include() -> str:
@@ -77,8 +75,6 @@ def get_include() -> str:
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for, and no more: commands and the pytest plug-in, which are here too, start fast."""
-    if name == "Stamp":  # the old name of SequenceNumber, which says so
-        return importlib.import_module(f"{__name__}.layout").Stamp
     if name in __all__:
         for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
             if name in vars(module):

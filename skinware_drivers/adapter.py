@@ -18,10 +18,8 @@ from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
 from skinware_drivers.layout_check import check_layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import HasOptions, NoOptions, OptionsT
-from skinware_drivers.polling import Poll
-from skinware_drivers.watch import Watch
+from skinware_drivers.polling import Notice, Poll, Watch
 
 _COMMAND_OPTIONS = (
     "bus capture config cpus driver geometry group help json latency listen_only name namespace publish realtime slots"

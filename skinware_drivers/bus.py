@@ -17,8 +17,7 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.status import BusReason
-from skinware_drivers.counters import BusCounters
-from skinware_drivers.samples import Samples
+from skinware_drivers.counters import BusCounters, Samples
 from skinware_drivers.wire_tap import WireTap
 
 EXTENDED_FLAG = 0x8000_0000

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD
 
@@ -16,20 +15,15 @@ class Identifier:
     Attributes:
         value: what the masked bits are; of a 29-bit identifier, with the flag: ``EXTENDED_FLAG | 0x18DA00F1``.
         mask: bits that count; default: all.
-        extended: whether the identifier has 29 bits. Do not give it: the value says it.
+        extended: whether the identifier has 29 bits, as the flag in the value says.
     """
 
     value: int
     mask: int = -1
-    extended: bool = False
+    extended: bool = field(init=False)
 
     def __post_init__(self) -> None:
         is_extended = bool(self.value & EXTENDED_FLAG)
-        if self.extended and not is_extended:
-            text = f"Identifier(0x{self.value:X}, extended=True): write Identifier(EXTENDED_FLAG | 0x{self.value:X})"
-            warnings.warn(text, DeprecationWarning, stacklevel=3)
-            object.__setattr__(self, "value", self.value | EXTENDED_FLAG)
-            is_extended = True
         object.__setattr__(self, "extended", is_extended)
         every = EXTENDED_FLAG | IDENTIFIER_MASK if is_extended else LARGEST_STANDARD
         mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)

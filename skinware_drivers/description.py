@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import StructureError
-from skinware.freshness import LONGEST_PERIOD_S
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
+from skinware.status import LONGEST_PERIOD_S
 from skinware.structure import Structure
 
 _BUS_SHIFT = 32

@@ -7,17 +7,15 @@ count together.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.freshness import LONGEST_PERIOD_S
-from skinware.status import Status
+from skinware.status import LONGEST_PERIOD_S, Status
 from skinware_drivers.bus import check_identifier
 from skinware_drivers.conditions import Bits, Byte, Condition, Identifier
 from skinware_drivers.numbering import DeviceTime, SequenceNumber
@@ -172,7 +170,6 @@ class Frame:
         time: the device's own time, if the frame has it.
         period_s: nominal time between two of these frames of a module, if it is longer than the driver's: their sensors
             are stale after three of these periods.
-        stamp: the old name of ``sequence``; to be removed in release 0.2.
     """
 
     name: str
@@ -185,15 +182,11 @@ class Frame:
     sequence: SequenceNumber | None = None
     time: DeviceTime | None = None
     period_s: float | None = None
-    stamp: InitVar[SequenceNumber | None] = None
 
-    def __post_init__(self, stamp: SequenceNumber | None) -> None:
+    def __post_init__(self) -> None:
         for what in ("when", "length"):
             if not isinstance(getattr(self, what), Collection):
                 raise ConfigurationError(f"frame {self.name!r}: `{what}` is a list: write {what}=[...]")
-        if stamp is not None:
-            warnings.warn("Frame(stamp=...) is now Frame(sequence=...)", DeprecationWarning, stacklevel=3)
-            object.__setattr__(self, "sequence", stamp)
 
     @property
     def runs(self) -> Sequence[Values]:
@@ -399,13 +392,6 @@ def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:
         raise ConfigurationError(
             f"the counter of a cycle has {cycle.turn} values: two lost cycles look like none; it needs {_FEWEST_COUNTS}"
         )
-
-
-def __getattr__(name: str) -> Any:
-    if name == "Stamp":
-        warnings.warn("Stamp is now SequenceNumber", DeprecationWarning, stacklevel=2)
-        return SequenceNumber
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = [

@@ -20,7 +20,7 @@ import skinware
 from skinware import realtime, threads
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.curves import read_curves
-from skinware.tactile.region_files import read_regions
+from skinware.tactile.regions import read_regions
 from skinware.tactile.testing import read_stage
 from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile

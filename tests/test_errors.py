@@ -24,7 +24,7 @@ from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWrit
 from skinware.bridge import Link as BridgeLink
 from skinware.bridge import endpoints
 from skinware.errors import SkinwareError
-from skinware.memory import _fences
+from skinware.memory import futex
 from skinware.realtime import Profile
 from skinware.recording import open as open_recording
 from skinware.sensor_types import PRESSURE
@@ -118,7 +118,7 @@ def BridgeError(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def PlatformError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    return _fences.fence_for("aarch64", library="libatomic.so.none")
+    return futex.fence_for("aarch64", library="libatomic.so.none")
 
 
 @produces

@@ -22,10 +22,9 @@ from skinware.bridge.messages import (
     raw_message,
 )
 from skinware.driver_service import counters_of
-from skinware.freshness import is_fresh
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState, PatchState
+from skinware.status import BusState, PatchState, is_fresh
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn, encoded
 from skinware.transfer.generation import Generation, RecordedDriverFrame

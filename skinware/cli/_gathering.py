@@ -16,9 +16,8 @@ from skinware.cli._format import terminal_width
 from skinware.cli._terminal import echo, print_json
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
-from skinware.tactile.calibration.sessions import Session
 from skinware.tactile.calibration.sources import LoadSource, PoseSource
-from skinware.tactile.calibration.state import restore_session, save_session
+from skinware.tactile.calibration.state import Session, restore_session, save_session
 
 _TELL_EVERY_S = 1.0
 _SAVE_EVERY_S = 10.0

@@ -84,7 +84,7 @@ def command(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.memory.namespace import Namespace, check_name
-    from skinware.tactile.region_files import read_regions
+    from skinware.tactile.regions import read_regions
     from skinware.yarp.outlet import Outlet, Wanted
 
     for name in names:

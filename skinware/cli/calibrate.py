@@ -127,7 +127,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     from skinware.cli._format import plural
     from skinware.geometry import geometry_to_toml
     from skinware.tactile.calibration.results import unrolled_comment, unrolled_groups
-    from skinware.tactile.calibration.sessions import StrokeSession
+    from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
 
     how = _How(**options)
@@ -182,7 +182,7 @@ def touch(
     places are twice as good, sensors that were not touched are placed too, and it is known where outside is.
     """
     from skinware.tactile.calibration.placing import place
-    from skinware.tactile.calibration.sessions import PressSession
+    from skinware.tactile.calibration.state import PressSession
 
     how = _How(**options)
     if offset_m and layout is None:
@@ -232,7 +232,7 @@ def finger(
     tip of the finger is.
     """
     from skinware.tactile.calibration.finger import place_finger
-    from skinware.tactile.calibration.sessions import PressSession
+    from skinware.tactile.calibration.state import PressSession
 
     how = _How(**options)
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
@@ -268,7 +268,7 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
     from skinware.cli._findings import finding_data, finding_text
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.checking import check_file, check_strokes
-    from skinware.tactile.calibration.sessions import StrokeSession
+    from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
 
     geometry = read_geometry(file)

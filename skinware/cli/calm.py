@@ -113,7 +113,7 @@ def command(
     from skinware.tactile.calm_service import CalmService
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.chain_state import default_path
-    from skinware.tactile.region_files import read_regions
+    from skinware.tactile.regions import read_regions
 
     log_to_stderr(verbose)
     check_name(name, "driver")

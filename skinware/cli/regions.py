@@ -107,8 +107,7 @@ def paint(
     """
     from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
-    from skinware.tactile.region_files import put_region
-    from skinware.tactile.regions import Region
+    from skinware.tactile.regions import Region, put_region
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
@@ -130,7 +129,7 @@ def paint(
 
 def _refuse_early(file: Path, name: str, force: bool) -> None:
     from skinware.errors import ConfigurationError
-    from skinware.tactile.region_files import read_regions
+    from skinware.tactile.regions import read_regions
 
     if file.exists() and not force and name in [region.name for region in read_regions(file)]:
         raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
@@ -159,7 +158,7 @@ class _Painter:
 
         from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
         from skinware.tactile.neighbours import neighbours
-        from skinware.tactile.painting import without_holes
+        from skinware.tactile.regions import without_holes
         from skinware.views.rest import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):

@@ -1,21 +1,75 @@
-"""Both ends of a ring with their data path in C, where it was compiled; they do what those in Python do.
-
-A reader's frame is made before it sleeps. One call then sleeps and copies into it without the interpreter lock, so that
-next to nothing is left to do when the lock is there again: after a sleep the processor's caches are cold, and whatever
-Python does then costs several times what it costs in a loop.
-"""
+"""Call the ring's code in C: take samples, sleep until the next one, and reuse their memory."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import sys
 import time
+from collections.abc import Sequence
+from itertools import accumulate
+from sys import getrefcount
+from typing import Generic
 
 from skinware import native
-from skinware.memory._frame_pool import FramePool
+from skinware.memory import futex
 from skinware.memory.ring import LATEST, RingReader, SampleT, Turn, Turns
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.segments import Segment
+
+Memory = ctypes.Array[ctypes.c_char]
+_Place = tuple[tuple[SampleT, ...], bytearray, Memory]
+
+_COUNTS_COME_LATE = not getattr(sys, "_is_gil_enabled", lambda: True)()  # those of other threads
+
+
+class FramePool(Generic[SampleT]):
+    """Frames to be filled by C: one of each ring, all in one piece of memory. Not for several threads at once.
+
+    Args:
+        rings: whose frames.
+
+    Attributes:
+        starts: where each frame begins in the memory, bytes.
+    """
+
+    def __init__(self, rings: Sequence[RingReader[SampleT]]) -> None:
+        *self.starts, self._size = accumulate((ring.frame_size for ring in rings), initial=0)
+        self._rings = rings
+        self._memory_type = ctypes.c_char * self._size
+        self._places = [self._place(), self._place()]  # a loop still has the frames before when it asks for the next
+        self._references = _references_of_one if len(rings) == 1 else _references
+        self._references_of_nobody = -1 if _COUNTS_COME_LATE else self._references(self._places[0])
+        self._turn = 0
+
+    def free(self) -> _Place[SampleT]:
+        """Frames that nobody has, their bytes, and the same for calls of C.
+
+        Whoever has a frame has a reference to it or to all of them, and whoever has an array of one, to the bytes.
+        """
+        self._turn = turn = 1 - self._turn
+        place = self._places[turn]
+        if self._references(place) != self._references_of_nobody:
+            place = self._places[turn] = self._place()
+        return place
+
+    def _place(self) -> _Place[SampleT]:
+        data = bytearray(self._size)
+        frames = tuple([ring.frame_in(data, start) for ring, start in zip(self._rings, self.starts, strict=True)])
+        return frames, data, self._memory_type.from_buffer(data)
+
+
+def _references_of_one(place: _Place[SampleT]) -> int:
+    """The same where there is one frame, in as few steps as can be: a loop asks in every turn."""
+    frames, data, _ = place
+    return getrefcount(frames) + getrefcount(data) + getrefcount(frames[0])
+
+
+def _references(place: _Place[SampleT]) -> int:
+    """How many there are to the frames of a place and to its bytes."""
+    frames, data, _ = place
+    return getrefcount(frames) + getrefcount(data) + sum(map(getrefcount, frames))
+
 
 _NEVER_NS = (1 << 63) - 1
 _COPIED, _NOTHING = 1, 0  # what library.c answers
@@ -203,3 +257,84 @@ class NativeRingWriter(RingWriter):
 def _ring_words(segment: Segment) -> tuple[int, int, int, int]:
     layout = segment.layout
     return segment.data.ctypes.data, layout.slot_offset, layout.slot_stride, layout.slot_count
+
+
+_NEWS, _NO_NEWS = 1, 0  # what look.c answers
+
+
+class PythonsTurn(Exception):
+    """Something else than frames is to be done, for which there is no C."""
+
+
+class _SeenRing(ctypes.Structure):
+    """``seen_ring`` of look.c."""
+
+    _fields_ = [("turns", ctypes.c_void_p), ("start", ctypes.c_uint64)]
+
+
+class _LookState(ctypes.Structure):
+    """``skinware_native_look`` of look.c."""
+
+    _fields_ = [
+        ("count", ctypes.c_uint64),
+        ("news_only", ctypes.c_uint64),
+        ("until_ns", ctypes.c_int64),
+        ("asked_ns", ctypes.c_int64),
+        ("rings", _SeenRing * futex.MAX_WORDS),
+        ("words", (ctypes.c_uint64 * 3) * futex.MAX_WORDS),
+    ]
+
+
+class Look(Generic[SampleT]):
+    """A look at several rings whose readers have left their turns to C.
+
+    Args:
+        rings: 1 to :data:`skinware.memory.futex.MAX_WORDS`.
+        library: with their C.
+    """
+
+    def __init__(self, rings: Sequence[NativeRingReader[SampleT]], library: native.Library) -> None:
+        self.rings = rings
+        self._at_once = library.quick.skinware_native_newest
+        self._with_sleep = library.waiting.skinware_native_newest
+        self._state = _LookState(len(rings))
+        self._state_at = ctypes.byref(self._state)
+        self._pool = FramePool(rings)
+        for seen, ring, start in zip(self._state.rings, rings, self._pool.starts, strict=False):
+            seen.turns, seen.start = ring.turns_address, start
+
+    def newest(self, until_ns: int | None) -> tuple[SampleT, ...] | None:
+        """The newest frame of every ring, each a private copy.
+
+        Args:
+            until_ns: wait for another frame than those of the last look, at most until then (CLOCK_MONOTONIC ns), and
+                maybe not as long. None: take what is there.
+
+        Returns:
+            None if there is nothing new.
+
+        Raises:
+            PythonsTurn: nothing was taken, and the readers have to look.
+        """
+        frames, _, memory = self._pool.free()
+        for frame in frames:
+            frame.stale = False
+        state = self._state
+        state.news_only, state.until_ns = until_ns is not None, 0
+        result = self._at_once(self._state_at, memory)  # which keeps the interpreter lock: others may have it for long
+        if result == _NO_NEWS:
+            state.until_ns = until_ns
+            result = self._with_sleep(self._state_at, memory)
+        if result == _NEWS:
+            return frames
+        if result == _NO_NEWS:
+            return None
+        raise PythonsTurn
+
+
+def look_at(rings: Sequence[RingReader[SampleT]]) -> Look[SampleT] | None:
+    library = native.core()
+    natives = [ring for ring in rings if isinstance(ring, NativeRingReader)]
+    if library is None or len(natives) < len(rings) or not 1 <= len(rings) <= futex.MAX_WORDS:
+        return None
+    return Look(natives, library)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.errors import Overrun
 from skinware.memory import file_layout, futex
-from skinware.memory._fences import fence
+from skinware.memory.futex import fence
 from skinware.memory.segments import Segment
 from skinware.realtime import now_ns
 

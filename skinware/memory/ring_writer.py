@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import Closed, ServiceError
-from skinware.freshness import AHEAD_NS
 from skinware.memory import file_layout, futex
-from skinware.memory._fences import fence
+from skinware.memory.futex import fence
 from skinware.memory.ring import (
     ACQUIRED,
     AHEAD,
@@ -30,6 +29,7 @@ from skinware.memory.ring import (
 from skinware.memory.segments import Segment
 from skinware.memory.statistics import bucket_of
 from skinware.realtime import now_ns
+from skinware.status import AHEAD_NS
 
 _STATISTICS = slice(file_layout.STATISTICS_OFFSET // 8, file_layout.COLUMN_OFFSET // 8)
 # words of the statistics: a count, two times (best, worst, total), another count, histograms

@@ -21,11 +21,10 @@ import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, NamespaceError, ServiceNotFound
 from skinware.memory import file_layout, futex
-from skinware.memory._fences import fence
 from skinware.memory.file_layout import Layout
-from skinware.memory.locks import Descriptor, is_locked, try_lock
+from skinware.memory.futex import fence
+from skinware.memory.locks import Descriptor, Process, ProcessWatch, has_ended, is_locked, this_process, try_lock
 from skinware.memory.namespace import Namespace
-from skinware.memory.processes import Process, ProcessWatch, has_ended, this_process
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from skinware._columns import Index, as_index
 from skinware.errors import BadRecording, StructureError
-from skinware.freshness import is_fresh
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import ChunkContents
+from skinware.status import is_fresh
 from skinware.structure import Structure
 from skinware.transfer.codec import HEADER, Run, runs
 from skinware.transfer.generation import PER_SENSOR, Generation, RecordedSample, frames_of

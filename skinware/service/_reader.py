@@ -6,14 +6,11 @@ import contextlib
 from collections.abc import Iterator
 from typing import Self
 
-from skinware._renamed import renamed
 from skinware.errors import Overrun
 from skinware.memory.announcement import ReaderRecord
-from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
-from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
@@ -233,23 +230,6 @@ class ServiceReader(Taking[SampleT]):
         self._accounts.close()
         self._client.close()
         self._ring.segment.close()
-
-    # -- names of version 0.1.0 -------------------------------------------------------------------------------------
-
-    def peek(self) -> Position | None:
-        """Deprecated: ``latest``."""
-        renamed("ServiceReader.peek()", "ServiceReader.latest")
-        return None if self._ring.state & GENERATION_ENDED else self.latest
-
-    def take_newest(self) -> SampleT:
-        """Deprecated: ``read(timeout_s=0)``."""
-        renamed("ServiceReader.take_newest()", "ServiceReader.read(timeout_s=0)")
-        return self._newest_now(self._ring.copy, True)
-
-    def wake_word(self) -> tuple[Word, int]:
-        """Deprecated: waiting is for ``read``, ``frames`` and :mod:`skinware.aio`."""
-        renamed("ServiceReader.wake_word()", "ServiceReader.read(newer_than=...)")
-        return self._ring.wake_word, self._ring.wake_count
 
     def __enter__(self) -> Self:
         return self

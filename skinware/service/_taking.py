@@ -8,8 +8,8 @@ from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, RingReader, Sample, SampleT
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
-from skinware.service._accounts import Accounts
 from skinware.service._attachment import GENERATION_ENDED, Attachment
+from skinware.service.messages import Accounts
 
 Position = tuple[int, int]
 """(generation, sequence) of a frame."""

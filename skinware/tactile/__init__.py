@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skinware.tactile.baseline import Baseline
-    from skinware.tactile.baseline_settings import BaselineSettings
-    from skinware.tactile.calm import Calm
+    from skinware.tactile.calm import BaselineSettings, Calm
     from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsReader, ContactsSample
@@ -32,8 +31,7 @@ if TYPE_CHECKING:
     from skinware.tactile.motion import MotionSet, RegionMotion, motion_of
     from skinware.tactile.motion_service import MotionReader
     from skinware.tactile.neighbours import neighbours_of_pairs
-    from skinware.tactile.region_files import put_region, read_regions
-    from skinware.tactile.regions import Box, Region, Regions
+    from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions
     from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Taxels
     from skinware.tactile.tracking import ContactKind, TrackingSettings
 
@@ -81,12 +79,10 @@ __all__ = [
 _MODULES = (
     "calm",
     "baseline",
-    "baseline_settings",
     "contacts",
     "tracking",
     "neighbours",
     "regions",
-    "region_files",
     "stages",
     "curves",
     "chain",

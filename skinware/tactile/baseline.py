@@ -27,11 +27,9 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.baseline_settings import BaselineSettings
-from skinware.tactile.calm import Calm
-from skinware.tactile.drift import Drift
+from skinware.tactile.calm import BaselineSettings, Calm
+from skinware.tactile.drift import Drift, Sag
 from skinware.tactile.resting import RestingMeasurement
-from skinware.tactile.sag import Sag
 from skinware.tactile.touches import Touches
 
 UNUSABLE = Status.NEVER_SEEN | Status.STALE | Status.MASKED | Status.NOT_CONNECTED

@@ -31,10 +31,9 @@ from skinware.status import PatchState, Status
 from skinware.structure import Structure
 from skinware.tactile import contacts_service, health_service
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.calm_contacts import CalmContacts, WatchedRegions
-from skinware.tactile.calm_health import CalmHealth
+from skinware.tactile.calm_contacts import CalmContacts, CalmHealth, WatchedRegions
 from skinware.tactile.chain import Chain, ChainSettings
-from skinware.tactile.learned_state import LearnedState
+from skinware.tactile.chain_state import LearnedState
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 

@@ -42,8 +42,7 @@ from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE, Baseline
-from skinware.tactile.baseline_settings import BaselineSettings
-from skinware.tactile.calm import Calm
+from skinware.tactile.calm import BaselineSettings, Calm
 from skinware.tactile.curves import CurveTable, read_curves
 from skinware.tactile.stages import (
     AmplifierSettings,

@@ -21,8 +21,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
-from skinware.tactile.components import Components
-from skinware.tactile.neighbours import area_m2, pitch_m
+from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Places, Tracker, TrackingSettings
 

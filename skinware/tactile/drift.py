@@ -1,4 +1,4 @@
-"""Drift of baselines: what is common to a patch, what is each taxel's own, and how strongly each follows the common."""
+"""Estimate how baselines drift and sag: what a patch has in common, and what each taxel does alone."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-
-from skinware.tactile.group_median import GroupMedian
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -112,3 +110,118 @@ class Drift:
         if over.any():
             self.product[over], self.square[over] = product[over] / 2, square[over] / 2
             self.own[over], self.common[over] = -self.lag[over], 0
+
+
+_COMES_BACK_S = 0.5
+"""So soon after the end of a contact."""
+_AT_MOST = 1.5
+"""Times what a taxel has sunk, it may come back by, and the threshold beyond."""
+
+Rows = npt.NDArray[np.intp]
+
+
+class Sag:
+    """Remembers how far the baselines of n taxels went down while their patch was touched.
+
+    A cover that is pressed sinks around the contact, farther than the module that is held. Free taxels there follow it
+    down, and must go up again when the contact is over, or what comes back would be a touch.
+
+    Args:
+        module: (n,) int, the module of each taxel.
+        patch: (n,) int, the patch of each taxel.
+    """
+
+    def __init__(self, module: Rows, patch: Rows) -> None:
+        self._module, self._patch = module, patch
+        self._patch_of_module = np.zeros(int(module.max(initial=-1)) + 1, np.intp)
+        self._patch_of_module[module] = patch
+        self._is_touched = np.zeros(len(self._patch_of_module), bool)
+        self._in_contact = np.zeros(int(patch.max(initial=-1)) + 1, bool)
+        self._since_end_s = np.full(len(self._in_contact), np.inf)
+        self._sunk: Floats = np.zeros(len(module), np.float32)
+
+    def sink(self, by: Floats) -> None:
+        """Baselines went down (n,) so far beside common drift; up, below 0."""
+        if self._in_contact.any():
+            self._sunk += by * self._in_contact[self._patch]
+            np.maximum(self._sunk, 0, out=self._sunk)
+
+    def come_back(self, deviation: Floats, touched: Flags, off: Floats, passed_s: float) -> Floats:
+        """Follow the contacts; (n,) how far the baselines of those whose sag is over have to go up.
+
+        Args:
+            deviation: (n,) of the values from the baselines.
+            touched: (n,) which taxels were touched in the last frame.
+            off: (n,) threshold below which a touch ends.
+            passed_s: since the last frame.
+        """
+        is_touched = np.zeros(len(self._is_touched), bool)
+        is_touched[self._module[touched]] = True
+        self._since_end_s += passed_s
+        self._since_end_s[self._patch_of_module[self._is_touched & ~is_touched]] = 0
+        self._is_touched = is_touched
+        self._in_contact[:] = False
+        self._in_contact[self._patch_of_module[is_touched]] = True
+        is_ending = self._since_end_s < _COMES_BACK_S
+        if not is_ending.any():
+            if not self._in_contact.all():
+                self._sunk *= self._in_contact[self._patch]
+            return np.zeros_like(self._sunk)
+        is_back = is_ending[self._patch] & (deviation > off) & (deviation < _AT_MOST * self._sunk + off)
+        up = self._sunk * is_back
+        self._sunk -= up
+        return up
+
+
+_WIDEST_WASTE = 2
+"""Groups share a table as long as its rows are at most so many times as wide as the smallest of them."""
+
+
+class GroupMedian:
+    """Medians of n values by group, of those that count.
+
+    Groups of similar size are rows of one table, which is sorted at once: one huge group beside a thousand small ones
+    costs no more than their members.
+
+    Args:
+        group: (n,) int, the group of each value, 0 or more.
+    """
+
+    def __init__(self, group: npt.NDArray[np.integer]) -> None:
+        self.n_groups = int(group.max(initial=-1)) + 1
+        self._group = group
+        sizes = np.bincount(group, minlength=self.n_groups)
+        members = np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1])
+        self._tables: list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]] = []
+        by_size = [int(number) for number in np.argsort(sizes, kind="stable") if sizes[number]]
+        while by_size:
+            widest = _WIDEST_WASTE * sizes[by_size[0]]
+            rows = [number for number in by_size if sizes[number] <= widest]
+            by_size = by_size[len(rows) :]
+            table = np.full((len(rows), sizes[rows[-1]]), len(group), np.intp)  # beyond the values stands infinity
+            for row, number in enumerate(rows):
+                table[row, : sizes[number]] = members[number]
+            self._tables.append((np.array(rows, np.intp), table))
+        self._values = np.full(len(group) + 1, np.inf, np.float32)
+
+    def __call__(
+        self, values: npt.NDArray[np.float32], counts: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.intp]]:
+        """The medians.
+
+        Args:
+            values: (n,) finite where they count.
+            counts: (n,) which of them count.
+
+        Returns:
+            (n_groups,) medians, NaN where none counts; (n_groups,) how many do.
+        """
+        medians = np.full(self.n_groups, np.nan, np.float32)
+        found = np.bincount(self._group[counts], minlength=self.n_groups)
+        self._values[:-1] = np.where(counts, values, np.inf)
+        for rows, table in self._tables:
+            ordered = np.sort(self._values[table], axis=1)
+            each, number = np.arange(len(rows)), found[rows]
+            twice = ordered[each, np.maximum(number - 1, 0) // 2] + ordered[each, number // 2]
+            medians[rows] = np.where(number > 0, twice / 2, np.nan)
+        return medians, found

@@ -30,11 +30,10 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
-from skinware.tactile.between import Pairs
 from skinware.tactile.calm import Calm
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
-from skinware.tactile.neighbours import NONE, Table, neighbours
-from skinware.tactile.noise import Noise
+from skinware.tactile.neighbours import NONE, Pairs, Table, neighbours
+from skinware.tactile.resting import Noise
 
 _APART_S = 1.0
 """Touches of a taxel with less time between them are one."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.calm import BaselineSettings
 
 _LEVEL_RISES_S, _LEVEL_FALLS_S = 2.0, 20.0
 """Of the level that a contact is held at: a bump of a moment must not raise it, a weaker grip may become the rule."""

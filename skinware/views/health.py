@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusReason, BusState, PatchState, Status
+from skinware.status import BusReason, BusState, PatchState, Status, is_fresh
 
 if TYPE_CHECKING:
     import numpy.typing as npt

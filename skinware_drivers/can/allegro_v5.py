@@ -46,10 +46,9 @@ from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sen
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing, Unframed
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

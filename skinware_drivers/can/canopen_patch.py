@@ -29,9 +29,8 @@ from skinware_drivers.can.sdo import SdoAborted, SdoClient
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match, Reply
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options, nearest_name
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Notice, Poll
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

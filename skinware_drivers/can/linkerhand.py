@@ -43,9 +43,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
+from skinware_drivers.polling import Poll, Watch, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

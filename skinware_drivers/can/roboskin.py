@@ -50,7 +50,7 @@ from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
-from skinware_drivers.watch import Watch
+from skinware_drivers.polling import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from skinware.status import Status
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.watch import Watch
+from skinware_drivers.polling import Watch
 
 _RECALIBRATION_CYCLES = 5
 _ZERO, _ALL = 1, (1 << _RECALIBRATION_CYCLES) - 1

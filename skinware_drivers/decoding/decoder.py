@@ -20,6 +20,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.device_stamps import DeviceStamps
@@ -30,7 +31,6 @@ from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
 from skinware_drivers.numbering import SequenceNumber
-from skinware_drivers.samples import Samples
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

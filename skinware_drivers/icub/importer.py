@@ -11,8 +11,7 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
-from skinware.tactile.region_files import regions_to_toml
-from skinware.tactile.regions import Region
+from skinware.tactile.regions import Region, regions_to_toml
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import check_drawings, places_of, read_body
 from skinware_drivers.icub.device import DeviceReader

@@ -34,7 +34,7 @@ from skinware_drivers.modbus.order_watch import OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.options import check_options
-from skinware_drivers.watch import Watch
+from skinware_drivers.polling import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -29,7 +29,7 @@ from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.order_watch import OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.options import check_options
-from skinware_drivers.watch import Watch
+from skinware_drivers.polling import Watch
 
 _FIRST, _BYTES = 3000, 2
 _FULL_SCALE = 4096

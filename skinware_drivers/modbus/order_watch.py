@@ -7,7 +7,7 @@ import logging
 from skinware.status import Status
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.zero_watch import ZeroWatch
+from skinware_drivers.polling import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

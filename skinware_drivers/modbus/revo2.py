@@ -31,11 +31,9 @@ from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.revo2_editions import EDITIONS, EditionName, content
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
-from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
+from skinware_drivers.polling import Notice, Watch, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -1,8 +1,7 @@
 """Options of drivers and emulators: declared as structs, written by people as text or TOML, checked."""
 
 from skinware_drivers.options.declared import HasOptions, NoOptions, Option, check_names, describe_options
-from skinware_drivers.options.names import nearest_name
-from skinware_drivers.options.texts import OptionsT, check_options, option_text, options_from_strings
+from skinware_drivers.options.texts import OptionsT, check_options, nearest_name, option_text, options_from_strings
 
 __all__ = [
     "HasOptions",

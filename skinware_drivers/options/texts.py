@@ -1,20 +1,33 @@
-"""Options as people write them: texts of bus queries and command lines become typed, checked structs, and back.
-
-Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9``; and any of them as ``0x710``.
-"""
+"""Turn texts of options into values, and suggest the nearest name for a wrong one."""
 
 from __future__ import annotations
 
+import difflib
 import re
 import types
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options.names import nearest_name
+
+SOURCE_SUFFIX = ".py"
+
+
+def nearest_name(wrong: str, right: Iterable[str]) -> str:
+    """The end of an error message about an unknown name: the nearest right one, and all there are."""
+    names = sorted(right)
+    nearest = difflib.get_close_matches(wrong, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
+    return f"{hint} Known: {', '.join(names) or 'none'}"
+
+
+def is_file(name: str) -> bool:
+    """Whether a name is that of a file, not of something that is registered."""
+    return name.endswith(SOURCE_SUFFIX)
+
 
 OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
 

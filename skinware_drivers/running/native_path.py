@@ -23,8 +23,8 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch, compile_decoder, why_not
+from skinware_drivers.polling import Watch
 from skinware_drivers.running.publisher import Publisher
-from skinware_drivers.watch import Watch
 
 Rows = npt.NDArray[np.int64]
 

@@ -13,7 +13,7 @@ from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.status import PatchState
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.description import Patch
-from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Notice
 from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation

@@ -9,18 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
-from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
-from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, Status
+from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, Status, age_limit_ns
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
+from skinware_drivers.polling import Watch
 from skinware_drivers.running.attention import HoldUp
 from skinware_drivers.running.bursts import Bursts
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.patch_timing import PatchTiming
-from skinware_drivers.watch import Watch
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""

@@ -33,9 +33,9 @@ from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.framing import Encoding, Field, Framing, Unframed

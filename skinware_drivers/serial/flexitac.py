@@ -32,8 +32,8 @@ from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Frame, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.packets import Packet

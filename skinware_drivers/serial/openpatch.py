@@ -21,8 +21,8 @@ from skinware.sensor_types import SensorType
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
+from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import CRC32

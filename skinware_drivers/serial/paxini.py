@@ -26,10 +26,9 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.hand import Hand
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Notice, Poll, Watch, ZeroWatch
 from skinware_drivers.serial import paxini_converter, paxini_high_speed
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import LRC
@@ -39,8 +38,6 @@ from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
 from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
 
 _HEADERS = 48
 """More than there is around the taxels in any body."""

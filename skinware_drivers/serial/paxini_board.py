@@ -9,8 +9,7 @@ from skinware.geometry import Geometry
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
-from skinware_drivers.notice import Notice
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Notice, Poll
 from skinware_drivers.serial.framing import Framing
 
 

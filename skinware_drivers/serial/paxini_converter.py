@@ -23,8 +23,7 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Notice, Poll
 from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing

@@ -36,12 +36,11 @@ from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifie
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Watch, ZeroWatch
 from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.splitting import Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

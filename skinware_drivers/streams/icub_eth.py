@@ -23,10 +23,10 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Watch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.streams.icub_rops import rops
-from skinware_drivers.watch import Watch
 
 
 class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

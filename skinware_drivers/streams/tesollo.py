@@ -34,16 +34,13 @@ from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Notice, Poll, Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.length_first import LengthFirst
 from skinware_drivers.serial.splitting import Part, Split, by_length
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -35,13 +35,11 @@ from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Notice, Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.streams.xela_messages import RAW, Seen, XelaMessages
-from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -29,8 +29,8 @@ from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGL
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options
+from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.streams.yarp_messages import LENGTH, MOST_VALUES, PLAIN, TIMED, VALUES_OF_A_FRAME, YarpMessages

@@ -22,10 +22,10 @@ from skinware.memory.namespace import Namespace
 from skinware_drivers import native
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
+from skinware_drivers.polling import Watch
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.one_path import Marking, NativeWay, NumpyWay, Publishing, Way
 from skinware_drivers.virtual.hand_clock import HandClock, package_on
-from skinware_drivers.watch import Watch
 
 
 class Pair:

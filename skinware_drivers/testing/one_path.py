@@ -18,10 +18,10 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
+from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
 from skinware_drivers.testing.defect import defect
-from skinware_drivers.watch import Watch
 
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
 _OF_STATE = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -34,8 +33,6 @@ def read_until(
     reader: DriverReader,
     condition: Callable[[DriverSnapshot], bool],
     within_s: float = PATIENCE_S,
-    *,
-    frames: int | None = None,
 ) -> DriverSnapshot:
     """The first frame that fulfils a condition; fails the test if none does in time, and tells what was in the last.
 
@@ -43,10 +40,7 @@ def read_until(
         reader: of the driver.
         condition: to be fulfilled.
         within_s: how long to wait, s.
-        frames: means nothing any more: say ``within_s``.
     """
-    if frames is not None:
-        warnings.warn("read_until(frames=...): say how long, within_s=...", DeprecationWarning, stacklevel=2)
     end, last, count = time.monotonic() + within_s, None, 0
     try:
         for frame in reader.in_order(timeout_s=within_s):

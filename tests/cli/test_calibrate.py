@@ -18,9 +18,8 @@ from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command
 from skinware.geometry import Geometry, geometry_to_toml, read_geometry
 from skinware.sensor_types import PRESSURE
-from skinware.tactile.calibration.sessions import PressSession, StrokeSession
-from skinware.tactile.calibration.state import save_session
-from skinware.tactile.calibration.strokes import StrokeSums
+from skinware.tactile.calibration.state import PressSession, StrokeSession, save_session
+from skinware.tactile.calibration.topology import StrokeSums
 from skinware.tactile.testing import Surface, triangles
 from skinware.tactile.testing.probe import Probe
 from skinware_drivers.testing.waiting import wait_until

@@ -20,8 +20,7 @@ from skinware.cli._command import exit_status
 from skinware.cli.regions import command
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
-from skinware.tactile.region_files import put_region, read_regions
-from skinware.tactile.regions import Region
+from skinware.tactile.regions import Region, put_region, read_regions
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import BIN, PATIENCE_S, run
 from tests.tactile.skins import triangles

@@ -13,8 +13,7 @@ from skinware import Namespace
 from skinware.cli import top
 from skinware.cli._command import exit_status
 from skinware.cli.top import command
-from skinware.tactile.region_files import put_region
-from skinware.tactile.regions import Region
+from skinware.tactile.regions import Region, put_region
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.commands import BIN, PATIENCE_S
 

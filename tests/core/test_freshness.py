@@ -11,8 +11,8 @@ import pytest
 
 from skinware import DriverReader, DriverWriter, Skin, Status
 from skinware.errors import ServiceTimeout
-from skinware.freshness import age_limit_ns, is_fresh
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import age_limit_ns, is_fresh
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_process, fake_structure
 

@@ -16,7 +16,7 @@ import pytest
 
 from skinware import DriverWriter, Skin, Snapshot, native
 from skinware.errors import Closed, ServiceTimeout
-from skinware.memory.native_look import Look
+from skinware.memory.native_ring import Look
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 

@@ -21,7 +21,7 @@ import pytest
 
 from skinware import Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Closed, ServiceTimeout
-from skinware.memory import native_look, native_ring
+from skinware.memory import native_ring
 from skinware.memory.native_ring import NativeRingReader, NativeRingWriter
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled
@@ -353,7 +353,7 @@ def test_no_frame_is_torn_whatever_is_checked(
     assert told["torn"] == 0
     assert told["timed"] == told["ages"] == 10000
     assert all(told[way] > 0 for way in ("turns", "in_order", "copies", "waits", "looks")), told
-    structures = native_ring._Request, native_ring._TurnsState, native_ring._WriterState, native_look._LookState
+    structures = native_ring._Request, native_ring._TurnsState, native_ring._WriterState, native_ring._LookState
     assert told["sizes"] == [ctypes.sizeof(one) for one in structures]
 
 

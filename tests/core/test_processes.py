@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from skinware.memory import processes
-from skinware.memory.processes import ENDED, UNKNOWN, Process, ProcessWatch, has_ended, this_process
+from skinware.memory import locks
+from skinware.memory.locks import ENDED, UNKNOWN, Process, ProcessWatch, has_ended, this_process
 
 
 def test_a_process_that_runs_has_not_ended() -> None:
@@ -57,14 +57,14 @@ def test_of_other_pid_namespaces_and_without_rights_nothing_is_known(monkeypatch
     assert has_ended(ended)
     assert not has_ended(ended._replace(pid_namespace=ended.pid_namespace + 1))
     assert not has_ended(ended._replace(start_ticks=0))
-    monkeypatch.setattr(processes, "_start_ticks", lambda _: 0)  # hidepid
+    monkeypatch.setattr(locks, "_start_ticks", lambda _: 0)  # hidepid
     assert not has_ended(ended)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, for pid namespaces")
 def test_a_proc_of_another_pid_namespace_makes_no_process_dead() -> None:
     program = """
-from skinware.memory.processes import Process, has_ended, this_process
+from skinware.memory.locks import Process, has_ended, this_process
 mine = this_process()
 assert mine.pid < 10, mine  # its own numbers, and the /proc of its parent
 print(has_ended(mine))

@@ -12,7 +12,7 @@ import pytest
 
 from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
-from skinware.memory import _fences, file_layout, segments
+from skinware.memory import file_layout, futex, segments
 from skinware.memory import ring as ring_module
 from skinware.memory.native_ring import ring_reader, ring_writer
 from skinware.memory.schema import Schema
@@ -74,13 +74,13 @@ def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
 
 @pytest.mark.parametrize("compiled", [None, native.core()], ids=["libatomic", "compiled"])
 def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch, compiled: native.Library | None) -> None:
-    fence = _fences.fence_for("aarch64", compiled)
+    fence = futex.fence_for("aarch64", compiled)
     monkeypatch.setattr(ring_module, "fence", fence)
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 7)
         assert reader.read().column("values")[0] == 7
     with pytest.raises(PlatformError, match="libatomic1"):
-        _fences.fence_for("aarch64", library="libmissing.so.9")
+        futex.fence_for("aarch64", library="libmissing.so.9")
 
 
 # -- losses -------------------------------------------------------------------------------------------------------

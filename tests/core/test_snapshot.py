@@ -180,22 +180,3 @@ def test_a_silent_driver_does_not_hold_the_moment_back() -> None:
             snapshot = next(skin.frames(100, align=True))
             assert snapshot.raw("pressure").tolist() == [2] * 10 + [1] * 10
             assert snapshot.spread_s == pytest.approx(4.999)
-
-
-def test_names_of_the_version_before_go_on_with_a_warning() -> None:
-    with DriverWriter("a", fake_structure(1, 1)) as writer:
-        publish(writer, 7)
-        with skin_of("a") as skin, DriverReader("a") as reader:
-            snapshot = skin.read()
-            with pytest.warns(DeprecationWarning, match=r"Snapshot\.values is called Snapshot\.raw now"):
-                assert snapshot.values("pressure").tolist() == [7] * 10
-            with pytest.warns(DeprecationWarning, match="Snapshot.status_of"):
-                assert not snapshot.status("pressure").any()
-            with pytest.warns(DeprecationWarning, match="latest"):
-                assert reader.peek() == reader.latest
-            with pytest.warns(DeprecationWarning, match="read"):
-                assert reader.take_newest().position == reader.latest
-            with pytest.warns(DeprecationWarning, match="newer_than"):
-                assert isinstance(reader.wake_word()[1], int)
-            with pytest.warns(DeprecationWarning, match="DriverCallback"):
-                assert skinware.skin.Told is skinware.skin.DriverCallback

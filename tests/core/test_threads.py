@@ -136,14 +136,3 @@ def test_a_worker_that_waits_is_stopped() -> None:
         paused.pause()
         paused.stop()
         assert not paused.active
-
-
-def test_names_of_the_version_before_go_on_with_a_warning() -> None:
-    def fill(columns: dict[str, npt.NDArray[Any]]) -> None:
-        columns["values"][0] = 1
-
-    with pytest.warns(DeprecationWarning, match=r"threads\.write is called threads\.start_writer now"):
-        writer = threads.write(ServiceWriter("x", SMALL), fill, rate_hz=100)
-    with writer:
-        with pytest.warns(DeprecationWarning, match=r"threads\.start_reader"):
-            threads.read(ServiceReader[Sample]("x"), lambda _: None, rate_hz=100).stop()

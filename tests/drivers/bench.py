@@ -20,7 +20,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
-from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Notice
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.emulator import Emulator
 from skinware_drivers.virtual.events import FrameFault

@@ -14,7 +14,7 @@ import pytest
 from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware_drivers.can.canopen_patch import CanopenDriver, CanopenOptions, MappingChanged
-from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Notice
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until

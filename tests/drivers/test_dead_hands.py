@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from skinware.status import Status
+from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
@@ -20,7 +21,6 @@ from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
 from skinware_drivers.virtual.emulator import Emulator
-from skinware_drivers.zero_watch import ZeroWatch
 
 pytestmark = pytest.mark.usefixtures("namespace")
 

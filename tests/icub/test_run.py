@@ -13,8 +13,7 @@ import pytest
 from skinware import DriverReader, PatchState
 from skinware.cli._command import exit_status
 from skinware.geometry import read_geometry
-from skinware.tactile.region_files import read_regions
-from skinware.tactile.regions import Region
+from skinware.tactile.regions import Region, read_regions
 from skinware_drivers.cli.import_ import command
 from tests.commands import run, running
 from tests.icub.conftest import DEFAULTS, WRAPPER, Made, board_sets, device, triangle_sets

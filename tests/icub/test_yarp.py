@@ -11,7 +11,7 @@ import pytest
 from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware.geometry import read_geometry
-from skinware.tactile.region_files import read_regions
+from skinware.tactile.regions import read_regions
 from skinware_drivers.cli.import_ import command
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.streams.yarp import Triangles, YarpOptions

@@ -18,11 +18,11 @@ from skinware_drivers.description import assemble
 from skinware_drivers.link import Link
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.dfrobot import DfrobotDriver, DfrobotOptions
+from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot, EmulatedDfrobotOptions
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import Action, device, rtu_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, with_options
 

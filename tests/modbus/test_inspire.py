@@ -19,11 +19,11 @@ from skinware_drivers.hand import FRAME
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.registers import Wanted
+from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.inspire import EmulatedInspire, EmulatedInspireOptions
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import device, rtu_server, tcp_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 

@@ -17,7 +17,7 @@ from skinware_drivers.description import assemble
 from skinware_drivers.link import Link
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
-from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Notice
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until

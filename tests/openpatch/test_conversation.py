@@ -10,7 +10,7 @@ import pytest
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
-from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Notice
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.serial.openpatch_description import BadDescription

@@ -10,7 +10,7 @@ from unittest import mock
 
 import msgspec
 
-from skinware import freshness
+from skinware import status
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
@@ -243,7 +243,7 @@ def driving(
 ) -> Iterator[Driving]:
     lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
     with (
-        mock.patch.object(freshness, "_LEAST_NS", SILENCE_NS),
+        mock.patch.object(status, "_LEAST_NS", SILENCE_NS),
         driving_lines(
             lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
         ) as running,

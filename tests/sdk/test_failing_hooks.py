@@ -19,13 +19,12 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
-from skinware_drivers.polling import Poll
+from skinware_drivers.polling import Poll, Watch
 from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
-from skinware_drivers.watch import Watch
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

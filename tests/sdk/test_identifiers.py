@@ -108,8 +108,3 @@ def test_the_flag_in_the_value_says_it() -> None:
     assert Identifier(RIGHT).extended
     assert not Identifier(0x7FF).extended
     assert Identifier(RIGHT, 0xFF00) == Identifier(RIGHT, EXTENDED_FLAG | 0xFF00)
-
-
-def test_the_way_of_before_is_told_of_the_new_one() -> None:
-    with pytest.warns(DeprecationWarning, match=r"write Identifier\(EXTENDED_FLAG \| 0x18DA00F1\)"):
-        assert Identifier(WRONG, extended=True) == Identifier(RIGHT)

@@ -16,8 +16,8 @@ from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import NoOptions
+from skinware_drivers.polling import Notice
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import skinware_drivers
 from skinware.errors import ConfigurationError
-from skinware_drivers import layout as vocabulary
 from skinware_drivers.decoding.sequences import read_numbers
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 
@@ -58,12 +56,3 @@ def test_a_counter_that_cannot_be_is_refused(counter: Any, of_frames: dict[str, 
 def test_each_member_may_have_its_counter_elsewhere() -> None:
     counters = [SequenceNumber(0, "u1"), SequenceNumber(1, "u1")]
     assert cycle_of(counters).cycle.counters == counters  # type: ignore[union-attr]
-
-
-def test_the_old_names_say_what_the_new_ones_are() -> None:
-    for place in (skinware_drivers, vocabulary):
-        with pytest.warns(DeprecationWarning, match="Stamp is now SequenceNumber"):
-            assert place.Stamp is SequenceNumber
-    with pytest.warns(DeprecationWarning, match="stamp=...\\) is now Frame\\(sequence=...\\)"):
-        frame = Frame("f", length=[1], values=Values(0, "u1", 1), stamp=SequenceNumber(0, "u1"))
-    assert frame.sequence == SequenceNumber(0, "u1")

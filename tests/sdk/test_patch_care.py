@@ -15,8 +15,8 @@ from skinware.status import PatchState
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
-from skinware_drivers.notice import Notice
 from skinware_drivers.options import NoOptions
+from skinware_drivers.polling import Notice
 from skinware_drivers.running import patch_care
 from skinware_drivers.running.patch_care import PatchCare
 

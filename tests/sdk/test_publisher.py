@@ -7,9 +7,9 @@ import pytest
 
 from skinware import DriverReader, DriverWriter, PatchState, Status
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.polling import Watch
 from skinware_drivers.running import publisher as publisher_module
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
-from skinware_drivers.watch import Watch
 from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
 
 PERIOD_S = 0.05

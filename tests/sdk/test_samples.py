@@ -9,13 +9,13 @@ import pytest
 from skinware import DriverReader
 from skinware.samples import Unused, sample_report, sample_text
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import samples
+from skinware_drivers import counters
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.counters import Samples
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Values
 from skinware_drivers.options import NoOptions
-from skinware_drivers.samples import Samples
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.clock import run_in_its_time
@@ -53,7 +53,7 @@ class Babbler:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     now = [0]
-    monkeypatch.setattr(samples, "now_ns", lambda: now[0])
+    monkeypatch.setattr(counters, "now_ns", lambda: now[0])
     return now
 
 

@@ -12,10 +12,9 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers import EXTENDED_FLAG, Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.conditions import Byte
-from skinware_drivers.counters import BusCounters
+from skinware_drivers.counters import BusCounters, Samples
 from skinware_drivers.running import patch_care
 from skinware_drivers.running.unused_frames import why_unused
-from skinware_drivers.samples import Samples
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import Chatter, TroubledBus, driving_lines
 

@@ -10,10 +10,9 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.calibration.presses import Presses
+from skinware.tactile.calibration.placing import Presses
 from skinware.tactile.calibration.shapes import Shape, shapes_of
-from skinware.tactile.calibration.strokes import StrokeSums
-from skinware.tactile.calibration.topology import Topology, shortest_m
+from skinware.tactile.calibration.topology import StrokeSums, Topology, shortest_m
 from skinware.tactile.testing import Response, Surface, World
 from skinware_drivers.icub.notes import Notes
 from skinware_drivers.icub.positions import read_positions

@@ -16,8 +16,7 @@ from hypothesis.extra import numpy as hnp
 from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_settings import BaselineSettings
-from skinware.tactile.calm import Calm
+from skinware.tactile.calm import BaselineSettings, Calm
 from skinware.tactile.testing import World, grid
 from tests.cli.fake_skin import FakeSkin
 

@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 
 from skinware.geometry import Geometry
-from skinware.tactile.between import Pairs
-from skinware.tactile.neighbours import neighbours
+from skinware.tactile.neighbours import Pairs, neighbours
 from tests.tactile.skins import PITCH_M, placed, triangles
 
 

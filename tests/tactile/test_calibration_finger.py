@@ -7,7 +7,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.calibration.finger import place_finger
-from skinware.tactile.calibration.presses import Presses
+from skinware.tactile.calibration.placing import Presses
 from skinware.tactile.calibration.shapes import shapes_of
 from skinware.tactile.testing import arm
 from tests.tactile.calibrating import off_m, presses, shapes

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware.tactile.calibration.placing import place
-from skinware.tactile.calibration.presses import Press, Presses, PressFinder
+from skinware.tactile.calibration.placing import Press, Presses, PressFinder, place
 from skinware.tactile.calibration.results import confidence_of
 from skinware.tactile.calibration.shapes import shapes_of
 from skinware.tactile.testing import Surface, arm, triangles

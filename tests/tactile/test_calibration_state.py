@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware.tactile.calibration.sessions import PressSession, Session, StrokeSession
-from skinware.tactile.calibration.state import restore_session, save_session
+from skinware.tactile.calibration.state import PressSession, Session, StrokeSession, restore_session, save_session
 
 UID = np.arange(4, dtype=np.uint64) + 7
 PERIOD_NS = 20_000_000

@@ -10,9 +10,7 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware.tactile.calibration.checking import Finding, check_file, check_strokes
 from skinware.tactile.calibration.shapes import rigid
-from skinware.tactile.calibration.strokes import MOST_TAXELS, StrokeSums
-from skinware.tactile.calibration.topology import Topology, topology_of
-from skinware.tactile.calibration.unrolling import unrolled_m
+from skinware.tactile.calibration.topology import MOST_TAXELS, StrokeSums, Topology, topology_of, unrolled_m
 from skinware.tactile.testing import Surface, arm, triangles
 from tests.tactile.calibrating import (
     DATA,

@@ -16,13 +16,12 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceReader, ServiceWriter, Status
 from skinware.errors import BadServiceFile
 from skinware.sensor_types import SHEAR_X, TEMPERATURE
-from skinware.tactile.calm_health import CalmHealth
+from skinware.tactile.calm_contacts import CalmHealth
 from skinware.tactile.chain import Chain, ChainSettings
-from skinware.tactile.chain_state import save_state
+from skinware.tactile.chain_state import LearnedState, save_state
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader, HealthWriter
-from skinware.tactile.learned_state import LearnedState
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.tactile.test_calm_contacts import calming, press
 

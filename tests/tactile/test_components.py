@@ -11,8 +11,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from skinware.tactile.components import Components
-from skinware.tactile.neighbours import NONE, neighbours, neighbours_of_pairs
+from skinware.tactile.neighbours import NONE, Components, neighbours, neighbours_of_pairs
 from tests.tactile.skins import placed, triangles
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.calm import BaselineSettings
 from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.testing import Response, World, grid

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skinware.tactile.group_median import GroupMedian
+from skinware.tactile.drift import GroupMedian
 
 
 @given(st.data())

@@ -8,7 +8,7 @@ import pytest
 
 from skinware._columns import Index
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.calm import BaselineSettings
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.motion import MotionSet, motion_of
 from skinware.tactile.neighbours import neighbours

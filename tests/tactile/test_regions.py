@@ -17,9 +17,7 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.painting import without_holes
-from skinware.tactile.region_files import put_region, read_regions, regions_to_toml
-from skinware.tactile.regions import Box, Region, Regions
+from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions, regions_to_toml, without_holes
 from tests.tactile.skins import placed, pressed, triangles
 
 HEAD = 'format = "skinware-regions"\nversion = 1\n'

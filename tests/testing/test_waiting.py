@@ -31,13 +31,6 @@ def test_it_waits_for_seconds_not_for_frames_and_says_what_it_saw() -> None:
     assert "unknown: 7, for example 18DA00F1 [8] 01 02 03 04 05 06 07 08" in words
 
 
-def test_how_many_frames_is_no_longer_asked() -> None:
-    with FakeSkin("torso") as skin, DriverReader("torso") as reader:
-        skin.publish()
-        with pytest.warns(DeprecationWarning, match="within_s="):
-            read_until(reader, lambda frame: True, frames=5)
-
-
 @pytest.mark.thorough
 def test_values_are_tested_first_and_silence_last() -> None:
     """So that with ``pytest -x`` the byte order is told, and not a silence that comes of it."""

@@ -36,8 +36,8 @@ from processes import own_namespace
 
 from skinware import DriverReader, DriverWriter, Namespace
 from skinware.errors import Overrun, ServiceNotFound, ServiceTimeout, SkinwareError, StructureChanged
-from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware.status import age_limit_ns
 from skinware_drivers.testing.leaks import Belongings
 from tests.bridge.net import Net
 from tests.bridge.rig import joining, publish, serving, structure

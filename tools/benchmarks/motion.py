@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.calm import BaselineSettings
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import NONE, neighbours

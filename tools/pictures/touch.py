@@ -15,8 +15,7 @@ import numpy.typing as npt
 from skinware import Structure
 from skinware.sensor_types import PRESSURE
 from skinware.tactile import Baseline, Box, Contacts, Health, HealthKind, HealthSettings, Region, Regions
-from skinware.tactile.calibration.placing import place
-from skinware.tactile.calibration.presses import Presses
+from skinware.tactile.calibration.placing import Presses, place
 from skinware.tactile.calibration.shapes import shapes_of
 from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import neighbours

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.tactile.calibration.placing import Placement, place
-from skinware.tactile.calibration.presses import Presses
+from skinware.tactile.calibration.placing import Placement, Presses, place
 from skinware.tactile.calibration.shapes import Pose, Shape, fitted
 
 ArrayF = npt.NDArray[np.float64]

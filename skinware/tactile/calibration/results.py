@@ -8,8 +8,7 @@ import numpy.typing as npt
 from skinware.geometry import GeometryGroup, Triple
 from skinware.structure import Structure
 from skinware.tactile.calibration.placing import Placement
-from skinware.tactile.calibration.topology import Topology
-from skinware.tactile.calibration.unrolling import unrolled_m
+from skinware.tactile.calibration.topology import Topology, unrolled_m
 
 ArrayF = npt.NDArray[np.float64]
 

@@ -1,21 +1,90 @@
-"""Who lies beside whom, and how far apart, from strokes alone.
-
-For touches of the shape of a bell, sqrt(-ln S) grows in proportion to the distance of two taxels, where S is the
-cosine between what they felt. Nothing else is needed but one length: the pitch of the lattice.
-"""
+"""Map a skin from strokes alone: which taxels are near, how far apart, and a flat map of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.calibration.strokes import StrokeSums
-from skinware.tactile.components import Components
-from skinware.tactile.neighbours import neighbours_of_pairs
+from skinware.errors import ConfigurationError
+from skinware.tactile.neighbours import Components, neighbours_of_pairs
 
 ArrayF = npt.NDArray[np.float64]
+
+MOST_TAXELS = 6000
+"""Every taxel is compared with every other one: so many need 290 MB."""
+ENOUGH_FRAMES = 20
+"""A taxel that felt something in so many frames is covered."""
+_LEAST_FRAMES = 8
+"""With fewer, what a taxel felt may be noise, and tells nothing."""
+
+
+@dataclass
+class StrokeSums:
+    """The sums over all frames that a topology is found from.
+
+    Attributes:
+        products: (n, n) float64, sum of the products of the loads of each pair of taxels.
+        active: (n,) int64, frames in which each felt something.
+        frames: number of frames in which any of them did.
+    """
+
+    products: ArrayF
+    active: npt.NDArray[np.int64]
+    frames: int = 0
+
+    @classmethod
+    def empty(cls, n: int) -> Self:
+        """Of n taxels, before the first frame.
+
+        Raises:
+            ConfigurationError: there are too many.
+        """
+        if n > MOST_TAXELS:
+            raise ConfigurationError(f"{n} taxels: a topology is found of at most {MOST_TAXELS} at a time")
+        return cls(np.zeros((n, n)), np.zeros(n, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.active)
+
+    def add(self, load: npt.NDArray[Any]) -> None:
+        """Take one frame, or many.
+
+        Args:
+            load: (n,) or (m, n): 0 where nothing touches, NaN where it is not known.
+        """
+        loads = np.nan_to_num(np.atleast_2d(np.asarray(load, np.float64)), posinf=0.0)
+        np.maximum(loads, 0, out=loads)
+        loads = loads[(loads > 0).any(axis=1)]
+        if not len(loads):
+            return
+        taxels = np.flatnonzero((loads > 0).any(axis=0))
+        felt = loads[:, taxels]
+        self.products[np.ix_(taxels, taxels)] += felt.T @ felt
+        self.active[taxels] += (felt > 0).sum(axis=0)
+        self.frames += len(loads)
+
+    @property
+    def covered(self) -> npt.NDArray[np.bool_]:
+        """(n,) bool: felt something in at least 20 frames."""
+        return self.active >= ENOUGH_FRAMES
+
+    @property
+    def known(self) -> npt.NDArray[np.bool_]:
+        """(n,) bool: felt something in enough frames to be compared with others."""
+        return self.active >= _LEAST_FRAMES
+
+    def similarity(self) -> ArrayF:
+        """(n, n), 0 to 1: the cosine between what two taxels felt over time; 0 with one that is not known."""
+        length = np.sqrt(np.diag(self.products))
+        known = self.known & (length > 0)
+        scale = np.where(known, 1 / np.where(known, length, 1), 0)
+        similarity: ArrayF = np.clip(self.products * scale[:, None] * scale, 0, 1)
+        return similarity
+
+
 ArrayI = npt.NDArray[np.int64]
 
 PITCH_M = 0.0065
@@ -95,3 +164,60 @@ def shortest_m(distance_m: ArrayF) -> ArrayF:
     for between in range(len(ways)):
         np.minimum(ways, ways[:, between, None] + ways[None, between], out=ways)
     return ways
+
+
+_ROUNDS = 200
+_ENOUGH = 1e-5
+"""Of the stress, by which a round must still lower it."""
+_FAR_WEIGHT = 0.002
+"""Of a way over several taxels, beside that of a measured distance of the same length."""
+
+
+def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
+    """(k, 2) places of k taxels of one piece on a map, m, with their mean at 0. It may be the mirror image.
+
+    Classical multidimensional scaling of the ways along the skin, then majorisation of the stress, in which measured
+    distances count most.
+
+    Args:
+        topology: with their distances.
+        taxels: (k,) of one piece.
+    """
+    ways = topology.geodesics_m(taxels)
+    if len(taxels) == 1:
+        return np.zeros((1, 2))
+    ways[~np.isfinite(ways)] = ways[np.isfinite(ways)].max()
+    places = _scaled(ways)
+    measured = np.isfinite(topology.distance_m[np.ix_(taxels, taxels)])
+    typical = float(np.median(ways[measured])) if measured.any() else 1.0
+    with np.errstate(divide="ignore"):
+        weight = np.where(measured, 1.0, _FAR_WEIGHT * (typical / ways) ** 2)
+    np.fill_diagonal(weight, 0)
+    return _majorised(places, ways, weight)
+
+
+def _scaled(ways: ArrayF) -> ArrayF:
+    """(k, 2) classical scaling: the two strongest directions of the table of squared distances."""
+    squares = ways**2
+    rows = squares.mean(axis=0)
+    value, vector = np.linalg.eigh(-0.5 * (squares - rows - rows[:, None] + squares.mean()))
+    strongest = vector[:, ::-1][:, :2] * np.sqrt(np.maximum(value[::-1][:2], 0))
+    places = np.zeros((len(ways), 2))
+    places[:, : strongest.shape[1]] = strongest
+    return places
+
+
+def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:
+    laplacian = np.diag(weight.sum(axis=1)) - weight
+    inverse = np.linalg.pinv(laplacian, hermitian=True)
+    stress = np.inf
+    for _ in range(_ROUNDS):
+        distance = np.linalg.norm(places[:, None] - places[None], axis=2)
+        before, stress = stress, float((weight * (distance - ways) ** 2).sum())
+        if stress >= (1 - _ENOUGH) * before:
+            break
+        pull = -weight * ways / np.where(distance > 0, distance, np.inf)
+        np.fill_diagonal(pull, -pull.sum(axis=1))
+        places = inverse @ (pull @ places)
+    centred: ArrayF = places - places.mean(axis=0)
+    return centred

@@ -10,13 +10,12 @@ It gives arrays, so that algorithms can be tried against a truth that no real sk
         sample.values, sample.truth  # (n,) both
 """
 
-from skinware.tactile.testing.arm import ARM_FRAME, arm, arm_path
 from skinware.tactile.testing.bench import BENCH_S, bench_world
 from skinware.tactile.testing.block import Block, Sample
 from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke, Wander
 from skinware.tactile.testing.response import Response
 from skinware.tactile.testing.stage import Play, read_stage
-from skinware.tactile.testing.surface import Surface, grid, triangles
+from skinware.tactile.testing.surface import ARM_FRAME, Surface, arm, arm_path, grid, triangles
 from skinware.tactile.testing.world import World
 
 __all__ = [

@@ -12,9 +12,8 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.tactile.testing.block import Block, Sample
-from skinware.tactile.testing.faults import Faults, Jump, Missing
 from skinware.tactile.testing.gestures import Cover, Gesture, How, Push, Stroke
-from skinware.tactile.testing.response import Response
+from skinware.tactile.testing.response import Faults, Jump, Missing, Response
 from skinware.tactile.testing.surface import Surface, Taxels
 
 ArrayF = npt.NDArray[np.float64]

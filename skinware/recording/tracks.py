@@ -55,11 +55,7 @@ class Series:
 
     @classmethod
     def joined(cls, parts: Sequence[Series]) -> Series:
-        """Frames of one service, one after the other.
-
-        Args:
-            parts: at least one, all with the same columns.
-        """
+        """Join at least one series of the same columns, one after the other."""
         return cls(
             parts[0].origin,
             np.concatenate([part.headers for part in parts]),
@@ -90,11 +86,8 @@ class Series:
         try:
             return self.columns[name]
         except KeyError:
-            there_are = f"there are {', '.join(self.columns)}"
             known = "was not read" if name in self.origin.columns else "is not there"
-            raise KeyError(f"column {name!r} {known}; {there_are}") from None
-
-    # -- by type ------------------------------------------------------------------------------------------------
+            raise KeyError(f"column {name!r} {known}; there are {', '.join(self.columns)}") from None
 
     def raw(self, type_name: str) -> npt.NDArray[Any]:
         """(n, sensors) raw counts of all sensors of a type, in the order of ``structure.index``.

@@ -24,7 +24,7 @@ from skinware_drivers.bus import (
     check_identifier,
     identifier_text,
 )
-from skinware_drivers.decoding.filters import fewest, filters_of
+from skinware_drivers.decoding.addresses import fewest, filters_of
 from skinware_drivers.layout import Layout
 
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05

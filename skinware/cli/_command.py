@@ -20,8 +20,7 @@ from typing import Any, NoReturn, TypeVar
 
 import click
 
-from skinware.cli._output import patient_output
-from skinware.cli._terminal import Formatter, echo
+from skinware.cli._terminal import Formatter, echo, patient_output
 from skinware.errors import BadRecording, ConfigurationError, SkinwareError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2

@@ -1,8 +1,9 @@
-"""How ``skin-calibrate`` gathers presses or strokes: until there are enough, or Enter, a time, or Ctrl-C."""
+"""Gather presses or strokes for skin-calibrate, and show the coverage and what is wrong with a geometry."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,102 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.cli._command import warn
-from skinware.cli._coverage import SIGNS, bars, picture
 from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
-from skinware.cli._format import terminal_width
+from skinware.cli._format import plural, terminal_width
+from skinware.cli._heat_map import arrange
 from skinware.cli._terminal import echo, print_json
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
+from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
 from skinware.tactile.calibration.sources import LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
+
+SIGNS = "·▂▃▄▅▆▇█"
+"""Of a sensor: nothing at all; in between; all that is wanted."""
+_BAR = 20
+_HEIGHT = 40
+
+
+def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]) -> Iterator[str]:
+    """A line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
+
+    Args:
+        structure: of the driver.
+        type_name: of the sensors.
+        coverage: (n,) 0 to 1 of each.
+    """
+    patch = structure.patch_of(type_name)
+    width = max(map(len, structure.patch_names))
+    for number, name in enumerate(structure.patch_names):
+        own = coverage[patch == number]
+        if len(own):
+            full = "█" * round(_BAR * float(own.mean()))
+            yield f"{name:<{width}}  {full:░<{_BAR}}  {int((own >= 1).sum())} of {len(own)}"
+
+
+def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64], width: int) -> Iterator[str]:
+    """The sensors, module by module as ``skin-top`` draws them, each with a sign for what it has.
+
+    Args:
+        structure: of the driver.
+        type_name: of the sensors.
+        coverage: (n,) 0 to 1 of each.
+        width: of the terminal.
+    """
+    drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
+    of_sensor = np.zeros(structure.n_sensors)
+    of_sensor[structure.index(type_name)] = coverage
+    level = np.where(of_sensor >= 1, len(SIGNS) - 1, np.ceil(of_sensor * (len(SIGNS) - 2)))
+    codes = level.astype(np.uint8)[drawn.sensors]
+    pixels = np.append(codes, np.uint8(len(SIGNS)))[drawn.pixels]
+    for number in range(drawn.lines):
+        upper, lower = pixels[2 * number : 2 * number + 2]
+        signs = [(SIGNS + " ")[code] for code in np.where(upper == len(SIGNS), lower, upper).tolist()]
+        for label in drawn.labels.get(number, ()):
+            signs[label.column : label.column + len(label.text)] = label.text
+        yield "".join(signs).rstrip()
+
+
+def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict[str, Any]:
+    """For programs.
+
+    Args:
+        finding: of sensors of one type.
+        structure: of the skin.
+        type_name: of the sensors.
+    """
+    return {
+        "kind": finding.kind,
+        "modules": [structure.module_names[number] for number in finding.modules],
+        "patches": [structure.patch_names[number] for number in finding.patches],
+        "uid": structure.sensor_uid[_sensors(finding, structure, type_name)].tolist(),
+        "off_m": finding.off_m,
+        "degrees": finding.degrees,
+    }
+
+
+def finding_text(finding: Finding, structure: Structure, type_name: str) -> str:
+    """One line for people; arguments as of :func:`finding_data`."""
+    told = finding_data(finding, structure, type_name)
+    names = told["modules"] or told["patches"]
+    count, whose = plural(len(finding.taxels), "sensor"), ", ".join(names)
+    sensor = structure.sensor_name(int(_sensors(finding, structure, type_name)[0]))
+    text = {
+        SHARED: f"{count} of {whose} at places of others",
+        UNKNOWN: f"{count} of {whose} without a place",
+        SWAPPED: f"{' and '.join(names)} are at each other's places: exchanged connectors?",
+        MIRRORED: f"{whose}: its mirror image would fit",
+        TURNED: f"{whose}: turned by {finding.degrees:.0f} degrees it would fit",
+        OFF: f"{sensor} is {1e3 * finding.off_m:.0f} mm from where its neighbours are",
+    }[finding.kind]
+    return f"{finding.kind}: {text}"
+
+
+def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDArray[np.int64]:
+    """(k,) positions in a frame of the sensors that are meant."""
+    sensors: npt.NDArray[np.int64] = np.arange(structure.n_sensors)[structure.index(type_name)][finding.taxels]
+    return sensors
+
 
 _TELL_EVERY_S = 1.0
 _SAVE_EVERY_S = 10.0

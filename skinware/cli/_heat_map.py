@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.views.shapes import Shape, rows_of, shape_of
+from skinware.views.scene import Shape, rows_of, shape_of
 
 LEVELS = 16
 FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(10)

@@ -13,8 +13,7 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from skinware.cli._heat_map import Arrangement, Label
-from skinware.cli._painting import changed_lines, segments_of
-from skinware.cli._palette import Palette
+from skinware.cli._painting import Palette, changed_lines, segments_of
 
 
 class HeatMap(ScrollView, can_focus=False):

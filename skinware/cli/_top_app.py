@@ -20,17 +20,15 @@ from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._format import NOT_FRESH, plural
 from skinware.cli._heat_widget import HeatMap
-from skinware.cli._palette import Palette, palette_for
-from skinware.cli._picture import Picture, describe_sensor
-from skinware.cli._scale import CHANGE
+from skinware.cli._painting import Palette, palette_for
+from skinware.cli._picture import CHANGE, Picture, describe_sensor
 from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.tactile.regions import Regions
-from skinware.views.bridges import LiveBridges
+from skinware.views.beside import LiveBridges, live_contacts, places_of
 from skinware.views.health import LIVE, life_of
 from skinware.views.live import LiveDrivers
-from skinware.views.touches import live_contacts, places_of
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5

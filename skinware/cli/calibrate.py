@@ -265,7 +265,7 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 
     Exit status: 0 nothing found, 1 something is wrong.
     """
-    from skinware.cli._findings import finding_data, finding_text
+    from skinware.cli._gathering import finding_data, finding_text
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.checking import check_file, check_strokes
     from skinware.tactile.calibration.state import StrokeSession

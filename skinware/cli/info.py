@@ -86,7 +86,7 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
 
     place = Namespace(namespace)
     if health:
-        from skinware.cli._sensor_health import show
+        from skinware.cli._report import show
 
         if sensors or watch:
             raise click.UsageError("--health stands alone: without --sensors and --watch")

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import re
+import select
 import signal
+import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +28,43 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
-from skinware.cli._enter_key import is_there, pressed_calls
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
     from skinware.recording.recorder import Recorder
+
+_LOOK_S = 0.1
+
+
+def is_there() -> bool:
+    """Whether somebody can press it: there is a terminal."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
+@contextlib.contextmanager
+def pressed_calls(call: Callable[[], object]) -> Iterator[None]:
+    """Enter calls something, in another thread, as long as the block lasts. Nothing without a terminal."""
+    if not is_there():
+        yield
+        return
+    ended = threading.Event()
+    thread = threading.Thread(target=_listen, args=(sys.stdin.fileno(), call, ended), name="Enter", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _listen(fd: int, call: Callable[[], object], ended: threading.Event) -> None:
+    while not ended.wait(_LOOK_S):
+        with contextlib.suppress(OSError):  # the terminal is gone
+            in_foreground = os.tcgetpgrp(fd) == os.getpgrp()  # who reads in the background is stopped
+            if in_foreground and select.select([fd], [], [], 0)[0] and os.read(fd, 4096).endswith(b"\n"):
+                call()
+
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]?i?)B?")

@@ -26,9 +26,8 @@ from skinware.cli._terminal import echo, print_json
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
     from skinware.tactile.contacts_service import ContactsSample
-    from skinware.views.bridges import LiveBridges
+    from skinware.views.beside import LiveBridges, LiveSources
     from skinware.views.live import LiveDrivers
-    from skinware.views.touches import LiveSources
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
@@ -97,9 +96,8 @@ def command(
 
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
-    from skinware.views.bridges import LiveBridges
+    from skinware.views.beside import LiveBridges, live_contacts
     from skinware.views.live import LiveDrivers
-    from skinware.views.touches import live_contacts
 
     start_s = time.monotonic()
     end_s = None if duration_s is None else start_s + duration_s
@@ -132,7 +130,7 @@ def _on_terminal() -> bool:
 def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as_json: bool) -> None:
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
-    from skinware.views.touches import places_of
+    from skinware.views.beside import places_of
 
     found = drivers.look()
     contacts.look(drivers.others)

@@ -87,7 +87,7 @@ class _Wipe:
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 
-        from skinware.views.rest import Rest
+        from skinware.views.quantities import Rest
         from skinware.views.wiping import WipeTest
 
         self._reader, self._as_json = reader, as_json
@@ -99,11 +99,15 @@ class _Wipe:
 
     def go_on(self, duration_s: float | None) -> None:
         from skinware.cli._driver_snapshots import after
-        from skinware.views.rest import SETTLING_S
+        from skinware.views.quantities import SETTLING_S
         from skinware.views.wiping import threshold
 
+        resting = None
         for frame, physical in self._frames(SETTLING_S):
             self._rest.follow(physical, frame.status == 0, frame.published_ns)
+            resting = physical, frame.status == 0
+        if resting is not None:
+            self._test.follow(*resting)  # the first press may be there before the next snapshot
         needed = threshold(self._rest.noise(self._type.name))
         told = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit, "threshold": needed}
         if self._as_json:

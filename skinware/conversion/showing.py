@@ -25,7 +25,7 @@ from skinware.sensor_types import SensorType
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
-from skinware.views.shapes import shape_of
+from skinware.views.scene import shape_of
 
 _FLOAT32, _UINT8 = 7, 2
 """Types of fields of a PointCloud2."""

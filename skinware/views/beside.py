@@ -1,16 +1,166 @@
-"""What services tell beside drivers: what is calm of them, contacts on them, and motion over their regions."""
+"""Follow the services beside drivers: calm, contacts, motion, and bridges."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
+
+from skinware.bridge_state import BridgeReader, BridgeSample, BridgeState
 from skinware.driver_snapshot import DriverSnapshot
+from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout, StructureError
 from skinware.memory.namespace import Namespace
+from skinware.memory.ring import SampleT
 from skinware.realtime import now_ns
-from skinware.tactile.contacts_service import ContactsSample
-from skinware.tactile.motion_service import MotionSample
+from skinware.service import ServiceReader
+from skinware.structure import Structure
+from skinware.tactile.contacts import Contact
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.tactile.motion_service import MotionReader, MotionSample
+from skinware.tactile.source_reader import SourceReader
 from skinware.views.live import LiveDriver, LiveDrivers
-from skinware.views.touches import live_contacts, live_motion
+
+ReaderT = TypeVar("ReaderT", bound=ServiceReader[Any])
+
+
+class LiveServices(Generic[ReaderT, SampleT]):
+    """The services of one kind in one namespace.
+
+    Args:
+        namespace: where to look.
+        reader: class of the readers of this kind; attaching to a service of another one raises
+            :class:`skinware.errors.BadServiceFile`.
+    """
+
+    def __init__(self, namespace: Namespace, reader: Callable[..., ReaderT]) -> None:
+        self._namespace, self._reader = namespace, reader
+        self._readers: dict[str, ReaderT] = {}
+
+    def look(self, names: Iterable[str]) -> None:
+        """Look for services of the kind that are new, and for those that went.
+
+        Args:
+            names: of the services that there are now; those of drivers may be missing.
+        """
+        there = set(names)
+        for name in self._readers.keys() - there:
+            self._drop(name)
+        for name in there - self._readers.keys():
+            try:
+                self._readers[name] = self._reader(name, namespace=self._namespace)
+            except (BadServiceFile, ConfigurationError, ServiceNotFound):
+                continue  # another kind of service, or just gone
+        self._readers = dict(sorted(self._readers.items()))
+
+    def close(self) -> None:
+        for name in list(self._readers):
+            self._drop(name)
+
+    def _newest(self, name: str) -> SampleT | None:
+        """What a service of a living writer told last; None where there is nothing."""
+        reader = self._readers[name]
+        try:
+            reader.refresh()
+            if reader.structure_changed:
+                reader.reattach()
+            frame: SampleT = reader.read(timeout_s=0.0)
+        except (ServiceTimeout, Overrun):
+            return None  # nothing published yet
+        except (ServiceNotFound, BadServiceFile):
+            self._drop(name)
+            return None
+        return None if frame.stale else frame
+
+    def _drop(self, name: str) -> None:
+        self._readers.pop(name).close()
+
+
+class LiveBridges(LiveServices[BridgeReader, BridgeSample]):
+    """What the bridges of a namespace tell of themselves.
+
+    Args:
+        namespace: where to look.
+    """
+
+    def __init__(self, namespace: Namespace) -> None:
+        super().__init__(namespace, BridgeReader)
+
+    def states(self) -> list[BridgeState]:
+        frames = [self._newest(name) for name in list(self._readers)]
+        return [frame.state for frame in frames if frame is not None]
+
+
+class TouchedPlace(NamedTuple):
+    """A contact, and where it is on the skin.
+
+    Attributes:
+        contact: it.
+        unit: of its load.
+        sensor: position in a frame of the driver of the taxel nearest to its centre; of one of its taxels, where
+            places are not known.
+        module: name of the module of that taxel.
+    """
+
+    contact: Contact
+    unit: str
+    sensor: int
+    module: str
+
+
+class LiveSources(LiveServices[SourceReader[Any, SampleT], SampleT]):
+    """The services of one kind that tell something of drivers, in one namespace, followed live."""
+
+    def of(self, driver: str) -> SampleT | None:
+        """What was told last of a driver; None where no service tells anything."""
+        for name, reader in self._readers.items():
+            if reader.source.driver == driver:
+                return self._newest(name)
+        return None
+
+
+def live_contacts(namespace: Namespace) -> LiveSources[ContactsSample]:
+    return LiveSources(namespace, ContactsReader)
+
+
+def live_motion(namespace: Namespace) -> LiveSources[MotionSample]:
+    """The services of motion over regions in a namespace."""
+    return LiveSources(namespace, MotionReader)
+
+
+def places_of(frame: ContactsSample | None, structure: Structure) -> list[TouchedPlace]:
+    """Where the contacts are, the oldest first; none if they are of other sensors than those of the driver.
+
+    Args:
+        frame: the contacts; None: there are none.
+        structure: of their driver now.
+    """
+    if frame is None:
+        return []
+    source = frame.source
+    try:
+        sensors = np.arange(structure.n_sensors)[structure.index(source.type_name)]
+    except StructureError:
+        return []
+    if not np.array_equal(structure.sensor_uid[sensors], source.uid):
+        return []
+    found = []
+    for contact in frame:
+        of_contact = sensors[contact.taxels]
+        sensor = int(of_contact[_nearest(contact, of_contact, structure)])
+        found.append(
+            TouchedPlace(contact, source.unit, sensor, structure.module_names[structure.sensor_module[sensor]])
+        )
+    return found
+
+
+def _nearest(contact: Contact, sensors: np.ndarray[Any, Any], structure: Structure) -> int:
+    """Which of the contact's sensors is nearest to its centre; the first where nobody knows."""
+    if structure.geometry is None:
+        return 0
+    away_m = np.linalg.norm(structure.geometry.position_m[sensors] - contact.cop_m, axis=1)
+    return int(np.nan_to_num(away_m, nan=np.inf).argmin())
+
 
 _PATIENCE_NS = 20_000_000
 """What is calm of a frame comes soon after it, or not at all."""

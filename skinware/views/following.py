@@ -19,9 +19,7 @@ from skinware.tactile.motion_service import MotionSample
 from skinware.views.beside import Beside
 from skinware.views.health import LIVE, STARTING, life_of, status_now
 from skinware.views.live import LiveDriver, LiveDrivers
-from skinware.views.past import Past
-from skinware.views.quantities import Quantity, quantities_of
-from skinware.views.rest import Rest
+from skinware.views.quantities import Past, Quantity, Rest, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 

@@ -8,10 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.views.following import Followed
-from skinware.views.levels import HIGHEST, Levels, levels_of, shear_of
-from skinware.views.quantities import Quantity
-from skinware.views.rest import Rest
-from skinware.views.scales import ChangeSpan, ValueLimits
+from skinware.views.quantities import HIGHEST, ChangeSpan, Levels, Quantity, Rest, ValueLimits, levels_of, shear_of
 from skinware.views.wiping import WipeTest, threshold
 
 Mode = Literal["raw", "change", "peak", "wipe"]
@@ -24,7 +21,7 @@ class Picture(NamedTuple):
 
     quantity: Quantity
     levels: Levels
-    """(n,) uint8, see :mod:`skinware.views.levels`."""
+    """(n,) uint8, see :mod:`skinware.views.quantities`."""
     scale: tuple[float, float]
     """What level 0 and the highest stand for, in the quantity's unit."""
     shear: npt.NDArray[np.int8] | None

@@ -21,8 +21,7 @@ from skinware.realtime import NS_PER_S
 from skinware.views import operations
 from skinware.views.access import Access, Refused
 from skinware.views.following import Follower
-from skinware.views.recording import Recording
-from skinware.views.replaying import ReplayControl
+from skinware.views.recording import Recording, ReplayControl
 from skinware.views.state import problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.views import operations
+from skinware.views.beside import places_of
 from skinware.views.following import Followed, Follower
 from skinware.views.looks import Look
 from skinware.views.scene import Scene
 from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
-from skinware.views.touches import places_of
 
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8

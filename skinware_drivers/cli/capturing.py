@@ -1,7 +1,4 @@
-"""A capture: a driver and all that goes over its wires, from the first byte on, in one file that may be given away.
-
-It is a recording of a process of its own, which cannot hold up the driver, and completes the file whatever ends that.
-"""
+"""Capture a driver and all that goes over its wires in one file, and take driver and options from such a file."""
 
 from __future__ import annotations
 
@@ -11,12 +8,41 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skinware.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from skinware_drivers.virtual.recorded import Recorded
+
+
+def driver_of_recording(bus_names: Sequence[str]) -> str:
+    found = (recorded.driver_type for recorded in map(_recorded, bus_names) if recorded is not None)
+    return next(filter(None, found), "")
+
+
+def only_listened(bus_names: Sequence[str]) -> bool:
+    """Whether the wires of drivers were recorded that sent nothing."""
+    found = [_recorded(name) for name in bus_names]
+    return bool(found) and all(recorded is not None and recorded.listen_only for recorded in found)
+
+
+def options_of_recording(bus_name: str, driver_type: str) -> Mapping[str, Any]:
+    recorded = _recorded(bus_name)
+    return recorded.options if recorded is not None and recorded.driver_type == driver_type else {}
+
+
+def _recorded(bus_name: str) -> Recorded | None:
+    """What a recording tells; None: the bus is none."""
+    if not bus_name.startswith("replay:"):
+        return None
+    from skinware_drivers.virtual.recorded import recorded_driver
+
+    return recorded_driver(bus_name)
+
 
 _END_S = 30.0
 """How long it may take to complete the file."""
@@ -105,7 +131,7 @@ def _record(path: Path, driver: str, namespace: str) -> None:
     try:
         from skinware.recording.files import Files
         from skinware.recording.recorder import Recorder
-        from skinware_drivers.doctor.scrubbing import Disguise
+        from skinware_drivers.doctor.report import Disguise
 
         target = Files(path)
         recorder = Recorder(target, names=[driver], namespace=namespace, with_wires=True, disguise=Disguise())

@@ -53,7 +53,7 @@ class DriverCommand(HardwareCommand):
     """A command that also takes the options of the driver it is asked to run."""
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
-        from skinware_drivers.cli.of_recording import driver_of_recording
+        from skinware_drivers.cli.capturing import driver_of_recording
         from skinware_drivers.loading import short_name
         from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
@@ -204,7 +204,7 @@ def command(
     from skinware.geometry import read_geometry
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
-    from skinware_drivers.cli.of_recording import driver_of_recording, only_listened, options_of_recording
+    from skinware_drivers.cli.capturing import driver_of_recording, only_listened, options_of_recording
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver, make_bus
     from skinware_drivers.running.flow import FlowLoop

@@ -11,7 +11,7 @@ from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware_drivers.cli.capturing import Capture
-    from skinware_drivers.running.patch_news import PatchChange
+    from skinware_drivers.running.news import PatchChange
     from skinware_drivers.running.runner import Runner
 
 

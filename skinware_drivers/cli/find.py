@@ -97,9 +97,8 @@ async def look(
     """
     from skinware.errors import BusNotAvailable
     from skinware_drivers.bus_names import is_only_asked
-    from skinware_drivers.finding.adapters import Detection, detect_adapters
     from skinware_drivers.finding.guess import known_drivers
-    from skinware_drivers.finding.interfaces import can_interfaces
+    from skinware_drivers.finding.interfaces import Detection, can_interfaces, detect_adapters
     from skinware_drivers.finding.looking import listen
     from skinware_drivers.finding.running import running_drivers
     from skinware_drivers.registry import make_bus
@@ -194,7 +193,7 @@ async def _ask(
 
 
 def _no_adapters(_timeout_s: float) -> Any:
-    from skinware_drivers.finding.adapters import Detection
+    from skinware_drivers.finding.interfaces import Detection
 
     return Detection()
 
@@ -253,7 +252,7 @@ def _port_data(port: SerialPort, answers: dict[str, Answer], running: list[Runni
 
 
 def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
-    from skinware_drivers.finding.udev import PLACE, RELOAD, rules_for, shipped_rules
+    from skinware_drivers.finding.ports import PLACE, RELOAD, rules_for, shipped_rules
 
     _, ports, others = _chosen(buses, [])
     if others:

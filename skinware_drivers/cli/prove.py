@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
     from skinware_drivers.cli.capturing import Capture
-    from skinware_drivers.proving.files import ProofFiles
-    from skinware_drivers.proving.proof import Proof
+    from skinware_drivers.proving.proof import Proof, ProofFiles
     from skinware_drivers.proving.walk import Step
 
 _STARTS_WITHIN_S = 30.0
@@ -134,8 +133,7 @@ def command(
         return
     if save:
         raise click.UsageError("--save is for --captured")
-    from skinware_drivers.proving.files import ProofFiles
-    from skinware_drivers.proving.proof import Proof
+    from skinware_drivers.proving.proof import Proof, ProofFiles
     from skinware_drivers.proving.walk import Manner, walk
 
     stem = stem or Path(time.strftime(f"prove-{name or 'driver'}-%Y%m%d-%H%M%S"))

@@ -1,8 +1,4 @@
-"""Whose frame is it: from bus and identifier to a module, and to the kinds of frame that it can be.
-
-Identifiers of 11 bits are looked up in one table for all buses. Those of 29 bits are too many for a table: the bit
-fields that name patch and module are taken out of them and searched for among the known ones.
-"""
+"""Find the patch and module of each frame, and the kernel filters that let these frames through."""
 
 from __future__ import annotations
 
@@ -12,9 +8,51 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Filter
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Byte, Frame, Identifier
+from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout
+
+_FLAGS = EXTENDED_FLAG | REMOTE_FLAG
+
+
+def filters_of(layout: Layout) -> list[Filter]:
+    """What lets all frames of a layout through, as few as there can be; no remote frames."""
+    found = []
+    for frame in layout.frames:
+        value, mask = (EXTENDED_FLAG if frame.extended else 0), _FLAGS
+        conditions = [condition for condition in frame.when if isinstance(condition, Identifier)]
+        for condition in conditions:
+            value |= condition.value
+            mask |= condition.mask
+        if all(value & condition.mask == condition.value for condition in conditions):  # else nothing fulfils them all
+            found.append(Filter(value, mask))
+    return fewest(found)
+
+
+def fewest(filters: Iterable[Filter]) -> list[Filter]:
+    """Filters that let the same frames through as these, with none that others make needless."""
+    left = {Filter(value & mask, mask) for value, mask in filters}
+    while True:
+        joined = {_join(one, other) for one in left for other in left if _differ_in_one_bit(one, other)}
+        every = left | joined
+        fewer = {one for one in every if not any(_covers(other, one) for other in every if other != one)}
+        if fewer == left:
+            return sorted(left)
+        left = fewer
+
+
+def _covers(wide: Filter, narrow: Filter) -> bool:
+    return wide.mask & narrow.mask == wide.mask and narrow.value & wide.mask == wide.value
+
+
+def _differ_in_one_bit(one: Filter, other: Filter) -> bool:
+    return one.mask == other.mask and (one.value ^ other.value).bit_count() == 1
+
+
+def _join(one: Filter, other: Filter) -> Filter:
+    mask = one.mask & ~(one.value ^ other.value)
+    return Filter(one.value & mask, mask)
+
 
 STANDARD_IDENTIFIERS = 1 << 11
 _FIELD_BITS = 29  # of a patch's or module's key

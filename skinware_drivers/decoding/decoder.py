@@ -22,10 +22,10 @@ from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
-from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.device_stamps import DeviceStamps
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
 from skinware_drivers.decoding.groups import Carrier, Groups
+from skinware_drivers.decoding.pairing import CompiledCycle
 from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables

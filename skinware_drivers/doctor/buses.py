@@ -7,13 +7,11 @@ from typing import NamedTuple
 
 from skinware.cli._format import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import BusSeen, Change, DriverSeen, Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.losses import lost_text
+from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity, brief, lost_text, typed
 from skinware_drivers.doctor.machine import circumstances
-from skinware_drivers.doctor.naming import brief, typed
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.finding.running import same_bus
-from skinware_drivers.running.limits import FULL, HIGH_LOAD
+from skinware_drivers.running.news import FULL, HIGH_LOAD
 
 AREA = "buses"
 _PROBLEM, _MISSING = "troubleshooting.md#a-bus-has-a-problem", "troubleshooting.md#data-is-missing"

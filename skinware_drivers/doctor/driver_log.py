@@ -20,7 +20,7 @@ from skinware.status import Status, load_report
 from skinware.structure import Structure
 from skinware.views.health import bus_reason_name, bus_state_name, count_statuses, patch_state_name
 from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, PatchSeen
-from skinware_drivers.doctor.matrices import whole_lines
+from skinware_drivers.doctor.judging import whole_lines
 
 _HOUR_S = 3600
 _MOST_CHANGES = 500

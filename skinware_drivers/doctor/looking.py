@@ -1,17 +1,260 @@
-"""Gathers the evidence of what runs on this machine now."""
+"""Gather the evidence of what runs on this machine now: programs, interfaces, ports, drivers."""
 
 from __future__ import annotations
 
+import contextlib
+import grp
+import os
+import platform
+import resource
+import time
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
+import skinware.native
+import skinware_drivers.native
 from skinware.bridge_state import BridgeState
-from skinware.errors import NamespaceError
-from skinware.memory.namespace import Namespace
-from skinware.views.bridges import LiveBridges
-from skinware_drivers.doctor import programs, surroundings
-from skinware_drivers.doctor.evidence import DriverSeen, Evidence
+from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.memory.announcement import ReaderRecord, living_readers
+from skinware.memory.namespace import ROOT, Namespace
+from skinware.memory.ring import Sample
+from skinware.service import ServiceReader
+from skinware.views.beside import LiveBridges
+from skinware_drivers.doctor.evidence import (
+    Counted,
+    DriverSeen,
+    Evidence,
+    InterfaceSeen,
+    MachineSeen,
+    NamespaceSeen,
+    ReaderSeen,
+)
 from skinware_drivers.doctor.watching import watch
 from skinware_drivers.finding import interfaces, ports, running
+from skinware_drivers.finding.interfaces import CanInterface
+from skinware_drivers.running.news import softnet_dropped
+
+_EVERY_FRAME = "in order"
+"""How readers read that want every frame; others are meant to skip some."""
+_DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay", "skin-bridge")
+_PROC = Path("/proc")
+
+
+class ReadersWatch:
+    """Looks at the programs that read the drivers of a namespace: now, and at the end of the watch.
+
+    Args:
+        namespace: of the drivers.
+    """
+
+    def __init__(self, namespace: Namespace) -> None:
+        self._namespace = namespace
+        self._before = self._look()
+
+    def seen(self) -> tuple[ReaderSeen, ...]:
+        found = []
+        for key, record in self._look().items():
+            before = self._before.get(key)
+            if before is not None and record.kind == _EVERY_FRAME:
+                frames, lost = record.frames - before.frames, record.lost - before.lost
+                found.append(ReaderSeen(record.program, record.pid, record.service, max(0, frames), max(0, lost)))
+        return tuple(found)
+
+    def _look(self) -> dict[tuple[int, str], ReaderRecord]:
+        return {(one.pid, one.service): one for one in living_readers(self._namespace)}
+
+
+def waiting_drivers(known: set[int], proc: Path = _PROC) -> tuple[int, ...]:
+    """Processes of ``skin-driver`` that publish nothing.
+
+    Args:
+        known: processes of drivers that do.
+        proc: procfs.
+    """
+    found = {int(path.name) for path in proc.glob("[0-9]*") if program_of(int(path.name), proc) == _DRIVER}
+    return tuple(sorted(found - known))
+
+
+def publishes_again(pid: int, proc: Path = _PROC) -> bool:
+    """Whether a process has no bus: what it publishes is another driver's, or was once.
+
+    Args:
+        pid: of a driver.
+        proc: procfs.
+    """
+    return program_of(pid, proc) in _SECOND_HAND
+
+
+def program_of(pid: int, proc: Path = _PROC) -> str:
+    """Name of a process' program; empty if there is no such process."""
+    try:
+        return (proc / str(pid) / "comm").read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+_PACKAGES = (
+    "skinware",
+    "numpy",
+    "python-can",
+    "pyserial",
+    "canopen",
+    "msgspec",
+    "click",
+    "textual",
+    "mcap",
+    "zstandard",
+)
+_PREFIX = "skinware."
+_LIMITS = {
+    "net.core.rmem_max": Path("/proc/sys/net/core/rmem_max"),
+    "net.core.netdev_max_backlog": Path("/proc/sys/net/core/netdev_max_backlog"),
+    "kernel.sched_rt_runtime_us": Path("/proc/sys/kernel/sched_rt_runtime_us"),
+}
+_GOVERNORS = "cpu*/cpufreq/scaling_governor"
+_CPUS = Path("/sys/devices/system/cpu")
+_MEMORY = Path("/proc/meminfo")
+
+
+class MachineWatch:
+    """Looks at the machine: now, and at the end of the watch."""
+
+    def __init__(self) -> None:
+        self._softnet = softnet_dropped()
+        self._clock_s = _clock_offset_s()
+
+    def seen(self) -> MachineSeen:
+        softnet, memory = softnet_dropped(), _memory()
+        total, free, problem = _shared_memory()
+        return MachineSeen(
+            versions=versions(),
+            kernel=f"{platform.system()} {platform.release()} {platform.machine()}",
+            native={"core": skinware.native.why_python(), "data path": skinware_drivers.native.why_python()},
+            cpus=len(os.sched_getaffinity(0)),
+            load=os.getloadavg()[0],
+            governors=tuple(sorted({text for path in _CPUS.glob(_GOVERNORS) if (text := _text(path))})),
+            memory_bytes=memory.get("MemTotal", 0),
+            memory_available_bytes=memory.get("MemAvailable", 0),
+            shared_bytes=total,
+            shared_free_bytes=free,
+            shared_problem=problem,
+            locked_memory_bytes=resource.getrlimit(resource.RLIMIT_MEMLOCK)[0],
+            realtime_priority=99 if os.geteuid() == 0 else resource.getrlimit(resource.RLIMIT_RTPRIO)[0],
+            groups=_groups(),
+            limits={name: int(text) for name, path in _LIMITS.items() if (text := _text(path)).lstrip("-").isdigit()},
+            softnet_dropped=None if softnet is None or self._softnet is None else softnet - self._softnet,
+            clock_set_s=_clock_offset_s() - self._clock_s,
+        )
+
+
+def versions() -> dict[str, str]:
+    found = {"skinware": "", "Python": f"{platform.python_version()} ({platform.python_implementation()})"}
+    for name in _PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def interfaces_seen(before: list[CanInterface], now: list[CanInterface]) -> tuple[InterfaceSeen, ...]:
+    """CAN interfaces, and what was counted on them in between.
+
+    Args:
+        before: as they were at the beginning.
+        now: as they are.
+    """
+    earlier = {one.name: _counts(one) for one in before}
+    found = []
+    for one in now:
+        total = _counts(one)
+        was = earlier.get(one.name, total)
+        found.append(
+            InterfaceSeen(one, Counted(total, {name: max(0, total[name] - was.get(name, 0)) for name in total}))
+        )
+    return tuple(found)
+
+
+def namespaces_seen(ours: Namespace) -> tuple[NamespaceSeen, ...]:
+    """All namespaces of this machine, as far as they may be looked at.
+
+    Args:
+        ours: the one that was asked for; it is told first, whether it is there or not.
+    """
+    names = {folder.name.removeprefix(_PREFIX) for folder in ROOT.glob(f"{_PREFIX}*")} - {ours.name}
+    found = [_namespace_seen(ours, is_ours=True)]
+    for name in sorted(names):
+        with contextlib.suppress(ConfigurationError):  # a folder whose name cannot be a namespace's
+            found.append(_namespace_seen(Namespace(name), is_ours=False))
+    return tuple(found)
+
+
+def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
+    path = str(namespace.path)
+    if not namespace.path.exists() and not namespace.path.is_symlink():
+        return NamespaceSeen(namespace.name, path, is_ours)
+    living: list[str] = []
+    dead: list[str] = []
+    damaged: list[str] = []
+    size = 0
+    try:
+        namespace.check()
+        idle_s = time.time() - namespace.path.stat().st_mtime
+        for name in namespace.services():
+            try:
+                with ServiceReader[Sample](name, namespace=namespace, announce=False) as reader:
+                    (living if reader.alive else dead).append(name)
+                    size += 0 if reader.alive else namespace.ring_path(name).stat().st_size
+            except (BadServiceFile, ConfigurationError) as error:
+                damaged.append(str(error))
+            except (ServiceNotFound, FileNotFoundError):
+                continue  # withdrawn this very moment
+    except (NamespaceError, OSError) as error:
+        return NamespaceSeen(namespace.name, path, is_ours, problem=str(error))
+    return NamespaceSeen(namespace.name, path, is_ours, "", tuple(damaged), tuple(living), tuple(dead), size, idle_s)
+
+
+def _counts(one: CanInterface) -> dict[str, int]:
+    return {**one.statistics, **{f"controller_{name}": count for name, count in one.controller_errors.items()}}
+
+
+def _clock_offset_s() -> float:
+    """Wall clock beside the clock that nobody sets."""
+    return time.time() - time.monotonic()
+
+
+def _groups() -> tuple[str, ...]:
+    names = []
+    for number in {os.getegid(), *os.getgroups()}:
+        with contextlib.suppress(KeyError):
+            names.append(grp.getgrgid(number).gr_name)
+    return tuple(sorted(names))
+
+
+def _memory() -> dict[str, int]:
+    """Figures of the machine's memory, in bytes."""
+    found = {}
+    for line in _text(_MEMORY).splitlines():
+        name, _, rest = line.partition(":")
+        with contextlib.suppress(ValueError, IndexError):
+            found[name] = 1024 * int(rest.split()[0])
+    return found
+
+
+def _shared_memory() -> tuple[int, int, str]:
+    """Bytes of /dev/shm, free ones, and why no file can be made there."""
+    try:
+        room = os.statvfs(ROOT)
+    except OSError as error:
+        return 0, 0, f"{ROOT}: {error.strerror}"
+    problem = "" if os.access(ROOT, os.W_OK | os.X_OK) else f"{ROOT} may not be written by this account"
+    return room.f_frsize * room.f_blocks, room.f_frsize * room.f_bavail, problem
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""
 
 
 def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] = lambda _seconds: None) -> Evidence:
@@ -22,9 +265,9 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         seconds: how long.
         tell: called now and then with how long that is by now, s.
     """
-    machine, readers = surroundings.MachineWatch(), programs.ReadersWatch(namespace)
+    machine, readers = MachineWatch(), ReadersWatch(namespace)
     before = interfaces.can_interfaces()
-    namespaces = surroundings.namespaces_seen(namespace)
+    namespaces = namespaces_seen(namespace)
     drivers: tuple[DriverSeen, ...]
     try:
         drivers = watch(namespace, seconds, tell)
@@ -37,11 +280,11 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         drivers=drivers,
         machine=machine.seen(),
         namespaces=namespaces,
-        interfaces=surroundings.interfaces_seen(before, interfaces.can_interfaces()),
+        interfaces=interfaces_seen(before, interfaces.can_interfaces()),
         kernel_has_can=interfaces.kernel_has_can(),
         ports=tuple(ports.serial_ports()),
-        running=tuple(one for one in living if not programs.publishes_again(one.pid)),
-        waiting=programs.waiting_drivers({one.pid for one in living}),
+        running=tuple(one for one in living if not publishes_again(one.pid)),
+        waiting=waiting_drivers({one.pid for one in living}),
         readers=readers.seen(),
         bridges=_bridges(namespace),
     )

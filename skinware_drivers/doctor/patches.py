@@ -9,9 +9,17 @@ from typing import NamedTuple
 
 from skinware.cli._format import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.losses import lost_text
-from skinware_drivers.doctor.naming import brief, has_operation, typed
+from skinware_drivers.doctor.finding import (
+    Finding,
+    Looked,
+    Note,
+    NotLooked,
+    Severity,
+    brief,
+    has_operation,
+    lost_text,
+    typed,
+)
 
 AREA = "patches"
 _FAULTS, _MISSING = "reference/faults.md#patches", "troubleshooting.md#data-is-missing"

@@ -28,7 +28,7 @@ from skinware_drivers.doctor.evidence import (
     Timing,
 )
 from skinware_drivers.doctor.judging import TaxelJudge
-from skinware_drivers.doctor.surroundings import MachineWatch
+from skinware_drivers.doctor.looking import MachineWatch
 
 _LOOK_EVERY_NS = 45_000_000
 """Frames between two looks are only counted and timed."""

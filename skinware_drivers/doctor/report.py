@@ -1,15 +1,122 @@
-"""All that was seen and found, as one Markdown text to attach to an issue, without secrets."""
+"""Write all that was seen and found as one Markdown text without secrets, to attach to an issue."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+import pwd
+import re
+import socket
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from skinware._printable import printable
 from skinware.cli._format import age_text, plural
 from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding
-from skinware_drivers.doctor.scrubbing import Secrets, scrubbed
+
+_FIRST_PERSON = 1000
+"""Accounts of people have numbers from here on."""
+_NOBODY = 65534
+_LEAST_NAME, _LEAST_VALUE = 3, 8
+"""Letters of what is taken out: shorter ones are in every text."""
+_SECRET = re.compile(r"TOKEN|SECRET|PASS|KEY|AUTH|CREDENTIAL|COOKIE|SESSION", re.IGNORECASE)
+_COMMON = ("root", "localhost", "skinware")
+_TOKENS = (
+    re.compile(r"(?i)\b(?:token|secret|password|passwd|api_?key|auth)\b(\s*[=:]\s*)\S+"),
+    re.compile(r"\b(?:gh[a-z]_|github_pat_|glpat-|xox[a-z]-|sk-|AKIA)[\w-]{10,}"),
+    re.compile(r"\beyJ[\w-]{8,}\.[\w-]+\.[\w-]*"),
+    re.compile(r"(?<![\w/])(?=[\w+-]*\d)(?=[\w+-]*[A-Za-z])[\w+-]{32,}={0,2}"),
+)
+_ADDRESSES = (
+    re.compile(r"\b[\w.+-]+@[\w-]+(?:\.[\w-]+)+"),
+    re.compile(r"\b(?:[0-9A-Fa-f]{2}:){5}[0-9A-Fa-f]{2}\b"),
+    re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.])"),
+    re.compile(r"(?<![\w:])(?:[0-9a-fA-F]{1,4}:){3,7}[0-9a-fA-F]{1,4}(?![\w:])|(?<![\w:])[0-9a-fA-F:]*::[0-9a-fA-F:]+"),
+    re.compile(r"(?<=://)[^\s/:@]+:[^\s/@]+(?=@)"),
+)
+_HOST = re.compile(r"(?<=://)(?:\[[^\]]*\]|[^/:?\s]+)|(?<=[?&]host=)[^&\s]+")
+"""Of the name of a bus."""
+_PATH = re.compile(r"(?<![\w./:])/(?:[^\s/'\"`,;:()]+/)+(?=[^\s/'\"`,;:()])")
+_KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
+"""Beginnings of paths that are the same on all machines."""
+
+
+@dataclass(frozen=True)
+class Secrets:
+    """What is not to be told.
+
+    Attributes:
+        words: texts and what stands in their place, as whole words.
+        texts: likewise, wherever they are.
+    """
+
+    words: Mapping[str, str] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of_this_machine(cls, environment: Mapping[str, str] | None = None) -> Secrets:
+        """Names of its people and of itself, their homes, and values of the environment.
+
+        Args:
+            environment: default: that of this process.
+        """
+        given = os.environ if environment is None else environment
+        people = [one for one in pwd.getpwall() if _FIRST_PERSON <= one.pw_uid < _NOBODY or one.pw_uid == os.geteuid()]
+        homes = {one.pw_dir for one in people} | {str(Path.home()), given.get("HOME", "")}
+        names = {one.pw_name for one in people} | {given.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")}
+        names |= {one.pw_gecos.partition(",")[0] for one in people}
+        machine = socket.gethostname()
+        words = dict.fromkeys((name for name in names if len(name) >= _LEAST_NAME), "<user>")
+        words |= dict.fromkeys((name for name in {machine, machine.partition(".")[0]} if name), "<machine>")
+        texts = dict.fromkeys((home for home in homes if home.count("/") > 0 and len(home) > 1), "<home>")
+        for name, value in given.items():
+            is_long = len(value) >= (_LEAST_NAME + 1 if _SECRET.search(name) else _LEAST_VALUE)
+            if is_long and value not in names:
+                texts.setdefault(value, f"<{name}>")
+        return cls({word: place for word, place in words.items() if word.lower() not in _COMMON}, texts)
+
+
+def scrubbed(text: str, secrets: Secrets) -> str:
+    """The same text without them, and without tokens, addresses of networks, and folders.
+
+    Args:
+        text: any.
+        secrets: what is known to be some.
+    """
+    for known, place in _longest_first(secrets.texts):
+        text = text.replace(known, place)
+    for known, place in _longest_first(secrets.words):
+        text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(known)}(?![A-Za-z0-9])", place, text, flags=re.IGNORECASE)
+    for pattern in _TOKENS:
+        text = pattern.sub("<token>", text)
+    for pattern in _ADDRESSES:
+        text = pattern.sub("<address>", text)
+    return _PATH.sub(lambda found: found[0] if found[0].startswith(_KNOWN_PATHS) else "/<folder>/", text)
+
+
+class Disguise:
+    """Names of buses and other texts as they may be given to others: hosts are ``host1``, ``host2``; no secrets.
+
+    Args:
+        secrets: what is known to be some; default: those of this machine.
+    """
+
+    def __init__(self, secrets: Secrets | None = None) -> None:
+        self._secrets = secrets or Secrets.of_this_machine()
+        self._hosts: dict[str, str] = {}
+
+    def __call__(self, text: str) -> str:
+        """The same text in disguise; the same host has the same name again."""
+        return scrubbed(_HOST.sub(self._host, text), self._secrets)
+
+    def _host(self, found: re.Match[str]) -> str:
+        return self._hosts.setdefault(found[0], f"host{len(self._hosts) + 1}")
+
+
+def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
+    return sorted(of.items(), key=lambda pair: -len(pair[0]))
 
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:

@@ -11,8 +11,7 @@ import numpy as np
 from skinware.cli._format import count_text, plural
 from skinware.tactile.calibration.checking import SHARED, UNKNOWN, check_file
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.naming import has_operation
+from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity, has_operation
 
 AREA = "taxels"
 _STATUS, _HEALTH, _CALIBRATION = "explanation/status.md", "tactile/health.md", "tactile/calibration.md"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skinware.cli._sensor_health import health
+from skinware.cli._report import health
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import (

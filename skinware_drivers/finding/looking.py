@@ -12,12 +12,10 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_names import is_only_asked
-from skinware_drivers.finding.attended import attended
-from skinware_drivers.finding.guess import Guess, guess, likely, with_default_options
-from skinware_drivers.finding.traffic import IdentifierClass, Traffic
+from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, guess, likely, with_default_options
+from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.registry import make_bus
-from skinware_drivers.running.bus_news import reason_text
-from skinware_drivers.running.limits import share_of_time
+from skinware_drivers.running.news import reason_text, share_of_time
 
 _CAN_PAYLOAD = 64
 _IDENTIFY_S = 5.0

@@ -1,21 +1,62 @@
-"""Operations on a bus that no driver has: open, look, ask, do, and leave it as it was found."""
+"""Look at and ask a bus that no driver has, and leave it as it was found."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from typing import Any
 
-from skinware.errors import BusError, BusSendError, ConfigurationError, HandshakeTimeout
+import numpy as np
+
+from skinware.errors import BusError, BusNotAvailable, BusSendError, ConfigurationError, HandshakeTimeout
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import Bus
+from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.description import Patch
-from skinware_drivers.finding.attended import attended
-from skinware_drivers.finding.guess import patches_heard
-from skinware_drivers.finding.traffic import Traffic
+from skinware_drivers.finding.guess import Traffic, patches_heard
 from skinware_drivers.link import Link
 from skinware_drivers.operations import check_arguments, operations_of
 from skinware_drivers.options import nearest_name
+
+
+@asynccontextmanager
+async def attended(bus: Bus, take: Callable[[FrameBatch], object] = lambda _batch: None) -> AsyncIterator[Link]:
+    """Open a bus, read it until the end of the block, and close it.
+
+    A bus that goes away meanwhile is read no more: what is asked on it then gets no answer.
+
+    Args:
+        bus: not open yet.
+        take: called with everything that was read at once; the batch is used again afterwards.
+
+    Raises:
+        BusNotAvailable: it cannot be opened.
+    """
+    loop = asyncio.get_running_loop()
+    link = Link(bus)
+    batch = FrameBatch.for_buses(1, bus.payload_size)
+
+    def read() -> None:
+        batch.clear()
+        try:
+            bus.receive(batch, 0)
+        except BusNotAvailable:
+            loop.remove_reader(descriptor)
+        if len(batch):
+            link.offer(batch, np.arange(batch.start, batch.stop))
+            take(batch)
+
+    bus.open()
+    try:
+        descriptor = bus.fileno()
+        loop.add_reader(descriptor, read)
+        try:
+            yield link
+        finally:
+            loop.remove_reader(descriptor)
+    finally:
+        bus.close()
+
 
 _LISTEN_S = 0.5
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skinware.realtime import NS_PER_S
-from skinware_drivers.running.backoff import Backoff
+from skinware_drivers.running.guard import Backoff
 
 _PATIENT_TIMES = 3
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0

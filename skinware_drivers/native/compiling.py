@@ -9,9 +9,9 @@ import numpy as np
 
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
+from skinware_drivers.decoding.pairing import CompiledCycle
 from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
 from skinware_drivers.native import structs
 from skinware_drivers.numbering import SequenceNumber

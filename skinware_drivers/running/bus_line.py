@@ -16,12 +16,8 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
-from skinware_drivers.running.backoff import Backoff
-from skinware_drivers.running.bus_news import WORDS, BusNews, reason_text
-from skinware_drivers.running.guard import bus_failure, hook
-from skinware_drivers.running.limits import BusLimits
-from skinware_drivers.running.patch_news import PatchNews
-from skinware_drivers.running.slow_call import SlowCall
+from skinware_drivers.running.guard import Backoff, SlowCall, bus_failure, hook
+from skinware_drivers.running.news import WORDS, BusLimits, BusNews, PatchNews, reason_text
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -12,7 +12,7 @@ from skinware.samples import sample_report
 from skinware.status import DataPath, PatchState, load_report
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
-from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.news import MachineLimits
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
 
 

@@ -18,10 +18,9 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.doubles import Doubles
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
-from skinware_drivers.running.patch_news import PatchChange
+from skinware_drivers.running.news import Doubles, PatchChange
 from skinware_drivers.running.publisher import Publisher
 
 log: logging.Logger = logging.getLogger("skinware.driver")

@@ -1,17 +1,13 @@
-"""What happens when a driver's own code fails: one policy for all hooks of an adapter.
-
-A hook is called under ``hook``. A ``BusError`` comes out of it as it is, an ``OSError`` (of a device's library, say)
-becomes one, with the names of the bus and the hook: something is wrong with a device, and it is asked again later.
-Anything else is a fault in the driver's code and becomes a ``DriverError``: its bus is set aside and tried again later
-while others are served, else the driver ends.
-"""
+"""Contain failures: of hooks of an adapter, of attempts that are repeated, and of libraries that do not return."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -84,3 +80,88 @@ def _cause(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return "".join(traceback.format_exception_only(error)).strip().replace("\n", " ") + where
+
+
+class Backoff:
+    """Longer and longer pauses.
+
+    Args:
+        first_s: the first one; the next is twice as long, and so on.
+        longest_s: the longest.
+        at_once: no pause at all comes first.
+    """
+
+    def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
+        self._first_s = first_s
+        self._longest_s = longest_s
+        self._begin_s = 0.0 if at_once else first_s
+        self._next_s = self._begin_s
+
+    @property
+    def longest_s(self) -> float:
+        """The longest pause. What went well for that long is over: see ``begin_again``."""
+        return self._longest_s
+
+    def next_s(self) -> float:
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
+        return pause_s
+
+    def begin_again(self) -> None:
+        self._next_s = self._begin_s
+
+
+class SlowCall:
+    """A call that has begun, in a thread that a program need not wait for when it ends.
+
+    Args:
+        name: of the thread.
+        call: what to do there.
+    """
+
+    def __init__(self, name: str, call: Callable[[], object]) -> None:
+        self._call = call
+        self._afterwards: Callable[[], object] | None = None
+        self._lock = threading.Lock()
+        self._has_returned = False
+        self._loop = asyncio.get_running_loop()
+        self._over: asyncio.Future[Exception | None] = self._loop.create_future()
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    async def is_over(self, patience_s: float) -> bool:
+        """Whether it comes back within a time, s."""
+        over, _ = await asyncio.wait([self._over], timeout=patience_s)
+        if over:
+            self._thread.join()  # which has nothing left to do
+        return bool(over)
+
+    def check(self) -> None:
+        """Once it is over: raise what it raised."""
+        error = self._over.result()
+        if error is not None:
+            raise error
+
+    def leave(self, afterwards: Callable[[], object]) -> bool:
+        """Leave it to itself, if it is not over; something is done in its thread when it has come back after all.
+
+        Returns:
+            Whether it was left; False: it is over, and nothing is done.
+        """
+        with self._lock:
+            if not self._has_returned:
+                self._afterwards = afterwards
+            return not self._has_returned
+
+    def _work(self) -> None:
+        failure = None
+        try:
+            self._call()
+        except Exception as error:  # noqa: BLE001  (for whoever asks)
+            failure = error
+        with self._lock:
+            self._has_returned = True
+        if self._afterwards is not None:
+            with contextlib.suppress(Exception):
+                self._afterwards()
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody asks any more
+            self._loop.call_soon_threadsafe(self._over.set_result, failure)

@@ -11,7 +11,7 @@ from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.link import Link, Match
 from skinware_drivers.polling import Poll
-from skinware_drivers.running.backoff import Backoff
+from skinware_drivers.running.guard import Backoff
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -30,8 +30,7 @@ from skinware_drivers.running.flow import FlowLoop, flow_of
 from skinware_drivers.running.generation import Generation, make_batch, make_watch, split_by_bus
 from skinware_drivers.running.guard import end_of_driver, hook
 from skinware_drivers.running.intake import Intake, latency_for
-from skinware_drivers.running.limits import MachineLimits
-from skinware_drivers.running.patch_news import PatchChange
+from skinware_drivers.running.news import MachineLimits, PatchChange
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving

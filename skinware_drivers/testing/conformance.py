@@ -23,10 +23,9 @@ from __future__ import annotations
 
 import pytest
 
-from skinware_drivers.testing.fault_tests import FaultTests
+from skinware_drivers.testing.fault_tests import FaultTests, SilenceTests
 from skinware_drivers.testing.life_tests import LifeTests
 from skinware_drivers.testing.path_tests import PathTests
-from skinware_drivers.testing.silence_tests import SilenceTests
 from skinware_drivers.testing.torn_tests import TornTests
 from skinware_drivers.testing.value_tests import ValueTests
 

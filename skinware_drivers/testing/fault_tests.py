@@ -1,15 +1,23 @@
-"""That damage on the wire costs no more than it must, and is never shown as data."""
+"""Test that damage costs no more than it must and is never shown as data, and that silence shows and ends."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.realtime import NS_PER_S
+from skinware.status import BusState, PatchState, Status
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
-from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.rig import Running, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.torn_tests import Heard
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -110,3 +118,163 @@ class FaultTests(Suite):
         rig.wire.fault = None
         await rig.sleep(4 * rig.adapter.period_s)
         require(len(rig.wire.damages) >= _DAMAGES // 2, "the emulated devices send too little to test faults with")
+
+
+_SILENCE_S = 1.5
+_RESTART_S = 12.0
+_STALE = np.uint8(Status.STALE | Status.NEVER_SEEN)
+
+
+class SilenceTests(Suite):
+    """Cut cables, lost buses, devices that restart or die."""
+
+    def test_silence_is_shown_and_ends(self) -> None:
+        """A cable that is cut: every value goes stale, and is fresh again when the cable is back."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                rig.wire.silent = True
+                slowest_ns = int(rig.record.frames[-1].structure.group_period_ns.max())
+                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s, 4 * slowest_ns / NS_PER_S))
+                require(
+                    (rig.record.frames[-1].status & _STALE).all(),
+                    "no data has come for seconds, but values are still shown as fresh: is `period_s` far too long?",
+                )
+                rig.wire.silent = False
+                await self._comes_back(rig, "the cable was cut and mended")
+
+        play(scenario)
+
+    def test_a_silent_kind_of_frame_is_not_shown_as_fresh(self) -> None:
+        """One kind of frame falls silent while all others go on: what only it carried keeps the time that it has."""
+
+        async def scenario(clock: HandClock) -> tuple[Heard, Running]:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                heard = Heard(rig)
+                await rig.sleep(_BURSTS * rig.adapter.period_s)
+                return heard, rig
+
+        heard, rig = play(scenario)
+        wire, time_ns = np.concatenate([t.wire for t in heard.takes]), np.concatenate([t.time_ns for t in heard.takes])
+        layout, half = rig.adapter.layout, len(wire) // 2
+        for number, frame in enumerate(layout.frames):
+            decoder = Decoder([layout], heard.tables, [rig.adapter.period_s])
+            seen = _show(decoder, wire[:half], time_ns[:half], None)
+            silent_ns, before = decoder.state.newest_ns, decoder.state.group_time_ns.copy()
+            seen &= ~_show(decoder, wire[half:], time_ns[half:], number)
+            groups = np.unique(decoder.tables.structure.sensor_group[seen])
+            renewed = groups[decoder.state.group_time_ns[groups] > np.maximum(before[groups], silent_ns)]
+            require(
+                not len(renewed),
+                f"frames {frame.name!r} fell silent, but what only they carry goes on as fresh: other frames fill the"
+                " same module. If an Expand is among them, say with `to` which channels it has",
+            )
+
+    def test_a_lost_bus_comes_back(self) -> None:
+        """The interface is unplugged and plugged in again: the driver goes on by itself."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                rig.bus.vanish()
+                gone = await rig.until(
+                    lambda frame: frame.bus_state[0] in (BusState.GONE, BusState.DOWN),
+                    "the interface went away, but the state of the bus does not tell",
+                )
+                del gone
+                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s))
+                require(
+                    (rig.record.frames[-1].status & _STALE).all(),
+                    "the interface is away, but values are shown as fresh",
+                )
+                rig.bus.come_back()
+                await self._comes_back(rig, "the interface was unplugged and plugged in again")
+
+        play(scenario)
+
+    def test_restarted_devices_come_back(self) -> None:
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock, boot_s=0.5) as rig:
+                await rig.until_fresh()
+                number = rig.numbers[0]
+                await self._restart(rig, number, clock.now_ns)
+                patch = rig.first_patch_of(number)
+                states = await self._until_stale(rig, patch, "a device lost its power, but it is shown as live")
+                disturbed = np.flatnonzero(states.patch_state != PatchState.LIVE)
+                require(
+                    set(disturbed.tolist()) <= {patch},
+                    f"a device lost its power, and patches {disturbed.tolist()} are not live: one holds up the others",
+                )
+                await self._comes_back(rig, "a device lost its power for half a second", within_s=_RESTART_S)
+
+        play(scenario)
+
+    @staticmethod
+    async def _restart(rig: Running, number: int, now_ns: int) -> None:
+        rig.devices.restart(number, now_ns)
+
+    @staticmethod
+    async def _until_stale(rig: Running, patch: int, why_not: str) -> DriverSnapshot:
+        return await rig.until(
+            lambda frame: frame.patch_state[patch] != PatchState.LIVE, why_not, within_s=20 * rig.adapter.period_s + 3
+        )
+
+    async def _comes_back(self, rig: Running, after: str, within_s: float = 10.0) -> None:
+        end_ns = rig.clock.now_ns
+        await rig.until(
+            lambda frame: frame.acquired_ns > end_ns and is_fresh(frame) and is_live(frame),
+            f"{after}, and {within_s:g} s later not every sensor is fresh again: look at `probe` and `revive`; what the"
+            f" driver sent: {rig.sent_in_words()}",
+            within_s=within_s,
+        )
+        await rig.sleep(4 * rig.adapter.period_s)
+        Comparison(rig).require_right(f"{after}, and afterwards")
+
+    def test_a_dead_device_holds_up_no_other(self) -> None:
+        """One device dies: the others go on at their rate."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock, boot_s=1e6) as rig:
+                await rig.until_fresh()
+                if len(rig.numbers) < 2:
+                    return
+                await self._restart(rig, rig.numbers[0], clock.now_ns)
+                await rig.sleep(1.0 + 8 * rig.adapter.period_s)
+                first = len(rig.record.frames)
+                await rig.sleep(_BURSTS * rig.adapter.period_s)
+                comparison = Comparison(rig)
+                comparison.require_right("one device had died")
+                for module in range(comparison.structure.n_modules):
+                    if comparison.structure.module_patch[module] == rig.first_patch_of(rig.numbers[0]):
+                        continue
+                    shown = [u for u in comparison.updates if u.module == module and u.frame >= first]
+                    require(
+                        len(shown) >= _BURSTS - 3,
+                        f"one device is dead, and of another one {len(shown)} of {_BURSTS} bursts were shown",
+                    )
+
+        play(scenario)
+
+
+def _show(
+    decoder: Decoder, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], silent: int | None
+) -> npt.NDArray[np.bool_]:
+    """Show frames without those of one kind; (n_sensors,) bool, which sensors they have values of."""
+    batch = FrameBatch(len(wire) + decoder.headroom, wire.dtype["payload"].shape[0], decoder.headroom)
+    decoder.put_back(batch)
+    rows = slice(batch.stop, batch.stop + len(wire))
+    batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0
+    batch.stop = rows.stop
+    if silent is not None:
+        _, kind, _ = decoder.name(batch)
+        keep = np.flatnonzero(kind != silent) + batch.start
+        left = batch.start + len(keep)
+        batch.wire[batch.start : left], batch.time_ns[batch.start : left] = batch.wire[keep], batch.time_ns[keep]
+        batch.stop = left
+    updates, _ = decoder.decode(batch)
+    decoder.state.show(updates)
+    found = np.zeros(decoder.tables.structure.n_sensors + 1, bool)
+    found[updates.sensors[updates.whole]] = True
+    return found[:-1]

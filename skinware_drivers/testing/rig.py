@@ -21,8 +21,8 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
+from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
-from skinware_drivers.running.unused_frames import why_unused
 from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import (

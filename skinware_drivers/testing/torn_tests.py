@@ -13,8 +13,8 @@ from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.replaying import BURSTS, Recording, counter_values, record, try_troubles
 from skinware_drivers.testing.rig import Running, play
-from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 
 _STUMBLING_PERIODS = 80

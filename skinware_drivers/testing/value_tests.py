@@ -10,9 +10,8 @@ import numpy as np
 from skinware.status import Status
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
-from skinware_drivers.testing.patterns import extreme
 from skinware_drivers.testing.rig import Running, play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.suite import Suite, extreme
 from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24

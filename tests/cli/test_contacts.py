@@ -24,7 +24,7 @@ from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
 from skinware.views import live
-from skinware.views.touches import live_contacts, places_of
+from skinware.views.beside import live_contacts, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.cli._learning import _NAMES
-from skinware.cli.convert import _FORMATS, _LEARNING_FORMATS, _WIRE_FORMATS
+from skinware.cli.convert import _FORMATS, _LEARNING_FORMATS, _NAMES, _WIRE_FORMATS
 from skinware.cli.convert import command as convert
 from skinware.conversion import FORMATS, WIRE_FORMATS
 from skinware.conversion.learning import LEARNING_FORMATS

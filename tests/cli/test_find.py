@@ -16,9 +16,8 @@ from skinware import Namespace
 from skinware.cli._command import exit_status
 from skinware_drivers.can import roboskin_boards
 from skinware_drivers.cli.find import command
-from skinware_drivers.finding import adapters, interfaces, ports
-from skinware_drivers.finding.adapters import CanAdapterFound, Detection
-from skinware_drivers.finding.interfaces import CanInterface
+from skinware_drivers.finding import interfaces, ports
+from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.carrying import emulated_on_a_pty
 from tests.commands import running
@@ -49,7 +48,7 @@ def machine(
         monkeypatch.setattr(interfaces, "can_interfaces", lambda: can or [])
         monkeypatch.setattr(interfaces, "kernel_has_can", lambda: kernel_has_can)
         monkeypatch.setattr(ports, "serial_ports", lambda: tty or [])
-        monkeypatch.setattr(adapters, "detect_adapters", lambda _timeout_s: found or Detection())
+        monkeypatch.setattr(interfaces, "detect_adapters", lambda _timeout_s: found or Detection())
 
     monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
     make()

@@ -34,9 +34,8 @@ from skinware_drivers.cli.emulation import Emulation, JsonReport
 from skinware_drivers.cli.find import command as find
 from skinware_drivers.cli.import_ import command as import_
 from skinware_drivers.cli.replay import command as replay
-from skinware_drivers.finding import adapters, interfaces, ports
-from skinware_drivers.finding.adapters import CanAdapterFound, Detection
-from skinware_drivers.finding.interfaces import CanInterface
+from skinware_drivers.finding import interfaces, ports
+from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
@@ -229,7 +228,7 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     monkeypatch.setattr(interfaces, "can_interfaces", lambda: [can0])
     monkeypatch.setattr(ports, "serial_ports", lambda: [tty])
     monkeypatch.setattr(
-        adapters, "detect_adapters", lambda _timeout_s: Detection([CanAdapterFound("kvaser:0", {"x": "y"})], "")
+        interfaces, "detect_adapters", lambda _timeout_s: Detection([CanAdapterFound("kvaser:0", {"x": "y"})], "")
     )
     machine = printing(find, "--probe", "--listen", "0.1")
     monkeypatch.setattr(interfaces, "can_interfaces", list)

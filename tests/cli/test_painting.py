@@ -8,15 +8,16 @@ from rich.segment import Segment
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
 from skinware.cli._painting import (
+    CHARACTERS,
     MARK_CHARACTERS,
     MARK_NAMES,
+    TRUE_COLOURS,
     changed_lines,
     colour_of,
     marks_text,
     scale_text,
     segments_of,
 )
-from skinware.cli._palette import CHARACTERS, TRUE_COLOURS
 
 RAMP = TRUE_COLOURS.ramp
 STALE, MASKED = heat.STALE * LEVELS, heat.MASKED * LEVELS

@@ -8,7 +8,7 @@ import pytest
 from rich.color import Color, ColorSystem
 from rich.color_triplet import ColorTriplet
 
-from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette, palette_for
+from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette, palette_for
 
 PALETTES = {
     "truecolor": (TRUE_COLOURS, ColorSystem.TRUECOLOR),

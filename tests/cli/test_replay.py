@@ -68,7 +68,7 @@ def test_it_does_not_publish_beside_living_drivers_unless_it_is_asked_to(
 
 def test_two_replays_at_once_have_a_namespace_each(file: Path, namespace: Namespace) -> None:
     with running("skin-replay", str(file), "--loop") as first:
-        first.wait_for("ready")
+        first.wait_for("status", lambda status: status["frames"].get("torso", 0) > 0)
         second = refused("skin-replay", str(file))
         assert second.returncode == 2
         assert f"torso runs in namespace '{namespace.name}': give another one with --namespace" in second.stderr

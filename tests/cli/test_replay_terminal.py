@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from skinware import Namespace, Sample, ServiceReader
-from skinware.cli._replay_keys import clock
+from skinware.cli.replay import clock
 from skinware.errors import ServiceError
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import BIN, PATIENCE_S

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware.cli._scale import ChangeScale, ValueScale
-from skinware.views.scales import rounded_up
+from skinware.cli._picture import ChangeScale, ValueScale
+from skinware.views.quantities import rounded_up
 
 NOISE = 3.0
 FRESH = np.ones(5, bool)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from skinware.views.shapes import block_columns, shape_of
+from skinware.views.scene import block_columns, shape_of
 
 
 def drawn(kind: str, count: int) -> list[str]:

@@ -16,8 +16,8 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware.cli import _top_app
 from skinware.cli._heat_widget import HeatMap
-from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
-from skinware.cli._scale import CHANGE, RANGE
+from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
+from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region, Regions

@@ -17,7 +17,7 @@ import pytest
 
 import skinware.recording
 from skinware import DriverReader
-from skinware.cli._output import PatientStream, patient_output
+from skinware.cli._terminal import PatientStream, patient_output
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import BIN, PATIENCE_S
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from skinware import Namespace
-from skinware_drivers.doctor import surroundings
+from skinware_drivers.doctor import looking
 from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.testing.driving import EmulatedSkin
 from tests.finding.fakes import see_only
@@ -19,8 +19,8 @@ def alone(namespace: Namespace, tmp_path_factory: pytest.TempPathFactory, monkey
     """Other tests may have drivers and namespaces, and the machine may drop packets; the folder of namespaces."""
     root = tmp_path_factory.mktemp("shm")
     see_only(namespace, root, monkeypatch)
-    monkeypatch.setattr(surroundings, "ROOT", root)
-    monkeypatch.setattr(surroundings, "softnet_dropped", lambda: 0)
+    monkeypatch.setattr(looking, "ROOT", root)
+    monkeypatch.setattr(looking, "softnet_dropped", lambda: 0)
     monkeypatch.setattr(interfaces, "can_interfaces", list)
     monkeypatch.setattr(ports, "serial_ports", list)
     return root

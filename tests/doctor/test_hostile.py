@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from skinware.realtime import now_ns
-from skinware_drivers.cli.doctor_text import as_text
+from skinware_drivers.cli.doctor import as_text
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.recorded import look_at
-from skinware_drivers.doctor.report import as_markdown
-from skinware_drivers.doctor.scrubbing import Secrets
+from skinware_drivers.doctor.report import Secrets, as_markdown
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.doctor.rig import looked
 from tests.recording.rig import has, recording

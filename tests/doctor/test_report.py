@@ -14,8 +14,7 @@ from skinware import Namespace
 from skinware.cli._command import exit_status
 from skinware_drivers.cli.doctor import command
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.report import as_markdown
-from skinware_drivers.doctor.scrubbing import Secrets, scrubbed
+from skinware_drivers.doctor.report import Secrets, as_markdown, scrubbed
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.doctor.rig import looked
 

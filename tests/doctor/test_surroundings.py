@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from skinware import DriverReader, Namespace
-from skinware_drivers.doctor import programs, surroundings, timing
+from skinware_drivers.doctor import looking, timing
 from skinware_drivers.doctor.evidence import Evidence, MachineSeen, NamespaceSeen
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.finding import Finding, Severity
@@ -36,7 +36,7 @@ def findings(seen: Evidence, area: str) -> list[Finding]:
 
 
 def machine(**changes: object) -> MachineSeen:
-    return dataclasses.replace(surroundings.MachineWatch().seen(), **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(looking.MachineWatch().seen(), **changes)  # type: ignore[arg-type]
 
 
 def can(root: Path, *links: dict[str, object]) -> list[CanInterface]:
@@ -170,7 +170,7 @@ def test_circumstances_are_the_evidence_of_what_they_cost() -> None:
 def test_namespaces_that_are_forgotten_foreign_or_no_namespaces(alone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (alone / "skinware.not a name").mkdir()
     (alone / "skinware.file").touch()
-    told = surroundings.namespaces_seen(Namespace())
+    told = looking.namespaces_seen(Namespace())
     assert [one.is_ours for one in told] == [True] + [False] * (len(told) - 1)
     old = NamespaceSeen("old", "/dev/shm/skinware.old", False, dead=("torso",), bytes_of_dead=1 << 20, idle_s=7200.0)
     foreign = NamespaceSeen("lab", "/dev/shm/skinware.lab", False, problem="it belongs to somebody else")
@@ -186,7 +186,7 @@ def test_a_driver_that_has_found_no_board_is_told() -> None:
     bus = "udp_multicast:239.74.163.9?port=43171"
     with running("skin-driver", "--bus", bus) as driver:
         pid = driver.process.pid
-        wait_until(lambda: pid in programs.waiting_drivers(set()))
+        wait_until(lambda: pid in looking.waiting_drivers(set()))
         finding = found_until(of("timing", "no driver has published"), seconds=0.0)
     assert f"{pid}" in finding.evidence
     assert "has found no device so far" in finding.evidence
@@ -218,8 +218,8 @@ def test_a_calmed_driver_is_no_second_one_on_its_bus(tmp_path: Path) -> None:
     for pid, program in ((17, "skin-calm"), (18, "skin-replay"), (19, "skin-driver"), (20, "python3")):
         (tmp_path / str(pid)).mkdir()
         (tmp_path / str(pid) / "comm").write_text(f"{program}\n")
-    assert [pid for pid in range(16, 22) if programs.publishes_again(pid, tmp_path)] == [17, 18]
-    assert programs.waiting_drivers({20}, tmp_path) == (19,)
+    assert [pid for pid in range(16, 22) if looking.publishes_again(pid, tmp_path)] == [17, 18]
+    assert looking.waiting_drivers({20}, tmp_path) == (19,)
 
 
 def test_names_of_others_cannot_move_the_cursor(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ import pytest
 from skinware.memory.namespace import Namespace
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.finding import running
+from skinware_drivers.finding.guess import Traffic
 from skinware_drivers.finding.ports import Machine
-from skinware_drivers.finding.traffic import Traffic
 
 
 def see_only(namespace: Namespace, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from skinware_drivers.finding.adapters import CanAdapterFound, detect_adapters
+from skinware_drivers.finding.interfaces import CanAdapterFound, detect_adapters
 
 
 def script(text: str) -> list[str]:

@@ -14,8 +14,7 @@ from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.finding.guess import Guess, guess, known_drivers
-from skinware_drivers.finding.traffic import Traffic
+from skinware_drivers.finding.guess import Guess, Traffic, guess, known_drivers
 from skinware_drivers.layout import Bits, Byte, Cycle, Frame, Identifier, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.bus import VirtualCanBus

@@ -22,8 +22,8 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
-from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.looking import Answer, HeardOnBus, ask, ask_port, listen_on
+from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import (

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.finding.traffic import Traffic
+from skinware_drivers.finding.guess import Traffic
 from skinware_drivers.link import Heard
 from tests.finding.fakes import SKIN, traffic_of
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from skinware_drivers.finding.ports import serial_ports
-from skinware_drivers.finding.udev import RULES_FILE, rules_for, shipped_rules
+from skinware_drivers.finding.ports import RULES_FILE, rules_for, serial_ports, shipped_rules
 from tests.finding.fakes import FakeMachine
 
 _PAIR = re.compile(r'([A-Z_]+)(?:\{([^}]+)\})?(==|!=|\+=|-=|:=|=)"((?:[^"\\])*)"')

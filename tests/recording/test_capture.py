@@ -15,7 +15,7 @@ import pytest
 import skinware.recording
 from skinware import DriverReader, Namespace
 from skinware.recording import Recording, WireItem
-from skinware_drivers.doctor.scrubbing import Disguise, Secrets
+from skinware_drivers.doctor.report import Disguise, Secrets
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import refused, run, running
 

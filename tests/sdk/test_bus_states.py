@@ -19,9 +19,9 @@ from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running import bus_line, bus_news, runner
+from skinware_drivers.running import bus_line, news, runner
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
+from skinware_drivers.running.news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -353,7 +353,7 @@ def test_a_flapping_bus_of_a_running_driver_is_told_of_a_few_times(
 ) -> None:
     monkeypatch.setattr(bus_line, "_FIRST_PAUSE_S", 0.001)
     monkeypatch.setattr(bus_line, "_LONGEST_PAUSE_S", 0.001)
-    monkeypatch.setattr(bus_news, "LINES_AT_ONCE", 3)
+    monkeypatch.setattr(news, "LINES_AT_ONCE", 3)
     bus = reporting()
     with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
         flaps = 0

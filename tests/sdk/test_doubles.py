@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware_drivers.running.doubles import Doubles
+from skinware_drivers.running.news import Doubles
 from tests.cli.fake_skin import fake_structure
 
 

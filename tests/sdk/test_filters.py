@@ -15,7 +15,7 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.socketcan import MOST_FILTERS, SocketCanBus
-from skinware_drivers.decoding.filters import fewest, filters_of
+from skinware_drivers.decoding.addresses import fewest, filters_of
 from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from skinware_drivers.testing.patterns import lively
 from skinware_drivers.testing.rig import Case, Running, play
+from skinware_drivers.testing.suite import lively
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 

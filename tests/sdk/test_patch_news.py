@@ -7,8 +7,7 @@ import logging
 import pytest
 
 from skinware import DriverReader
-from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE
-from skinware_drivers.running.patch_news import PatchChange, PatchNews
+from skinware_drivers.running.news import LINE_EVERY_S, LINES_AT_ONCE, PatchChange, PatchNews
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.clock import Clock
 from tests.sdk.driving import driving, emulated, follow, hardware_of

@@ -14,7 +14,7 @@ from skinware_drivers.can import CanAdapter
 from skinware_drivers.conditions import Byte
 from skinware_drivers.counters import BusCounters, Samples
 from skinware_drivers.running import patch_care
-from skinware_drivers.running.unused_frames import why_unused
+from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import Chatter, TroubledBus, driving_lines
 

@@ -21,7 +21,7 @@ from skinware_drivers.serial.packets import Packet
 from skinware_drivers.serial.recurring import Recurring
 from skinware_drivers.serial.stuffing import LINES
 from skinware_drivers.serial.text_matrix import TextMatrix
-from skinware_drivers.testing.both_streams import made
+from skinware_drivers.testing.path_tests import made
 from tests.serial.framings import Example
 
 _ROWS = 3

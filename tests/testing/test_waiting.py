@@ -10,7 +10,7 @@ import pytest
 
 from skinware import DriverReader
 from skinware.samples import Unused
-from skinware_drivers.testing.silence_tests import SilenceTests
+from skinware_drivers.testing.fault_tests import SilenceTests
 from skinware_drivers.testing.waiting import read_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.testing import test_cells

@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.exceptions import InvalidStatus
 
-from skinware.views.access import Access, Refused, is_loopback
-from skinware.views.peers import account_of
+from skinware.views.access import Access, Refused, account_of, is_loopback
 from skinware_drivers.testing.waiting import PATIENCE_S
 from tests.views.client import page_of
 from tests.views.conftest import INDEX, Serve

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from skinware import Status
-from skinware.views.levels import HIGHEST, NO_VALUE, WITHOUT_VALUE, levels_of, shear_of
+from skinware.views.quantities import HIGHEST, NO_VALUE, WITHOUT_VALUE, levels_of, shear_of
 
 VALUES = arrays.arrays(np.float32, 20, elements=st.floats(width=32))
 LIMITS = st.tuples(st.floats(-1e30, 1e30), st.floats(-1e30, 1e30))

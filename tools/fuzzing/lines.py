@@ -29,10 +29,10 @@ from skinware_drivers.description import SkinTables  # noqa: E402
 from skinware_drivers.registry import load_driver  # noqa: E402
 from skinware_drivers.serial.adapter import SerialAdapter  # noqa: E402
 from skinware_drivers.testing.both_paths import Pair, hand_clock, why_python  # noqa: E402
-from skinware_drivers.testing.both_streams import made  # noqa: E402
 from skinware_drivers.testing.one_path import Publishing  # noqa: E402
-from skinware_drivers.testing.patterns import lively  # noqa: E402
+from skinware_drivers.testing.path_tests import made  # noqa: E402
 from skinware_drivers.testing.rig import Case, Running, play  # noqa: E402
+from skinware_drivers.testing.suite import lively  # noqa: E402
 from skinware_drivers.virtual.hand_clock import HandClock  # noqa: E402
 from skinware_drivers.virtual.hardware import load_emulator  # noqa: E402
 

@@ -17,7 +17,7 @@ from textual.widgets import DataTable, Static
 
 from skinware import Namespace
 from skinware.cli._heat_map import BACKGROUND, LEVELS
-from skinware.cli._palette import TRUE_COLOURS
+from skinware.cli._painting import TRUE_COLOURS
 from skinware.cli._top_app import SkinTop
 
 SIZE = (80, 24)

@@ -1,7 +1,4 @@
-"""What the kernel knows of a CAN interface: bit rate, state of the controller, restarts. By rtnetlink; needs no rights.
-
-Sources: linux/rtnetlink.h, linux/if_link.h, linux/can/netlink.h.
-"""
+"""Ask the kernel about a CAN interface (rtnetlink), and compute how long frames take on its wire."""
 
 from __future__ import annotations
 
@@ -9,6 +6,11 @@ import socket
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.bus import EXTENDED_FLAG
 
 _RTM_NEWLINK, _RTM_GETLINK = 16, 18
 _NLM_F_REQUEST = 1
@@ -81,3 +83,38 @@ def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
             return
         yield kind & 0x3FFF, data[offset + 4 : offset + length]
         offset += -(-length // 4) * 4
+
+
+_CLASSIC_PAYLOAD = 8
+_CLASSIC_BITS, _CLASSIC_EXTENDED_BITS = 47, 67  # without payload and stuff bits, with the pause after it
+_FD_BITS, _FD_EXTENDED_BITS = 30, 49  # at the nominal rate: up to the bit rate switch, and from the acknowledgement on
+_FD_SHORT_DATA_BITS, _FD_LONG_DATA_BITS = 32, 37  # beside the payload, with the fixed stuff bits: check sum of 17 or 21
+_LONGEST_SHORT_FD = 16
+_STUFFING = 1.1
+# flags of linux/can.h; kernels before 5.14 do not set the last one
+_SWITCHED, _PASSIVE_SENDER, _IS_FD = 0x01, 0x02, 0x04
+
+
+def wire_bits(wire: npt.NDArray[np.void], speed_up: float = 1.0) -> float:
+    """About how many bits of the nominal rate frames take.
+
+    Args:
+        wire: (n,) rows of :func:`skinware_drivers.bus.wire_dtype`.
+        speed_up: by how much the payload of CAN FD frames that switch is faster.
+    """
+    if wire.dtype["payload"].shape[0] == _CLASSIC_PAYLOAD:
+        return _classic_bits(wire)
+    length, flags = wire["length"].astype(np.int64), wire["flags"]
+    is_fd = (flags & np.uint8(_SWITCHED | _PASSIVE_SENDER | _IS_FD) != 0) | (length > _CLASSIC_PAYLOAD)
+    fd, length = wire[is_fd], length[is_fd]
+    extended = int(np.count_nonzero(fd["identifier"] & np.uint32(EXTENDED_FLAG)))
+    bits = _FD_BITS * (len(fd) - extended) + _FD_EXTENDED_BITS * extended
+    data = np.where(length > _LONGEST_SHORT_FD, _FD_LONG_DATA_BITS, _FD_SHORT_DATA_BITS) + 8 * length
+    share = np.where(fd["flags"] & np.uint8(_SWITCHED), 1 / speed_up, 1.0)
+    return _classic_bits(wire[~is_fd]) + _STUFFING * (bits + float(data @ share))
+
+
+def _classic_bits(wire: npt.NDArray[np.void]) -> float:
+    extended = int(np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG)))
+    bits = _CLASSIC_BITS * (len(wire) - extended) + _CLASSIC_EXTENDED_BITS * extended
+    return _STUFFING * (bits + 8 * int(wire["length"].sum(dtype=np.int64)))

@@ -44,8 +44,7 @@ from skinware_drivers.can.roboskin_options import (
     runs_text,
     usual_kind,
 )
-from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp, tell_of_chips, tell_what_fits
-from skinware_drivers.can.roboskin_watch import BaselineWatch
+from skinware_drivers.can.roboskin_setup import START, STOP, BaselineWatch, BoardSetUp, tell_of_chips, tell_what_fits
 from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match

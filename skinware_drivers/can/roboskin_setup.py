@@ -1,12 +1,4 @@
-"""What ROBOSKIN boards are told at set-up, and what is switched on in them afterwards.
-
-Order and waits: robotology/icub-main CanBusSkin.cpp. SET_BRD_CFG to each board, SET_TRIANG_CFG for all triangles of
-each, 500 ms, the boards that differ, 10 ms, the triangles that differ, 10 ms, start. What the firmware makes of it:
-robotology/icub-firmware embot_app_application_theSkin.cpp; a SET_BRD_CFG switches all triangles off.
-
-The old way: TACT_SETUP (4C) to each board, which starts it, then TACT_SETUP2 (4E) to each. An MTB4 takes nothing
-from them: it sends all triangles every 40 ms, in message class 4.
-"""
+"""Set up ROBOSKIN boards, and watch for boards that may have moved their baseline."""
 
 from __future__ import annotations
 
@@ -15,6 +7,10 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
+import numpy as np
+import numpy.typing as npt
+
+from skinware.status import Status
 from skinware_drivers.can.roboskin_options import (
     ERGO_HAND,
     TRIANGLES,
@@ -24,6 +20,9 @@ from skinware_drivers.can.roboskin_options import (
     SpecialBoards,
     runs,
 )
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.description import SkinTables
+from skinware_drivers.polling import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -229,3 +228,40 @@ def tell_what_fits(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
         fitting,
         math.ceil(period_ms * needed),
     )
+
+
+_RECALIBRATION_CYCLES = 5
+_ZERO, _ALL = 1, (1 << _RECALIBRATION_CYCLES) - 1
+
+
+class BaselineWatch(Watch):
+    """Marks boards that may have moved their baseline.
+
+    When they have, the flag of the channel goes away. What they send from then on is measured from an unknown baseline,
+    until they are set up again.
+
+    What a board has counted is not always known: whether one that was set up anew had restarted, it does not say. So
+    all counts that are possible are followed, as bits, and one that may have reached the fifth is marked.
+    """
+
+    def __init__(self, tables: SkinTables) -> None:
+        super().__init__(tables)
+        self._counts: npt.NDArray[np.int64] = np.full(tables.structure.n_patches, _ZERO)  # bit k: it may be at k
+
+    def look(self, updates: Updates) -> None:
+        """Count what was not acknowledged, per board; see :class:`skinware_drivers.adapter.Watch`."""
+        status = updates.status[:, 0]  # these flags are of all sensors of a triangle
+        silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
+        if not silent.any():
+            return
+        module_patch = self.tables.structure.module_patch
+        cycles = np.bincount(module_patch[updates.module[silent]], minlength=len(self._counts))
+        moved = (self._counts << np.minimum(cycles, _RECALIBRATION_CYCLES)) > _ALL
+        turned = self._counts << cycles % _RECALIBRATION_CYCLES
+        self._counts = (turned | turned >> _RECALIBRATION_CYCLES | moved * _ZERO) & _ALL
+        self.module_status[moved[module_patch]] |= np.uint8(Status.SUSPECT)
+
+    def forget(self, patch: int) -> None:
+        """The board was set up anew, so its baseline is known again; it goes on counting, unless it had restarted."""
+        super().forget(patch)
+        self._counts[patch] |= _ZERO

@@ -32,10 +32,9 @@ from skinware_drivers.bus import (
     identifier_text,
 )
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
-from skinware_drivers.can.interface import NO_CAN, read_controller
+from skinware_drivers.can.interface import NO_CAN, read_controller, wire_bits
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
-from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.native.kernel_bus import KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from skinware_drivers.icub.importer import Import, ImportedPart
-    from skinware_drivers.icub.notes import Note
+    from skinware_drivers.icub.xml_tree import Note
 
 _HEADINGS = {
     "todo": "To fill in or decide",
@@ -78,7 +78,7 @@ def icub(
     reported on stderr.
     """
     from skinware_drivers.icub.importer import import_files
-    from skinware_drivers.icub.notes import Notes
+    from skinware_drivers.icub.xml_tree import Notes
 
     root = _root(root)
     notes = Notes()
@@ -178,7 +178,7 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) 
 
 
 def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, str]], root: str) -> dict[str, object]:
-    from skinware_drivers.icub.notes import shown
+    from skinware_drivers.icub.xml_tree import shown
 
     parts = []
     for number, part in enumerate(done.parts):

@@ -1,20 +1,110 @@
-"""Body parts on boards: what a part's ports, position files and drawings say of its triangles."""
+"""Say what a part's ports, position files and drawings (skinGui) make of its boards."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec.structs
 
+from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup
+from skinware.tactile.regions import Region
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
-from skinware_drivers.icub.drawing import Drawing, Shape
-from skinware_drivers.icub.notes import Notes
+from skinware_drivers.icub.device import Port
 from skinware_drivers.icub.part import Part
-from skinware_drivers.icub.positions import Pose, Positions
-from skinware_drivers.icub.wrapper import Port
+from skinware_drivers.icub.positions import Pose, Positions, read_text
+from skinware_drivers.icub.xml_tree import Notes
+from skinware_drivers.icub.xml_tree import number as whole_number
+
+_SENSORS = "[SENSORS]"
+Shape = tuple[str, tuple[int, ...]]
+"""Kind of a module, and its channels that feel no touch."""
+
+_KINDS: dict[str, Shape] = {
+    "triangle": ("triangle", ()),
+    "triangle_10pad": ("triangle", NON_TACTILE["triangle"]),
+    **dict.fromkeys(("fingertip", "fingertip2L", "fingertip2R", "fingertip3L", "fingertip3R"), ("fingertip", ())),
+}
+_PALMS = ("palmL", "palmR")
+_TRIANGLES_OF_A_PALM = 4
+_MOST_TRIANGLES = 256
+_NOT_USED = ("cardid", "CanDeviceName", "CanDeviceNum", "width", "height", "xpos", "ypos")
+
+
+@dataclass
+class Drawing:
+    """One file.
+
+    Attributes:
+        path: of it.
+        part: the body part.
+        shapes: by triangle (16 per board, in the body part's own count), what it is; None where nobody here knows.
+    """
+
+    path: Path
+    part: str
+    shapes: dict[int, Shape | None] = field(default_factory=dict)
+
+
+def is_drawing(text: str) -> bool:
+    """Whether a text looks like a drawing of skinGui."""
+    return _SENSORS in text and "robotPart" in text
+
+
+def read_drawing(path: Path, notes: Notes) -> Drawing:
+    """Read a file; what is not understood is noted.
+
+    Raises:
+        ConfigurationError: it is no drawing.
+    """
+    text = read_text(path)
+    if not is_drawing(text):
+        raise ConfigurationError(f"{path}: not a drawing of skinGui: it has no robotPart and [SENSORS]")
+    drawing = Drawing(path, "")
+    in_sensors, unused = False, set[str]()
+    for line_number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0] == _SENSORS:
+            in_sensors = True
+        elif in_sensors:
+            why = _take_sensor(drawing, words)
+            if why:
+                notes.add("unknown", path, why, line=line_number, element=" ".join(words)[:60])
+        elif words[0] == "robotPart":
+            drawing.part = " ".join(words[1:])
+        elif words[0] in _NOT_USED:
+            unused.add(words[0])
+        else:
+            notes.add("unknown", path, "not understood", line=line_number, element=" ".join(words)[:60])
+    if drawing.shapes:
+        unused.add("x, y, orientation, gain, mirror and layout of each module")
+    if unused:
+        text = "for the picture on the screen only; not used"
+        notes.add("info", path, text, element="; ".join(sorted(unused)))
+    return drawing
+
+
+def _take_sensor(drawing: Drawing, words: list[str]) -> str:
+    """Take one module; returns why not, if so."""
+    try:
+        triangle = whole_number(words[1])
+    except (IndexError, ValueError):
+        return "no number of a triangle; left out"
+    if not 0 <= triangle < _MOST_TRIANGLES:
+        return f"there is no triangle {triangle}; left out"
+    if words[0] in _PALMS:
+        for each in range(triangle, min(triangle + _TRIANGLES_OF_A_PALM, _MOST_TRIANGLES)):
+            drawing.shapes[each] = "palm", NON_TACTILE["palm"]
+        return ""
+    drawing.shapes[triangle] = _KINDS.get(words[0])
+    return "" if words[0] in _KINDS else f"a module of the kind {words[0]!r}, which is not known here"
+
 
 _OF_A_BOARD = TRIANGLES * CHANNELS
 _NO_NORMAL = (math.nan,) * 3
@@ -176,3 +266,32 @@ def places_text(places: Sequence[Place] | set[Place]) -> str:
     for patch, board, triangle in sorted(places):
         boards.setdefault((patch, board), []).append(triangle)
     return "; ".join(f"patch {p} board {b}: {runs_text(triangles)}" for (p, b), triangles in boards.items())
+
+
+def regions_of(
+    driver: str, places: Mapping[str, set[Place]], enabled: set[Place], patches: Sequence[int]
+) -> list[Region]:
+    """A region for each body part of which something is switched on.
+
+    Args:
+        driver: name of the driver of the device.
+        places: the triangles of each body part, by its name.
+        enabled: triangles that are switched on.
+        patches: the device's patches, in the order of the driver's buses.
+    """
+    boards = Counter(board for _, board in {(patch, board) for patch, board, _ in enabled})
+    regions = []
+    for name, of_part in places.items():
+        on = of_part & enabled
+        by_name, by_uid = set[int](), list[int]()
+        for patch, board, triangle in sorted(on):
+            of_board = {place for place in enabled if place[:2] == (patch, board)}
+            if boards[board] == 1 and of_board <= on:
+                by_name.add(board)
+            else:  # the name is not the board's alone, or the board not the part's
+                first = patches.index(patch) << 32 | board << 16 | triangle << 8
+                by_uid += range(first, first + CHANNELS)
+        if on:
+            patch_names = tuple(f"board {board}" for board in sorted(by_name))
+            regions.append(Region(name, "pressure", (driver,), tuple(by_uid), patch_names))
+    return regions

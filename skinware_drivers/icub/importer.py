@@ -13,17 +13,27 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
 from skinware.tactile.regions import Region, regions_to_toml
 from skinware_drivers.can.roboskin_options import CHANNELS
-from skinware_drivers.icub.body import check_drawings, places_of, read_body
-from skinware_drivers.icub.device import DeviceReader
-from skinware_drivers.icub.drawing import Drawing, is_drawing, read_drawing
-from skinware_drivers.icub.notes import Level, Notes, shown
+from skinware_drivers.icub.body import (
+    Drawing,
+    check_drawings,
+    is_drawing,
+    places_of,
+    read_body,
+    read_drawing,
+    regions_of,
+)
+from skinware_drivers.icub.device import WRAPPER, DeviceReader, Port, Wrapper, read_wrapper
 from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
-from skinware_drivers.icub.regions import regions_of
-from skinware_drivers.icub.toml_text import configuration_text, yarp_configuration_text
-from skinware_drivers.icub.translate import TranslatedBus, enabled_places, service_name, translate
-from skinware_drivers.icub.wrapper import WRAPPER, Port, Wrapper, read_wrapper
-from skinware_drivers.icub.xml_tree import Element
+from skinware_drivers.icub.translate import (
+    TranslatedBus,
+    configuration_text,
+    enabled_places,
+    service_name,
+    translate,
+    yarp_configuration_text,
+)
+from skinware_drivers.icub.xml_tree import Element, Level, Notes, shown
 from skinware_drivers.icub.yarp import YarpPort, yarp_ports
 
 _SUFFIXES = (".xml", ".txt", ".ini")

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 
 from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD, TRIANGLES
 from skinware_drivers.icub.device import Group
-from skinware_drivers.icub.notes import Notes
-from skinware_drivers.icub.values import Reader, words
-from skinware_drivers.icub.xml_tree import Element
+from skinware_drivers.icub.xml_tree import Element, Notes, Reader, words
 
 ETHERNET, CAN = "embObjSkin", "canBusSkin"
 _ONLY_PATCH = 1

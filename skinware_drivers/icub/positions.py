@@ -18,9 +18,7 @@ from pathlib import Path
 from skinware.errors import ConfigurationError
 from skinware.geometry import Triple
 from skinware_drivers.can.roboskin_options import CHANNELS
-from skinware_drivers.icub.notes import Notes
-from skinware_drivers.icub.values import number
-from skinware_drivers.icub.xml_tree import read_bytes
+from skinware_drivers.icub.xml_tree import Notes, number, read_bytes
 
 _CALIBRATION = "[calibration]"
 _REPRESENTATIVES = re.compile(r"taxel2Repr\s*\(([^()]*)\)")

@@ -1,19 +1,151 @@
-"""XML as robots have it: elements with line numbers, read without trust.
-
-Documents may refer to a DTD by its address, as real ones do; it is not fetched. Documents that define entities are
-refused, as nobody here needs them and they can make a small file huge. Comments are read as the robots' own reader
-does, which lets them end at the first ``-->``, whatever they hold before.
-"""
+"""Read a robot's files: XML with line numbers, values, and notes on everything that is left out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 from xml.parsers import expat
 
+import msgspec
+
+from skinware._printable import printable
 from skinware.errors import ConfigurationError
-from skinware_drivers.icub.notes import Notes
+
+Level = Literal["todo", "odd", "unknown", "missing", "info"]
+"""``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not
+understood; ``missing``: named, but not there; ``info``: nothing to do."""
+
+
+class Note(msgspec.Struct, frozen=True, order=True):
+    """One remark.
+
+    Attributes:
+        level: what kind.
+        file: where it is about.
+        line: counted from 1; 0: the file as a whole.
+        element: what is meant there.
+        text: the remark.
+    """
+
+    level: Level
+    file: str
+    line: int
+    element: str
+    text: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {self.element}: {self.text}" if self.element else f"{place}: {self.text}"
+
+
+_LONGEST = 400
+
+
+def shown(text: object) -> str:
+    """A text from a foreign file as a terminal or a comment can show it: without control characters, not too long."""
+    visible = printable(str(text))
+    return visible if len(visible) <= _LONGEST else f"{visible[:_LONGEST]} ..."
+
+
+class Notes:
+    """Remarks in the order in which they came, each once."""
+
+    def __init__(self) -> None:
+        self._notes: dict[Note, None] = {}
+
+    def add(self, level: Level, file: Path | str, text: str, *, line: int = 0, element: str = "") -> None:
+        self._notes[Note(level, shown(file), line, shown(element), shown(text))] = None
+
+    def take(self, other: Notes) -> None:
+        self._notes.update(other._notes)
+
+    def all(self) -> list[Note]:
+        return list(self._notes)
+
+
+_LONGEST_NUMBER = 12
+
+
+def words(text: str) -> list[str]:
+    """The words of a value; quotes and the brackets of a list fall away."""
+    return text.translate(str.maketrans('()"', "   ")).split()
+
+
+def number(text: str) -> int:
+    """A whole number as these files write it.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
+        raise ValueError(f"{text[:20]!r} is not a whole number")
+    try:
+        value = int(text, 16) if text.lower().startswith("0x") else int(text, 10)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a whole number") from None
+    return value
+
+
+class Reader:
+    """Reads values of elements; what it cannot read is noted, and counts as not given.
+
+    Args:
+        notes: takes what was not understood.
+    """
+
+    def __init__(self, notes: Notes) -> None:
+        self.notes = notes
+
+    def numbers(self, element: Element | None) -> list[int] | None:
+        """All words of an element as numbers; None if there is no element, or one is none."""
+        if element is None:
+            return None
+        element.understood = True
+        try:
+            return [number(word) for word in words(element.text)]
+        except ValueError as error:
+            self.refuse(element, str(error))
+            return None
+
+    def number(self, element: Element | None, first: int, last: int) -> int | None:
+        """The one number of an element, within limits."""
+        found = self.numbers(element)
+        if element is None or found is None:
+            return None
+        if len(found) != 1:
+            self.refuse(element, f"{element.text!r} is not one number")
+        elif not first <= found[0] <= last:
+            self.refuse(element, f"{found[0]} is outside {first}-{last}")
+        else:
+            return found[0]
+        return None
+
+    def truth(self, element: Element | None) -> bool | None:
+        """Yes or no as YARP reads it: the first word is ``true`` or a number that is not 0; anything else means no."""
+        if element is None:
+            return None
+        element.understood = True
+        found = words(element.text)
+        try:
+            value = found[:1] == ["true"] or bool(number("".join(found[:1])))
+            clear = len(found) == 1
+        except ValueError:
+            value, clear = False, found == ["false"]
+        if not clear:
+            text = f"{element.text!r} is neither true nor false; taken to be {str(value).lower()}, as on the robot"
+            self.note("odd", element, text)
+        return value
+
+    def refuse(self, element: Element, why: str) -> None:
+        """Note that a value was not understood."""
+        self.note("unknown", element, f"{why}; left out")
+
+    def note(self, level: Level, element: Element, text: str) -> None:
+        """Note something about an element."""
+        self.notes.add(level, element.file, text, line=element.line, element=element.label)
+
 
 LARGEST_FILE = 4 << 20
 _DEEPEST = 40

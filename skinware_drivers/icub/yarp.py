@@ -14,10 +14,10 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE
 from skinware_drivers.description import Module
 from skinware_drivers.icub.body import Body, Place, triangles_of
-from skinware_drivers.icub.notes import Notes
+from skinware_drivers.icub.device import Port
 from skinware_drivers.icub.part import Part
 from skinware_drivers.icub.translate import TranslatedBus
-from skinware_drivers.icub.wrapper import Port
+from skinware_drivers.icub.xml_tree import Notes
 from skinware_drivers.streams.yarp import Triangles, YarpOptions
 
 _CHANNEL = 0xFF

@@ -1,4 +1,4 @@
-"""The adapter that drivers of Modbus devices subclass: which registers hold which values, and nothing about asking."""
+"""Adapt drivers of Modbus devices: they declare which registers hold which values, and no more."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusError, ConfigurationError
+from skinware.status import Status
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.conditions import Identifier
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import AnyFlag, Frame, Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.modbus import wire
@@ -23,6 +26,7 @@ from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.master import ANSWERS
 from skinware_drivers.modbus.registers import Order, Registers, Wanted
 from skinware_drivers.options import OptionsT
+from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -279,3 +283,28 @@ def _refuse_twice(registers: Sequence[Registers]) -> None:
                     f"{owner.name} and {block.name} both have the value of channel {channel}: say which patch or module"
                     " each is of, or with `to` which channels it has"
                 )
+
+
+class OrderWatch(ZeroWatch):
+    """Also tells what it means that the layout holds values for suspect because they are above all that a taxel tells.
+
+    Args:
+        tables: of the skin.
+        full_scale: the greatest value of a taxel.
+    """
+
+    def __init__(self, tables: SkinTables, full_scale: int) -> None:
+        super().__init__(tables)
+        self._full_scale = full_scale
+        self._has_told_order = False
+
+    def look(self, updates: Updates) -> None:
+        super().look(updates)
+        is_sensor = updates.sensors < self.tables.structure.n_sensors
+        if not self._has_told_order and (updates.status[is_sensor] & Status.SUSPECT).any():
+            self._has_told_order = True
+            log.warning(
+                "values above %d, which no taxel has, are suspect; if there are many, the device may send the bytes of"
+                " registers in the other order: add byte_order=little to the options of the bus",
+                self._full_scale,
+            )

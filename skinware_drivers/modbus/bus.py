@@ -29,9 +29,9 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
 from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.address import Address, parse_address
+from skinware_drivers.streams.bus import Address, parse_address
 from skinware_drivers.streams.tcp import TcpOptions, TcpPort, TcpServerBus, connect
-from skinware_drivers.virtual.timer import MonotonicTimer, Timer
+from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
 
 DEFAULT_PORT = 502
 _TCP = "tcp://"

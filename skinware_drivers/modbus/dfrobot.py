@@ -29,8 +29,7 @@ from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter
-from skinware_drivers.modbus.order_watch import OrderWatch
+from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.options import check_options

@@ -15,7 +15,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guest, Guests
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.serial.ports import PtyPort
-from skinware_drivers.streams.address import Address, parse_address, reason_of
+from skinware_drivers.streams.bus import Address, parse_address, reason_of
 from skinware_drivers.streams.tcp import keep_alive
 
 _MOST_GUESTS, _MOST_WAITING = 16, 8

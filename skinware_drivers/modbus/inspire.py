@@ -25,8 +25,7 @@ from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter
-from skinware_drivers.modbus.order_watch import OrderWatch
+from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch

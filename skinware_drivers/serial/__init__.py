@@ -18,12 +18,10 @@ from skinware_drivers.serial.checksums import (
     Sum,
     Xor,
 )
-from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Unframed
-from skinware_drivers.serial.length_first import LengthFirst
+from skinware_drivers.serial.framings import Delimited, LengthFirst, Recurring
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.recurring import Recurring
-from skinware_drivers.serial.splitting import Part, Split, by_length
+from skinware_drivers.serial.stream import Part, Split, by_length
 from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
 from skinware_drivers.serial.text_matrix import TextMatrix
 

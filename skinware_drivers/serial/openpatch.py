@@ -26,8 +26,8 @@ from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import CRC32
-from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     MAJOR,

@@ -34,10 +34,9 @@ from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Encoding, Framing, Unframed
 from skinware_drivers.serial.packets import LengthTable, Packet
-from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, Board
 
 _HEADERS = 48
 """More than there is around the taxels in any body."""

@@ -28,12 +28,12 @@ from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
-from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     POINTS_OF_PART,
     SATURATED,
     TAXEL,
+    Board,
     model_of,
     module,
     values,

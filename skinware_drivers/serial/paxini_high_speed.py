@@ -37,9 +37,17 @@ from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.paxini_board import Board
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, SATURATED, TAXEL, Slot, module, nominal_places, values
-from skinware_drivers.serial.splitting import Split
+from skinware_drivers.serial.paxini_modules import (
+    MOST_POINTS,
+    SATURATED,
+    TAXEL,
+    Board,
+    Slot,
+    module,
+    nominal_places,
+    values,
+)
+from skinware_drivers.serial.stream import Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -1,21 +1,21 @@
-"""Modules of Paxini's PX-6AX GEN3, whatever board they are attached to: models, sensors, and values in a frame.
-
-A taxel is three bytes: Fx and Fy int8, Fz uint8, in 0.1 N. A module also tells the resultant on all of it, in the same
-unit. Resultants are sensors of their own types, so that nobody who adds up the taxels' forces counts them twice.
-"""
+"""Describe the modules of Paxini's PX-6AX GEN3, and what its boards have in common."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_X, FORCE_Y, FORCE_Z, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, taxels
+from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Sentinel, Values
+from skinware_drivers.layout import Layout, Sentinel, Values
+from skinware_drivers.link import Link
+from skinware_drivers.polling import Notice, Poll
+from skinware_drivers.serial.framing import Framing
 
 TAXEL = 3
 """Bytes of a taxel."""
@@ -177,3 +177,55 @@ def _from_the_end(slot: Slot) -> int:
 def _block(points: int) -> Grid:
     columns = math.isqrt(points - 1) + 1
     return Grid(-(-points // columns), columns)
+
+
+class Board(ABC):
+    """One board on a line; the methods are those of a driver, see :class:`skinware_drivers.adapter.Adapter`.
+
+    Attributes:
+        framing: what it sends, as far as it is known yet.
+        layout: what its frames mean; known once it was described.
+        geometry: where its modules are, about; None: nobody knows.
+        period_s: time between two updates.
+
+    Args:
+        period_s: time between two updates, as far as it is known yet.
+        use: called with a framing: from now on it is that; what was received and is no whole frame is dropped.
+        tell: called with what a patch says of itself.
+    """
+
+    framing: Framing
+    layout: Layout
+    geometry: Geometry | None = None
+
+    def __init__(self, period_s: float, use: Callable[[Framing], None], tell: Callable[[Patch, Notice], None]) -> None:
+        self.period_s = period_s
+        self.use = use
+        self.tell = tell
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """What it has to be asked; nothing if it sends by itself."""
+        return ()
+
+    @abstractmethod
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask it what it has."""
+
+    async def start(self, link: Link) -> None:  # noqa: B027  (one that is asked has nothing to do)
+        """Have it send by itself, if it can."""
+
+    async def stop(self, link: Link) -> None:  # noqa: B027
+        """Make it silent."""
+
+    @abstractmethod
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether a silent patch answers, and is what it was."""
+
+    @abstractmethod
+    async def attend(self, link: Link) -> None:
+        """Hear what is no data."""
+
+    @abstractmethod
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
+        """Take the present forces as zero."""

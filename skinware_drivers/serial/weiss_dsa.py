@@ -39,7 +39,7 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch, ZeroWatch
 from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.framing import Encoding, Framing
-from skinware_drivers.serial.splitting import Split
+from skinware_drivers.serial.stream import Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")

@@ -1,12 +1,9 @@
-"""ROBOSKIN boards behind iCub's Ethernet boards (EMS, MC4PLUS, MC2PLUS): the CAN frames in their UDP datagrams.
-
-What is in a datagram: ``icub_rops``. What is in the CAN frames: ``skinware_drivers.can.roboskin_layout``. Only listened
-to: the robot's own program sets the boards up, starts their skin service, and is whom they send to.
-"""
+"""Read ROBOSKIN boards behind iCub's Ethernet boards (EMS, MC4PLUS, MC2PLUS): CAN frames in UDP datagrams."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
@@ -25,8 +22,53 @@ from skinware_drivers.link import Link
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Framing
-from skinware_drivers.streams.icub_rops import rops
+from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.stream import Split
+
+_HEADER, _OVERHEAD, _LONGEST_DATAGRAM = 24, 28, 1500
+_HEAD = struct.Struct("<BBHI")
+_SAY, _SIGNAL = 2, 4
+_TIME, _SIGNATURE, _VERSION = 0x04, 0x08, 0xC0
+_SKIN = 0x0300_0002
+_ITEM, _LONGEST_CAN = 10, 8
+
+
+def rops(port: int) -> Split:
+    """The framing; what it finds are the CAN frames of the skin on a CAN port, 1 or 2."""
+    return Split(_FRAMES, lambda _, operations: _can_frames(operations, _SKIN | (port - 1) << 8))
+
+
+def _can_frames(operations: bytes, wanted: int) -> Iterator[tuple[int, bytes]]:
+    """The CAN frames in those operations of a frame that tell a variable: (identifier, payload)."""
+    place = 0
+    while len(operations) - place >= _HEAD.size:
+        control, code, size, variable = _HEAD.unpack_from(operations, place)
+        begin = place + _HEAD.size
+        place = begin + -(-size // 4) * 4 + (4 if control & _SIGNATURE else 0) + (8 if control & _TIME else 0)
+        if control & _VERSION or place > len(operations):
+            return  # where the next one begins is not known
+        if code in (_SAY, _SIGNAL) and variable == wanted:
+            yield from _items(operations[begin : begin + size])
+
+
+def _items(array: bytes) -> Iterator[tuple[int, bytes]]:
+    if len(array) < 4 or array[1] != _ITEM or array[2] > array[0]:
+        return
+    for at in range(4, min(len(array) - _ITEM, 4 + _ITEM * (array[2] - 1)) + 1, _ITEM):
+        info = array[at] | array[at + 1] << 8
+        length = info >> 12
+        if length <= _LONGEST_CAN:
+            yield info & 0x7FF, array[at + 2 : at + 2 + length]
+
+
+_FRAMES = Packet(
+    sync=(0x78, 0x56, 0x34, 0x12),
+    length=Length(Field(4, 2), more=_OVERHEAD),
+    maximum=_LONGEST_DATAGRAM,
+    trailer=(0x21, 0x43, 0x65, 0x87),
+    header=_HEADER,
+)
 
 
 class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -21,8 +21,7 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.ports import DescriptorPort, Port
-from skinware_drivers.streams.address import Address, reason_of, unknown_name
-from skinware_drivers.streams.bus import NetworkBus
+from skinware_drivers.streams.bus import Address, NetworkBus, reason_of, unknown_name
 
 _CONNECTING_S = 5.0
 _WAITING_CALLERS = 4

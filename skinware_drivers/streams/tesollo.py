@@ -39,8 +39,8 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Notice, Poll, Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
-from skinware_drivers.serial.length_first import LengthFirst
-from skinware_drivers.serial.splitting import Part, Split, by_length
+from skinware_drivers.serial.framings import LengthFirst
+from skinware_drivers.serial.stream import Part, Split, by_length
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

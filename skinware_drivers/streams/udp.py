@@ -19,8 +19,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.address import Address
-from skinware_drivers.streams.bus import NetworkBus
+from skinware_drivers.streams.bus import Address, NetworkBus
 
 _RECEIVE_BUFFER = 1 << 20
 _MOST_DATAGRAMS = 512

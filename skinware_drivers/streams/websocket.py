@@ -12,8 +12,7 @@ from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.address import parse_address
-from skinware_drivers.streams.bus import ServerBus
+from skinware_drivers.streams.bus import ServerBus, parse_address
 
 if TYPE_CHECKING:
     from skinware_drivers.streams.websocket_port import WebSocketPort

@@ -17,7 +17,7 @@ from skinware.errors import BusNotAvailable
 from skinware.status import BusReason
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.address import Address
+from skinware_drivers.streams.bus import Address
 from skinware_drivers.streams.tcp import connect, keep_alive
 
 LONGEST = CHUNK - 1

@@ -12,8 +12,7 @@ from websockets.server import ServerProtocol
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.address import Address, parse_address
-from skinware_drivers.streams.bus import ServerOptions
+from skinware_drivers.streams.bus import Address, ServerOptions, parse_address
 from skinware_drivers.streams.tcp import ListeningPort
 from skinware_drivers.streams.websocket import split_url
 

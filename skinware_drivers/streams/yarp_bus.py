@@ -19,8 +19,7 @@ from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server
 from skinware_drivers.bus import Bus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.address import Address, parse_address
-from skinware_drivers.streams.bus import ServerBus
+from skinware_drivers.streams.bus import Address, ServerBus, parse_address
 from skinware_drivers.streams.tcp import TcpPort, connect
 from skinware_drivers.streams.yarp_messages import BEGIN, message_size
 

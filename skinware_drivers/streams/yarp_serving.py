@@ -14,8 +14,7 @@ from collections.abc import Callable
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.address import Address
-from skinware_drivers.streams.bus import ServerOptions
+from skinware_drivers.streams.bus import Address, ServerOptions
 from skinware_drivers.streams.tcp import ListeningPort
 from skinware_drivers.streams.yarp_bus import split_channel
 

@@ -1,4 +1,4 @@
-"""The bus ``virtual``: emulated hardware in the driver's own process. Needs no kernel support and no rights."""
+"""Run emulated hardware in the driver's own process: the bus ``virtual``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,23 @@ from typing import ClassVar, Self
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
+from skinware.geometry import Geometry
 from skinware.samples import Unused
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
+from skinware_drivers.description import Patch
+from skinware_drivers.link import Link
+from skinware_drivers.operations import operation
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, emulators_instead, load_emulator
+from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
+from skinware_drivers.virtual.hardware import (
+    EmulatedHardware,
+    PlacedHardware,
+    Pressing,
+    WireFrame,
+    emulators_instead,
+    load_emulator,
+)
 from skinware_drivers.virtual.stage import Stage
-from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 DEFAULT_EMULATOR = "roboskin"
 
@@ -243,3 +254,30 @@ def _packer(payload_size: int) -> Callable[[int, int, bytes], bytes]:
     if wire_dtype(payload_size)["length"].itemsize > 1:
         return struct.Struct(f"=II{payload_size}s").pack
     return struct.Struct(f"=IB3x{payload_size}s").pack
+
+
+class PlacedCanBus(VirtualCanBus):
+    """A :class:`.VirtualCanBus` by name; see :class:`.hardware.PlacedHardware`."""
+
+    hardware: PlacedHardware
+
+    @property
+    def geometry(self) -> Geometry | None:
+        return self.hardware.geometry()
+
+    @operation()
+    async def press(
+        self,
+        link: Link,  # noqa: ARG002 - as every operation
+        patches: Sequence[Patch],  # noqa: ARG002
+        at_m: Sequence[float],
+        force_n: float = 3.0,
+        radius_m: float = 0.006,
+        seconds: float = 1.0,
+    ) -> dict[str, object]:
+        """Press the emulated skin at a place for a while.
+
+        Raises:
+            ValueError: the numbers make no sense, or nothing of the skin would feel it.
+        """
+        return self.hardware.press(Pressing.of(at_m, force_n, radius_m, seconds), self._clock())

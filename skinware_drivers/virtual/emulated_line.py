@@ -13,8 +13,8 @@ from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
+from skinware_drivers.virtual.hand_clock import MonotonicTimer
 from skinware_drivers.virtual.hardware import EmulatedHardware, emulators_instead, load_emulator, next_read
-from skinware_drivers.virtual.timer import MonotonicTimer
 
 _LONGEST_BACKLOG_NS = 1_000_000_000
 """What nobody fetched for longer is lost, as in a kernel's buffer that is full."""

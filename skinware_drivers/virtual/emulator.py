@@ -21,11 +21,10 @@ from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
 from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.foreign import ForeignTraffic
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.press import Press
 from skinware_drivers.virtual.stage import Actor, Stage
-from skinware_drivers.virtual.wire import Transmission, Transmitter
+from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Transmitter
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
 CanFrame = tuple[int, bytes]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from skinware_drivers.bus import Bus
-from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, VirtualCanBus
+from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, PlacedCanBus, VirtualCanBus
 from skinware_drivers.virtual.hardware import PlacedHardware, load_emulator, medium_of
-from skinware_drivers.virtual.placed import PlacedCanBus
 
 
 def virtual_bus(

@@ -22,9 +22,9 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
 from skinware_drivers.virtual.recorded_modbus import ReplayedModbusBus, was_over_tcp
 from skinware_drivers.virtual.recorded_wire import Note, RecordedPort, RecordedWire
-from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireItem, WireTrack

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG
 from skinware_drivers.serial.ports import Port
+from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 if TYPE_CHECKING:
     from skinware.recording import WireItem

@@ -1,8 +1,4 @@
-"""One CAN wire: a frame at a time, and among those that wait the lowest identifier first.
-
-Every board is a transmitter with a queue of its own; only the first frame of each queue takes part in
-arbitration, so the two halves of a triangle stay in order although another board's frames may come between.
-"""
+"""Carry emulated CAN frames one at a time, lowest identifier first, beside frames of other devices."""
 
 from __future__ import annotations
 
@@ -11,8 +7,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
+from skinware_drivers.virtual import events
 from skinware_drivers.virtual.events import Half
-from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.hardware import EventLog, WireFrame
 
 _EXTENDED_FLAG = 0x8000_0000
 _BIT_NS, _NS_PER_S = 1000, 1_000_000_000
@@ -158,3 +157,57 @@ def _next_in_arbitration(queue: deque[Transmission]) -> int:
     if identifier & _EXTENDED_FLAG:
         return (identifier & 0x1FFF_FFFF) << 1 | 1
     return identifier << 19
+
+
+class ForeignTraffic:
+    """Devices that send at random moments, ``rate_hz`` frames a second on average.
+
+    Args:
+        identifiers: of their frames.
+        rate_hz: more than 0.
+        random: all chance comes from here.
+        transmitter: place on the wire.
+        log: takes the events.
+        counts: totals, of which ``foreign`` is counted.
+        now_ns: when the devices begin.
+    """
+
+    def __init__(
+        self,
+        identifiers: Sequence[int],
+        rate_hz: float,
+        random: np.random.Generator,
+        transmitter: Transmitter,
+        log: EventLog,
+        counts: dict[str, int],
+        now_ns: int,
+    ) -> None:
+        self._random = random
+        self._pause_ns = 1e9 / rate_hz
+        self._transmitter, self._log, self._counts = transmitter, log, counts
+        self._identifiers = identifiers
+        self._next_ns = now_ns
+        self._wait()
+
+    def _wait(self) -> None:
+        self._next_ns += 1 + int(self._random.exponential(self._pause_ns))
+
+    def next_event_ns(self) -> int:
+        return self._next_ns
+
+    def run(self, now_ns: int) -> None:
+        while self._next_ns <= now_ns:
+            identifier = self._identifiers[int(self._random.integers(len(self._identifiers)))]
+            payload = self._random.bytes(int(self._random.integers(0, 8, endpoint=True)))
+            self._transmitter.queue.append(Transmission(self._next_ns, [identifier], [payload]))
+            self._counts["foreign"] += 1
+            self._log.append(events.ForeignFrame(time_ns=self._next_ns, identifier=identifier, length=len(payload)))
+            self._wait()
+
+    def skip_to(self, now_ns: int) -> int:
+        """Leave out what is due before ``now_ns``; returns how many frames that would have been, on average."""
+        missed_ns = now_ns - self._next_ns
+        if missed_ns <= 0:
+            return 0
+        self._next_ns = now_ns
+        return 1 + int(missed_ns / self._pause_ns)

@@ -12,10 +12,9 @@ from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.hand import Hand
 from skinware_drivers.link import Link
 from skinware_drivers.serial.paxini import PaxiniDriver, PaxiniOptions
-from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_converter import ConverterBoard
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import Slot
+from skinware_drivers.serial.paxini_modules import Board, Slot
 from skinware_drivers.virtual.bus import VirtualCanBus
 
 

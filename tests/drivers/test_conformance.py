@@ -65,8 +65,7 @@ from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
-from skinware_drivers.virtual.devices.xela import EmulatedXela
-from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
+from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaServer
 from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions

@@ -19,7 +19,7 @@ from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
-from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
+from skinware_drivers.virtual.devices.xela import EmulatedXelaServer
 from skinware_drivers.virtual.emulator import Emulator
 
 pytestmark = pytest.mark.usefixtures("namespace")

@@ -10,7 +10,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.can.pdo_map import Entry, PdoMap, Tpdo, default_tpdos
+from skinware_drivers.can.canopen_objects import Entry, PdoMap, Tpdo, default_tpdos
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from tests.drivers.bench import EXAMPLE_EDS

@@ -12,8 +12,8 @@ import pytest
 
 from skinware.errors import HandshakeTimeout
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can import sdo
-from skinware_drivers.can.sdo import SdoAborted, SdoClient
+from skinware_drivers.can import canopen_objects
+from skinware_drivers.can.canopen_objects import SdoAborted, SdoClient
 from skinware_drivers.link import Link
 
 T = TypeVar("T")
@@ -57,7 +57,7 @@ def scripted(*answers: list[str]) -> Wire:
 
 @pytest.fixture(autouse=True)
 def short_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdo, "REPLY_S", 0.05)
+    monkeypatch.setattr(canopen_objects, "REPLY_S", 0.05)
 
 
 # Literal frames

@@ -11,7 +11,7 @@ from skinware.geometry import read_geometry
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.icub.importer import Import, import_files
-from skinware_drivers.icub.notes import Notes
+from skinware_drivers.icub.xml_tree import Notes
 from tests.icub.conftest import configuration
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from skinware.tactile.regions import Region
-from skinware_drivers.icub.body import Place
-from skinware_drivers.icub.regions import regions_of
+from skinware_drivers.icub.body import Place, regions_of
 
 
 def board(patch: int, number: int, triangles: range = range(16)) -> set[Place]:

@@ -8,8 +8,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.icub.device import DeviceReader
-from skinware_drivers.icub.notes import Notes
-from skinware_drivers.icub.xml_tree import LARGEST_FILE, read_xml
+from skinware_drivers.icub.xml_tree import LARGEST_FILE, Notes, read_xml
 from tests.icub.conftest import Made, device
 
 DOCTYPE = '<!DOCTYPE params PUBLIC "-//YARP//DTD yarprobotinterface 3.0//EN" "http://www.yarp.it/DTD/none.dtd">'

@@ -16,8 +16,7 @@ from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import read_until
-from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.placed import PlacedCanBus
+from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 

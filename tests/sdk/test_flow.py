@@ -25,7 +25,7 @@ from skinware_drivers import native
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.can.roboskin_watch import BaselineWatch
+from skinware_drivers.can.roboskin_setup import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.emulation import Emulation, JsonReport
 from skinware_drivers.decoding.skin_state import Updates

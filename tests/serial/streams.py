@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framed, Framer, Framing
+from skinware_drivers.serial.framings import Delimited, Recurring
 from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.serial.recurring import Recurring
 from skinware_drivers.serial.stuffing import LINES
 from skinware_drivers.serial.text_matrix import TextMatrix
 from skinware_drivers.testing.path_tests import made

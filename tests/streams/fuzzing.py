@@ -16,14 +16,14 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _Matrix
-from skinware_drivers.streams.icub_rops import rops
+from skinware_drivers.streams.icub_eth import rops
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
-from skinware_drivers.streams.xela_messages import XelaMessages
+from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
-from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer, EmulatedXelaServerOptions
+from skinware_drivers.virtual.devices.xela import EmulatedXelaServer, EmulatedXelaServerOptions
 from skinware_drivers.virtual.devices.yarp import EmulatedYarp, EmulatedYarpOptions
 from tests.serial.spoken import Spoken
 

@@ -12,8 +12,7 @@ from skinware.status import PatchState
 from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.framing import Framed
-from skinware_drivers.streams.icub_eth import IcubEthOptions
-from skinware_drivers.streams.icub_rops import rops
+from skinware_drivers.streams.icub_eth import IcubEthOptions, rops
 from skinware_drivers.testing.carrying import emulated_on
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until

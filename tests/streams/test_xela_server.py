@@ -13,8 +13,7 @@ from websockets.sync.server import ServerConnection
 from skinware.errors import ConfigurationError
 from skinware.status import PatchState
 from skinware_drivers.serial.framing import Framed
-from skinware_drivers.streams.xela_messages import XelaMessages
-from skinware_drivers.streams.xela_server import XelaServerOptions
+from skinware_drivers.streams.xela_server import XelaMessages, XelaServerOptions
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import running

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.virtual.foreign import ForeignTraffic
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.boards import Board, BoardParts
 from skinware_drivers.virtual.roboskin.faults import BoardFaults
@@ -14,7 +13,7 @@ from skinware_drivers.virtual.roboskin.mtb4 import Mtb4
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.pressed import PressedSkin
 from skinware_drivers.virtual.roboskin.touch import Touch, WireSource, cycle_pattern
-from skinware_drivers.virtual.wire import Wire
+from skinware_drivers.virtual.wire import ForeignTraffic, Wire
 
 
 def make_boards(

@@ -89,7 +89,7 @@ def test_the_first_reader_of_the_readme_reads(tmp_path: Path) -> None:
         )
         assert process.stdout is not None
         try:
-            lines = [process.stdout.readline() for _ in range(5)]
+            lines = [process.stdout.readline() for _ in range(100)]
         finally:
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=PATIENCE_S)
@@ -121,6 +121,13 @@ def test_links_and_tests_that_are_named_exist(page: Path) -> None:
         if not (ROOT / file).exists() or (name and f"def {name}(" not in (ROOT / file).read_text())
     ]
     assert missing == []
+
+
+@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+def test_files_and_folders_that_a_page_names_exist(page: str) -> None:
+    named = re.findall(r"`((?:skinware|skinware_drivers|tools|docs|tests)(?:/[\w.]+)*)`", (ROOT / page).read_text())
+    assert len(named) >= 2
+    assert [path for path in named if not (ROOT / path).exists()] == []
 
 
 def fenced(page: Path, language: str) -> list[str]:

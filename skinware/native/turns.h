@@ -10,7 +10,7 @@ enum { TURNS = 256 };
 /* The longest sleep: Python then looks whether somebody wants to end the wait. */
 static const int64_t SLICE_NS = 50000000;
 
-/* What a turn was, as skinware/service/_accounts.py has it. */
+/* What a turn was, as skinware/service/messages.py has it. */
 typedef struct turn {
     int64_t acquired_ns;
     int64_t taken_ns;

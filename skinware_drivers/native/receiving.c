@@ -1,4 +1,4 @@
-/* Takes what has arrived on a CAN socket: can/socketcan.py, recvmmsg.py, stamps.py and wire_time.py. */
+/* Takes what has arrived on a CAN socket: can/socketcan.py, recvmmsg.py, stamps.py and interface.py. */
 #include "flow.h"
 
 #include <errno.h>

@@ -27,7 +27,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, is_fresh
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn, encoded
-from skinware.transfer.generation import Generation, RecordedDriverFrame
+from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _HELD_NS = NS_PER_S // 2
 """How long a question for the newest frame waits for one."""
@@ -292,7 +292,7 @@ class Summaries:
         age_ms, lost, fresh, problems = None, 0, 0, int(not is_live)
         silent: list[str] = []
         if newest is not None and newest.generation == driver.generation.generation:
-            frame = RecordedDriverFrame(driver.generation, newest.slot)
+            frame = RecordedDriverSnapshot(driver.generation, newest.slot)
             time_ns = now_ns()
             age_ms = round((time_ns - frame.acquired_ns) / 1e6, 3)
             fresh = _fresh(frame, structure, time_ns, is_live)
@@ -316,7 +316,7 @@ class Summaries:
         )
 
 
-def _fresh(frame: RecordedDriverFrame, structure: Structure, time_ns: int, is_live: bool) -> int:
+def _fresh(frame: RecordedDriverSnapshot, structure: Structure, time_ns: int, is_live: bool) -> int:
     """How many sensors can be trusted now."""
     fresh = is_fresh(
         frame.status,

@@ -21,7 +21,7 @@ from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.choosing import SensorChoice
-from skinware.transfer.generation import Generation, RecordedDriverFrame
+from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _OF_SENSORS = ("values", "status")
 _OF_MODULES = ("module_time_ns", "module_untouched")
@@ -76,10 +76,10 @@ class Cut:
         self.head = Head(whole.head_with(cut, Schema(columns, whole.schema.description)))
         self.generation: Generation = Generation(self.head.raw, whole.name)
 
-    def frame(self, frame: Sample) -> RecordedDriverFrame:
+    def frame(self, frame: Sample) -> RecordedDriverSnapshot:
         slot = np.zeros(self.generation.slot_stride, np.uint8)
         slot[: SLOT.itemsize] = np.frombuffer(frame.slot, np.uint8, SLOT.itemsize)
-        cut = RecordedDriverFrame(self.generation, memoryview(slot.data))
+        cut = RecordedDriverSnapshot(self.generation, memoryview(slot.data))
         for name, count, n_stay, rows in self._stay:
             cut.column(name).reshape(n_stay, -1)[...] = frame.column(name).reshape(count, -1)[rows]
         return cut

@@ -165,7 +165,7 @@ _LEARNING_FORMATS = ("lerobot",)
         "skin-convert walk.mcap --to npz                        writes walk.npz",
         "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
         "skin-convert walk.mcap --to parquet --region palm -o palm",
-        "skin-convert walk.npz --to mcap -o again.mcap          and back",
+        "skin-convert walk.mcap --to mcap --end 12 -o part.mcap a part, still a recording",
         "skin-convert walk.mcap --to candump                    what went over CAN buses, for canplayer",
         "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
         "skin-convert walk.mcap --to ros2                       a bag of ROS 2",

@@ -1,7 +1,7 @@
-"""Recordings as files that others read, and back: numpy, CSV, Parquet, HDF5.
+"""Write recordings as files of other programs: numpy, CSV, Parquet, HDF5, Foxglove, ROS 2.
 
-A source (:mod:`skinware.conversion.tables`) gives what was recorded as arrays with a row for each frame, a little at a
-time; each format writes what a source gives. So whatever can be read can be written in every format, in little memory.
+A source (:mod:`skinware.conversion.tables`) gives a recording as arrays with a row for each sample, a little at a time;
+each format writes what a source gives, in little memory.
 """
 
 from __future__ import annotations

@@ -24,10 +24,10 @@ if find_spec("mcap") is None or find_spec("zstandard") is None:
 from skinware.recording.reading import Recording
 from skinware.recording.tracks import Series, Track
 from skinware.recording.wire_tracks import WireItem, WirePiece, WireTrack
-from skinware.transfer.generation import RecordedDriverFrame, RecordedSample, RecordedSnapshot
+from skinware.transfer.generation import RecordedDriverSnapshot, RecordedSample, RecordedSnapshot
 
 __all__ = [
-    "RecordedDriverFrame",
+    "RecordedDriverSnapshot",
     "RecordedSample",
     "RecordedSnapshot",
     "Recording",

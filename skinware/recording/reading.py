@@ -21,7 +21,7 @@ from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
 from skinware.transfer.collecting import LIVE, PAUSED
-from skinware.transfer.generation import Generation, RecordedDriverFrame, RecordedSnapshot
+from skinware.transfer.generation import Generation, RecordedDriverSnapshot, RecordedSnapshot
 
 
 @dataclass
@@ -187,12 +187,12 @@ class Recording:
             start_s: where to begin, s since the recording began.
             end_s: where to end, likewise; default: with the last.
         """
-        newest: dict[str, RecordedDriverFrame] = {}
+        newest: dict[str, RecordedDriverSnapshot] = {}
         layout = SkinLayout((), ())
         for time_s, driver, frame, event in self.moments(self.drivers if drivers is None else drivers, end_s=end_s):
             if event in GONE:
                 newest.pop(driver, None)
-            if not isinstance(frame, RecordedDriverFrame):
+            if not isinstance(frame, RecordedDriverSnapshot):
                 continue
             newest[driver] = frame
             layout = _layout(newest, layout)
@@ -386,7 +386,7 @@ class Recording:
         return f"<Recording {self.path}: {', '.join(self.services) or 'nothing'}, {self.duration_s:.1f} s>"
 
 
-def _layout(newest: dict[str, RecordedDriverFrame], before: SkinLayout) -> SkinLayout:
+def _layout(newest: dict[str, RecordedDriverSnapshot], before: SkinLayout) -> SkinLayout:
     """The layout of some frames; the same one as before if nothing changed."""
     drivers = tuple(sorted(newest))
     structures = tuple(newest[name].structure for name in drivers)

@@ -171,7 +171,7 @@ class RecordedSample(Sample):
         return self.published_ns - self.acquired_ns
 
 
-class RecordedDriverFrame(RecordedSample, DriverSnapshot):
+class RecordedDriverSnapshot(RecordedSample, DriverSnapshot):
     """A recorded frame of a driver."""
 
     __slots__ = ()
@@ -210,4 +210,4 @@ def frames_of(generation: Generation, run: Run) -> Iterator[RecordedSample]:
 
 def frame_of(generation: Generation, slot: npt.NDArray[np.uint8]) -> RecordedSample:
     """The frame that stands in (stride,) bytes, as it was in the ring."""
-    return (RecordedDriverFrame if generation.is_driver else RecordedSample)(generation, memoryview(slot.data))
+    return (RecordedDriverSnapshot if generation.is_driver else RecordedSample)(generation, memoryview(slot.data))

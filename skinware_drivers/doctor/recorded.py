@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import skinware.recording
 from skinware.memory.statistics import Histogram
 from skinware.realtime import NS_PER_S
-from skinware.recording import RecordedDriverFrame, Recording
+from skinware.recording import RecordedDriverSnapshot, Recording
 from skinware.status import Status
 from skinware_drivers.doctor.driver_log import DriverLog
 from skinware_drivers.doctor.evidence import (
@@ -54,7 +54,7 @@ def look_at(file: Path, tell: Callable[[float], object] = lambda _seconds: None)
         events = recording.events
         drivers = {name: _DriverTrack(name) for name in recording.drivers}
         for number, (time_s, name, frame, _) in enumerate(recording.moments(tuple(drivers))):
-            if isinstance(frame, RecordedDriverFrame):
+            if isinstance(frame, RecordedDriverSnapshot):
                 drivers[name].take(frame, recording[name].generation(frame.generation).static(), time_s)
             if number % _TELL_EVERY == 0:
                 tell(time_s)
@@ -117,7 +117,7 @@ class _DriverTrack:
         self.log: DriverLog | None = None
         self._judge: TaxelJudge | None = None
         self._earlier: list[DriverLog] = []
-        self._newest: RecordedDriverFrame | None = None
+        self._newest: RecordedDriverSnapshot | None = None
         self._driver_type = ""
         self._looked_ns = 0
         self._frames = self._restarts = 0
@@ -125,7 +125,7 @@ class _DriverTrack:
         self._late, self._age = Histogram(), Histogram()
         self._longest_gap_ns = 0
 
-    def take(self, frame: RecordedDriverFrame, tables: Any, time_s: float) -> None:
+    def take(self, frame: RecordedDriverSnapshot, tables: Any, time_s: float) -> None:
         """The next frame.
 
         Args:
@@ -147,7 +147,7 @@ class _DriverTrack:
                 self.log.take(frame, tables, time_s)
                 self._judge.take(frame)
 
-    def _begin(self, frame: RecordedDriverFrame, tables: Any, *, is_restart: bool) -> None:
+    def _begin(self, frame: RecordedDriverSnapshot, tables: Any, *, is_restart: bool) -> None:
         """Another generation; where its sensors are the same, what was seen goes on."""
         self._restarts += is_restart
         self._driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1]).decode(errors="replace")
@@ -158,7 +158,7 @@ class _DriverTrack:
         self.log = DriverLog(frame.structure, by_hour=True)
         self._judge = TaxelJudge(frame.structure, self._name)
 
-    def _time(self, before: RecordedDriverFrame, frame: RecordedDriverFrame) -> None:
+    def _time(self, before: RecordedDriverSnapshot, frame: RecordedDriverSnapshot) -> None:
         """How regular frames are that follow each other; those after a loss say nothing."""
         if frame.sequence != before.sequence + 1:
             return

@@ -14,7 +14,7 @@ from skinware import DriverReader, DriverWriter, Structure
 from skinware.bridge.parts import Cut
 from skinware.errors import StructureError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.transfer.generation import Generation, RecordedDriverFrame
+from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 from skinware.views.health import status_now
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled
@@ -120,7 +120,7 @@ def test_a_recording_keeps_them(tmp_path: Path) -> None:
 
 def test_what_is_cut_out_keeps_its_groups() -> None:
     whole = generation_of_driver("groups", grouped())
-    frame = RecordedDriverFrame(whole, memoryview(np.zeros(whole.slot_stride, np.uint8).data))
+    frame = RecordedDriverSnapshot(whole, memoryview(np.zeros(whole.slot_stride, np.uint8).data))
     frame.column("group_time_ns")[:] = [10, 20, 30, 40]
     frame.column("module_time_ns")[:] = [10, 30]
     taxels = Cut(whole, np.array([0, 1, 5]))

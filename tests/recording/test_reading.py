@@ -42,7 +42,7 @@ def test_columns_frames_and_snapshots_tell_the_same(path: Path) -> None:
         assert series.physical("pressure").dtype == np.float32
         assert opened["arm"].read().physical("pressure").dtype == np.float64
         for row, frame in enumerate(frames):
-            assert isinstance(frame, skinware.recording.RecordedDriverFrame)
+            assert isinstance(frame, skinware.recording.RecordedDriverSnapshot)
             for of_series, of_frame in (
                 (series.raw("pressure"), frame.raw("pressure")),
                 (series.physical("temperature"), frame.physical("temperature")),

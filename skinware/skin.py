@@ -19,8 +19,8 @@ from skinware.errors import (
 )
 from skinware.geometry import Geometry
 from skinware.memory import futex, segments
+from skinware.memory.look import Look, PythonsTurn, look_at
 from skinware.memory.namespace import Namespace
-from skinware.memory.native_ring import Look, PythonsTurn, look_at
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout

@@ -139,16 +139,16 @@ class BusReason(enum.IntEnum):
 
 
 class DataPath(enum.IntEnum):
-    """Which way frames take from a driver's buses to its readers; the values are the same by both."""
+    """What receives the frames of a bus. Compiled code decodes and publishes all of them."""
 
     NOT_TOLD = 0
-    """The driver does not tell."""
+    """The driver does not say."""
     PYTHON = 1
-    """Through numpy: the native path was not compiled, is switched off, or cannot do what the driver says."""
+    """Python: an adapter of python-can, an emulated bus."""
     NATIVE = 2
-    """Through compiled code."""
+    """Compiled code."""
     MIXED = 3
-    """Through compiled code, from some of the buses; the others are read in Python. Of a driver, never of a bus."""
+    """Compiled code on some buses of a driver, Python on others; never of a bus."""
 
     @classmethod
     def _missing_(cls, value: object) -> DataPath:

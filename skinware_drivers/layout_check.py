@@ -10,6 +10,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Cycle, Frame, Layout, Packed, Values
+from skinware_drivers.native.compiling import check_values
 
 _DTYPES = ("u1", "i2", "u2", "i4", "f4")
 """What a driver's dtype can be, the smallest first."""
@@ -34,6 +35,7 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     names = [patch.name for patch in patches for _ in patch.modules]
     addresses = Addresses(layout.frames, [range(len(layout.frames))], tables)
     for number, frame in enumerate(layout.frames):
+        check_values(frame)
         for values in frame.runs:
             _check_dtype(frame, values, tables.structure.dtype)
         needed = 1 + max((c for values in frame.runs for c in values.channels if c is not None), default=-1)

@@ -20,11 +20,11 @@ import zenoh
 from serial.tools import list_ports
 
 import skinware.recording
-from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWriter, errors
+from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWriter, errors, native
 from skinware.bridge import Link as BridgeLink
 from skinware.bridge import endpoints
 from skinware.errors import SkinwareError
-from skinware.memory import futex
+from skinware.memory.ring import slot_headers_of
 from skinware.realtime import Profile
 from skinware.recording import open as open_recording
 from skinware.sensor_types import PRESSURE
@@ -118,7 +118,7 @@ def BridgeError(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def PlatformError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    return futex.fence_for("aarch64", library="libatomic.so.none")
+    return native.load(Path("libskinware.so"), native.ABI)
 
 
 @produces
@@ -176,7 +176,7 @@ def StructureChanged(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 def Overrun(_: pytest.MonkeyPatch) -> object:  # noqa: N802
     with writer() as writing, reader() as reading:
         publish(writing)
-        writing._ring._slot_words[1][0] = 0  # as if the writer had come past each time
+        slot_headers_of(writing._ring.segment)[1][0] = 0  # as if the writer had come past each time
         return reading.read()
 
 

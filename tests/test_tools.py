@@ -140,13 +140,6 @@ def test_what_has_changed_is_installed_again(project: Path, changed: str) -> Non
     assert not installs(project)
 
 
-def test_a_compiler_that_comes_later_compiles(project: Path) -> None:
-    assert installs(project, compiler="no-such-compiler")
-    assert not installs(project, compiler="no-such-compiler")
-    assert installs(project, compiler="true")
-    assert not installs(project, compiler="true")
-
-
 @pytest.mark.parametrize("extra", ["test", "top"])
 def test_a_library_that_was_cleaned_away_is_compiled_again(project: Path, compiling: Path, extra: str) -> None:
     assert installs(project)

@@ -53,13 +53,14 @@ def make_wheel(source: Path, folder: Path, environ: Mapping[str, str] | None = N
     return wheel
 
 
-def run_in(source: Path, *arguments: str, environ: Mapping[str, str] | None = None) -> str:
-    """Run Python with copied sources, and a compiler that does not optimize; what it said. It must succeed.
+def run_in(source: Path, *arguments: str, environ: Mapping[str, str] | None = None, succeeds: bool = True) -> str:
+    """Run Python with copied sources, and a compiler that does not optimize; return its output.
 
     Args:
         source: the copy.
         arguments: of Python.
         environ: environment beside what is there.
+        succeeds: whether it must exit with 0 or with another status.
     """
     done = subprocess.run(
         [sys.executable, *arguments],
@@ -71,5 +72,5 @@ def run_in(source: Path, *arguments: str, environ: Mapping[str, str] | None = No
         timeout=PATIENCE_S,
         text=True,
     )
-    assert done.returncode == 0, done.stdout
+    assert (done.returncode == 0) == succeeds, done.stdout
     return done.stdout

@@ -17,7 +17,7 @@ find_python() {
     return 1
 }
 
-# the compiled libraries that are there and no older than what they are made of
+# the compiled libraries that exist and are no older than their sources
 compiled() {
     local library
     for library in "$project"/skinware*/native/*.so; do
@@ -29,8 +29,7 @@ compiled() {
 
 prepare_environment() {
     local extra=$1 wanted stamp
-    # what is installed, and with which compiler: one that comes later counts too
-    wanted=$(cat "$project"/{pyproject.toml,setup.py,skinware*/native/*.[ch],skinware/include/*.h} | cksum)$(command -v ${CC:-cc} || true)
+    wanted=$(cat "$project"/{pyproject.toml,setup.py,skinware*/native/*.[ch],skinware/include/*.h} | cksum)
     stamp=$venv/installed-$extra
     if [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted $(compiled)" ] &&
         "$venv/bin/python" -c 'import skinware' 2>/dev/null; then
@@ -48,7 +47,5 @@ prepare_environment() {
     fi
     echo "installing skinware[$extra]" >&2
     "$venv/bin/python" -m pip install --quiet --editable "$project[$extra]"
-    [ -e "$project/skinware_drivers/native/libskinware_drivers.so" ] ||
-        echo "the native data path is not compiled: Python runs instead (Debian and Ubuntu: apt install gcc libc6-dev)" >&2
     echo "$wanted $(compiled)" >"$stamp"
 }

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from skinware import bridge_state, native
+from skinware import bridge_state
 from skinware.cli import _bridges
 from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
 from skinware.cli._terminal import echo, print_json, style
@@ -74,8 +74,7 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
             continue  # otherwise it was withdrawn this very moment
         entry["readers"] = [record for record in readers if record["service"] == name]
         (drivers if entry["kind"] == KIND else services).append(entry)
-    own = {"data_path": native.path(), "why_python": native.why_python()}
-    return {"namespace": namespace.name, **own, "drivers": drivers, "services": services, "problems": problems}
+    return {"namespace": namespace.name, "drivers": drivers, "services": services, "problems": problems}
 
 
 def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:

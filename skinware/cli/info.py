@@ -42,7 +42,6 @@ _OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
 """What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
 and of an update's age when it was published."""
 _ABOUT_A_PATCH = "99 %: 99th percentile; interval: time between two updates; delay: time until publication"
-_BUS_READERS = {"native": "compiled code", "python": "Python"}
 _INDENT = 2
 _LIFE_COLOURS = {
     "live": "green",
@@ -125,8 +124,6 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     for service in services:
         own = [*_content_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
         lines += ["", _life_line("service", service), *_indented(own)]
-    if found["why_python"]:
-        lines += ["", f"programs of this installation read without compiled code: {found['why_python']}"]
     if found["problems"]:
         lines += ["", *(style("problem: ", fg="red") + text for text in found["problems"])]
     return [part for line in lines for part in wrapped(line, terminal_width())]
@@ -177,17 +174,11 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
 
 
 def _path_lines(driver: dict[str, Any]) -> list[str]:
-    path = driver["data_path"]
-    if path in (None, "not_told"):
-        return []
-    parts = [f"{path} data path"]
-    if path == "mixed":
-        for way, reader in _BUS_READERS.items():
-            names = ", ".join(bus["name"] for bus in driver["buses"] if bus["data_path"] == way)
-            parts.append(f"{reader} reads {names}")
+    names = ", ".join(bus["name"] for bus in driver["buses"] if bus["data_path"] == "python")
+    parts = [f"Python receives the frames of {names}"] if names else []
     if driver["latency_ms"]:
         parts.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")
-    return ["", "; ".join(parts)]
+    return ["", "; ".join(parts)] if parts else []
 
 
 def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
@@ -379,7 +370,6 @@ def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
 
 
 def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
-    from skinware import native
     from skinware.cli._report import report
     from skinware.errors import ServiceNotFound
 
@@ -387,8 +377,7 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         try:
             found = report(namespace, name)
         except ServiceNotFound as error:  # it may come
-            found = {"namespace": namespace.name, "data_path": native.path(), "why_python": native.why_python()}
-            found |= {"drivers": [], "services": [], "problems": [str(error)]}
+            found = {"namespace": namespace.name, "drivers": [], "services": [], "problems": [str(error)]}
         if as_json:
             print_json(found)
         elif sys.stdout.isatty():

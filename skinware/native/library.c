@@ -1,12 +1,12 @@
 /*
- * What skinware.memory calls in C: a sleep that ends with the frame copied, copies, publication. Plain functions over
- * plain structures, so that one library serves every Python (docs/decisions/0026-native-code.md).
+ * What skinware.memory calls: a sleep that ends with the sample copied, copies, publication. Plain functions over plain
+ * structures, so that one library serves every Python (docs/decisions/0026-native-code.md).
  */
 
 #include "ring.h"
 
 /* Changes whenever a function or structure here does; skinware/native/__init__.py has the same number. */
-#define ABI 6
+#define ABI 7
 
 /* What a reader asks for. The map outlives it. */
 typedef struct skinware_native_request {
@@ -24,7 +24,7 @@ SKINWARE_EXPORT uint32_t skinware_native_abi(void);
 SKINWARE_EXPORT void skinware_native_fence(void);
 SKINWARE_EXPORT int skinware_native_copy(const skinware__ring *ring, uint64_t wanted, unsigned char *to);
 SKINWARE_EXPORT int skinware_native_wait(const skinware_native_request *request, unsigned char *to);
-SKINWARE_EXPORT void skinware_native_begin(skinware_ring_writer *writer);
+SKINWARE_EXPORT void skinware_native_begin(skinware_ring_writer *writer, uint64_t skipped);
 SKINWARE_EXPORT uint64_t skinware_native_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags);
 SKINWARE_EXPORT void skinware_native_wake(const skinware_ring_writer *writer);
 
@@ -59,7 +59,8 @@ int skinware_native_wait(const skinware_native_request *request, unsigned char *
     return skinware_native_copy(&request->ring, request->wanted, to);
 }
 
-void skinware_native_begin(skinware_ring_writer *writer) {
+void skinware_native_begin(skinware_ring_writer *writer, uint64_t skipped) {
+    writer->skipped = skipped;
     (void)skinware_ring_begin(writer);
 }
 

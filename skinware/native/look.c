@@ -24,7 +24,7 @@ typedef struct seen_ring {
     uint64_t start; /* of its frame, in the memory of all */
 } seen_ring;
 
-/* skinware/memory/native_ring.py has the same words. */
+/* skinware/memory/look.py has the same words. */
 typedef struct skinware_native_look {
     uint64_t count;
     uint64_t news_only; /* 1: only if one of them has another frame than the one that was handed out last */

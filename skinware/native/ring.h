@@ -1,6 +1,6 @@
 /*
- * The slot protocol in C: reading is in skinware.h, publishing here. skinware/memory/ring_writer.py says the same in
- * Python, and docs/reference/shared-memory.md what it means. Include this before any system header.
+ * The slot protocol: reading is in skinware.h, publishing here; docs/reference/shared-memory.md explains it. Include
+ * this before any system header.
  *
  * Memory order: the fence of begin keeps what is filled in behind the sequence 0; the store of the sequence in commit is
  * a release, and so are those of latest and the wake word, in this order. A reader acquires each, and looks at the
@@ -35,16 +35,17 @@ enum {
 };
 
 /*
- * The writer's end of one generation, for one thread at a time. Python's RingWriter has one, at native_address: whoever
- * publishes, in Python or in C, does it through the same.
+ * The writer's end of one generation, for one thread at a time. Python's RingWriter owns one, at native_address; every
+ * publication goes through it.
  */
 typedef struct skinware_ring_writer {
     unsigned char *map; /* may be written */
     uint64_t slot_offset;
     uint64_t slot_stride;
     uint64_t slot_count;
-    int64_t begun_ns; /* 0: no frame is begun */
+    int64_t begun_ns; /* 0: no sample is begun */
     int64_t cpu_ns;   /* of the publishing thread, at the last publication */
+    uint64_t skipped; /* sequences that are left out before the next one; 0 after a commit */
 } skinware_ring_writer;
 
 static inline int64_t skinware__clock_ns(clockid_t clock) {
@@ -108,6 +109,11 @@ static inline uint64_t skinware_ring_sequence(const skinware_ring_writer *writer
     return __atomic_load_n(skinware__word_at(writer, SKINWARE__LATEST_OFFSET / 8), __ATOMIC_RELAXED);
 }
 
+/* The sequence of the sample that begin and commit are about. */
+static inline uint64_t skinware_ring_next(const skinware_ring_writer *writer) {
+    return skinware_ring_sequence(writer) + 1 + writer->skipped;
+}
+
 /* The slot of a sequence: SLOT_HEADER_BYTES of header, then the columns at their offsets. */
 static inline unsigned char *skinware_ring_slot(const skinware_ring_writer *writer, uint64_t sequence) {
     return writer->map + writer->slot_offset + (sequence % writer->slot_count) * writer->slot_stride;
@@ -118,7 +124,7 @@ static inline unsigned char *skinware_ring_slot(const skinware_ring_writer *writ
  * old frame are told that it is gone. May be called again instead of a commit.
  */
 static inline unsigned char *skinware_ring_begin(skinware_ring_writer *writer) {
-    unsigned char *slot = skinware_ring_slot(writer, skinware_ring_sequence(writer) + 1);
+    unsigned char *slot = skinware_ring_slot(writer, skinware_ring_next(writer));
     writer->begun_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     __atomic_store_n(&((skinware__slot *)(void *)slot)->sequence, 0, __ATOMIC_RELAXED);
     __atomic_thread_fence(__ATOMIC_RELEASE);
@@ -144,7 +150,7 @@ static inline void skinware_ring_wake(const skinware_ring_writer *writer) {
  * Returns the frame's sequence; 0 if there was no begin: nothing has changed then.
  */
 static inline uint64_t skinware_ring_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags) {
-    const uint64_t sequence = skinware_ring_sequence(writer) + 1;
+    const uint64_t sequence = skinware_ring_next(writer);
     const int64_t begun_ns = writer->begun_ns;
     skinware__slot *slot = (skinware__slot *)(void *)skinware_ring_slot(writer, sequence);
     int64_t published_ns;
@@ -160,6 +166,7 @@ static inline uint64_t skinware_ring_commit(skinware_ring_writer *writer, int64_
     __atomic_store_n(&slot->flags, flags, __ATOMIC_RELAXED);
     __atomic_store_n(&slot->sequence, sequence, __ATOMIC_RELEASE);
     writer->begun_ns = 0;
+    writer->skipped = 0;
     __atomic_store_n(skinware__word_at(writer, SKINWARE__LATEST_OFFSET / 8), sequence, __ATOMIC_RELEASE);
     skinware_ring_wake(writer);
     skinware__note(writer, begun_ns, published_ns, acquired_ns);

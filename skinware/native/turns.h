@@ -1,4 +1,4 @@
-/* Where a reader in C is, between two calls of it. skinware/memory/native_ring.py has the same words. */
+/* Where a reader in C is, between two calls of it. skinware/memory/ring_reader.py has the same words. */
 
 #ifndef SKINWARE_NATIVE_TURNS_H
 #define SKINWARE_NATIVE_TURNS_H

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, RequestRefused, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.native_ring import ring_reader
-from skinware.memory.ring import RingReader, Sample, SampleT
+from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring_reader import RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, Periodic, now_ns
@@ -158,8 +158,8 @@ class Attachment(Generic[SampleT]):
     def _attach(self, known: RingReader[SampleT] | None = None) -> RingReader[SampleT]:
         segment = segments.attach(self.namespace, self.name)
         if known is not None and _digest(segment) == _digest(known.segment):
-            return ring_reader(segment, self.frame_class, known.context)
-        return ring_reader(segment, self.frame_class, self._describe(segment))
+            return RingReader(segment, self.frame_class, known.context)
+        return RingReader(segment, self.frame_class, self._describe(segment))
 
     def _describe(self, _attached: segments.Segment) -> object:
         """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""

@@ -15,7 +15,6 @@ from skinware.errors import Closed, NameInUse, NamespaceError
 from skinware.memory import file_layout, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.native_ring import ring_writer
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.schema import Column, Schema
 from skinware.realtime import NS_PER_S, now_ns
@@ -101,8 +100,8 @@ class Ownership:
         return self.generation, self.sequence
 
     @property
-    def ring_address(self) -> int | None:
-        """Of the ring's ``skinware_ring_writer``, for C code that publishes through it; None where Python does."""
+    def ring_address(self) -> int:
+        """Address of the ring's ``skinware_ring_writer``, for C code that publishes through it."""
         return self._ring.native_address
 
     def column_offsets(self) -> dict[str, int]:
@@ -243,7 +242,7 @@ class Ownership:
                 published_before=published_before,
             )
             try:
-                ring = ring_writer(segment)
+                ring = RingWriter(segment)
                 ring.set_state(file_layout.STATE_PAUSED, self._paused)
                 segments.publish(segment, self.namespace, self.name)
             except BaseException:

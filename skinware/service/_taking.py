@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import COPY_ATTEMPTS, RingReader, Sample, SampleT
+from skinware.memory.ring import COPY_ATTEMPTS, Sample, SampleT
+from skinware.memory.ring_reader import RingReader
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._attachment import GENERATION_ENDED, Attachment
 from skinware.service.messages import Accounts
@@ -188,11 +189,11 @@ class Taking(Attachment[SampleT]):
         return (self._ring.begun_ns if in_c else now_ns()) + timeout_ns
 
     def _go_round_in_c(self) -> None:
-        """Leave a loop's next turns to C, where there is C, until they have to be done here."""
-        if self._last_taken is not None:
-            self._turns_in_c = self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
-        if self._turns_in_c:
-            self._open_turn = None
+        """Leave a loop's next turns to C until something else happens than samples."""
+        if self._last_taken is None:
+            return
+        self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
+        self._turns_in_c, self._open_turn = True, None
 
     def _come_back(self) -> None:
         if self._turns_in_c:

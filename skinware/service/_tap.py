@@ -6,7 +6,8 @@ from typing import Any
 
 from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.futex import Word
-from skinware.memory.ring import RingReader, SampleT
+from skinware.memory.ring import SampleT
+from skinware.memory.ring_reader import RingReader
 from skinware.realtime import now_ns
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader

@@ -12,7 +12,7 @@ import msgspec
 
 from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Turn, Turns
+from skinware.memory.ring_reader import Turn, Turns
 from skinware.realtime import NS_PER_S, now_ns
 
 MAX_PACKET = 1 << 16

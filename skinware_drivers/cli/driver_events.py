@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 
 def tell_ready(runner: Runner, as_json: bool) -> None:
-    from skinware_drivers.running.figures import path_figures
-
     if runner.generation is None:
         return
     structure = runner.generation.tables.structure
@@ -26,13 +24,12 @@ def tell_ready(runner: Runner, as_json: bool) -> None:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
-        print_json({**ready, "types": types, "buses": buses, **path_figures(runner.generation)})
+        latency_ms = int(runner.generation.publisher.latency_ns[0]) / 1e6
+        print_json({**ready, "types": types, "buses": buses, "latency_ms": latency_ms})
     else:
         patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
         what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
         echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
-        if runner.generation.why_python:
-            echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
 
 
 def tell_patches(runner: Runner, change: PatchChange) -> None:

@@ -250,7 +250,6 @@ class MachineSeen:
     Attributes:
         versions: of skinware, Python, numpy ..., by name.
         kernel: release, and the machine's kind.
-        native: of the compiled libraries, by name: why Python does their work; empty: they are used.
         cpus: that are switched on.
         load: processes that want one, mean of the last minute.
         governors: of the processors, each once; empty: they have none, or it is not told.
@@ -267,7 +266,6 @@ class MachineSeen:
 
     versions: Mapping[str, str]
     kernel: str
-    native: Mapping[str, str]
     cpus: int
     load: float
     governors: tuple[str, ...]

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import skinware.native
-import skinware_drivers.native
 from skinware.bridge_state import BridgeState
 from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory.announcement import ReaderRecord, living_readers
@@ -130,7 +128,6 @@ class MachineWatch:
         return MachineSeen(
             versions=versions(),
             kernel=f"{platform.system()} {platform.release()} {platform.machine()}",
-            native={"core": skinware.native.why_python(), "data path": skinware_drivers.native.why_python()},
             cpus=len(os.sched_getaffinity(0)),
             load=os.getloadavg()[0],
             governors=tuple(sorted({text for path in _CPUS.glob(_GOVERNORS) if (text := _text(path))})),

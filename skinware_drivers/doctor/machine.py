@@ -12,8 +12,6 @@ AREA = "machine"
 _LEAST_FREE = 0.05
 """Of shared memory or memory: with less a driver that starts may find no room."""
 _SLOW_GOVERNORS = ("powersave", "conservative", "userspace")
-_CHOICE = ("SKINWARE_NATIVE=0", "not compiled")
-"""In the reason why Python does the work: nothing is broken."""
 _GIB = 1 << 30
 
 
@@ -23,20 +21,6 @@ def check(evidence: Evidence) -> Iterator[Note]:
     if evidence.recording is not None:
         yield Looked(AREA, "recorded by", evidence.recording.recorded_by or "the file does not tell")
     yield Looked(AREA, "versions here", f"{versions}; {machine.kernel}")
-    native = "; ".join(f"{name} {'in Python: ' + why if why else 'compiled'}" for name, why in machine.native.items())
-    yield Looked(AREA, "compiled code", native)
-    for name, why in machine.native.items():
-        if why and not any(choice in why for choice in _CHOICE):
-            yield Finding(
-                Severity.WARNING,
-                AREA,
-                "compiled code is there and cannot be used",
-                name,
-                why,
-                "install this package again",
-                ("pip install --force-reinstall --no-deps skinware",),
-                "how-to/install.md",
-            )
     if evidence.is_live:
         yield from _processors(evidence)
         yield from _memory(evidence)
@@ -54,8 +38,6 @@ def circumstances(evidence: Evidence, driver: DriverSeen) -> str:
     slow = [name for name in machine.governors if name in _SLOW_GOVERNORS]
     if slow:
         parts.append(f"CPU governor {', '.join(slow)}")
-    if driver.data_path == "python":
-        parts.append("its data path is not compiled")
     return ", ".join(parts)
 
 

@@ -14,7 +14,6 @@ from msgspec import Meta
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
-from skinware_drivers import native
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Gateway
@@ -228,11 +227,10 @@ class ModbusBus(KernelBus):
             self._talk = Listener(self._wanted, self.counters)
         else:
             over_tcp = self._address is not None
-            kind = Master if native.library() is None else NativeMaster
             guests = None if self._gateway is None else self._gateway.guests
             if guests is not None:
                 guests.give_up()
-            self._talk = kind(
+            self._talk = NativeMaster(
                 self._wanted,
                 self._timing,
                 self.counters,
@@ -288,8 +286,7 @@ class ModbusBus(KernelBus):
     @property
     def reads_natively(self) -> bool:
         """Whether C asks and takes the replies, as long as all is well."""
-        is_there = native.library() is not None and not self.listen_only
-        return is_there and isinstance(self._port, DescriptorPort | None)
+        return not self.listen_only and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
         """Have C ask; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""

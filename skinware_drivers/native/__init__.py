@@ -1,4 +1,4 @@
-"""The data path in C, and how Python hands it what a layout compiles to (docs/decisions/0028-native-data-path.md)."""
+"""The data path of drivers in C, and how Python hands it what a layout compiles to (decision 0028)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,16 @@ from pathlib import Path
 
 import skinware.native
 
-ABI = 7
-"""Of ``path.c``: both change together."""
+ABI = 8
+"""Number of the interface of ``path.c``: both change together."""
 
 _FILE = Path(__file__).with_name("libskinware_drivers.so")
 
 
-def library() -> skinware.native.Library | None:
-    """The data path in C, None where numpy does its work."""
-    return skinware.native.load(_FILE, ABI).library
+def library() -> skinware.native.Library:
+    """Return the library of the data path.
 
-
-def why_python() -> str:
-    """Why numpy does its work; empty if it does not."""
-    return skinware.native.load(_FILE, ABI).why_python
-
-
-__all__ = ["ABI", "library", "why_python"]
+    Raises:
+        PlatformError: it cannot be loaded; the message says what to do.
+    """
+    return skinware.native.load(_FILE, ABI)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
@@ -22,25 +23,34 @@ _ORDERS = ("given", "any", "ends_with")
 _SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
 
 
-def why_not(decoder: Decoder) -> str:
-    """Why C cannot do what these layouts say; empty if it can."""
-    if decoder.tables.structure.dtype.str[1:] not in _TYPES:
-        return f"values of dtype {decoder.tables.structure.dtype}"
-    for frame in decoder.frames:
-        runs = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
-        if not all(dtype.str[1:] in _TYPES for dtype in runs):
-            return f"frame {frame.name!r}: values of an unusual dtype"
-        if len({dtype.kind == "f" for dtype in runs}) > 1:
-            return f"frame {frame.name!r}: integers beside floats"
-        if runs and runs[0].kind == "f" and decoder.tables.structure.dtype.kind != "f":
-            return f"frame {frame.name!r}: floats where the driver has integers"
-        if runs and runs[0].kind != "f" and np.result_type(*runs).kind == "f":
-            return f"frame {frame.name!r}: values of 64 bits with and without a sign"
-    return ""
+def check_values(frame: Frame) -> None:
+    """Refuse values that the data path cannot read together.
+
+    Raises:
+        ConfigurationError: the message says what to do.
+    """
+    dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
+    kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
+    unknown = next((dtype for dtype in dtypes if dtype.str[1:] not in _TYPES), None)
+    if unknown is not None:
+        problem = f"values of dtype {unknown.name}"
+    elif len(kinds) > 1:
+        problem = "integers beside floats"
+    elif kinds == {"integer"} and np.result_type(*dtypes).kind == "f":
+        problem = "64-bit values with and without a sign"
+    else:
+        return
+    raise ConfigurationError(f"frame {frame.name!r}: {problem} cannot be declared; read them with an Expand function")
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
-    """Fill in what a plan says of frames and updates."""
+    """Fill in what a plan says of frames and updates.
+
+    Raises:
+        ConfigurationError: a frame has values that C does not read.
+    """
+    for frame in decoder.frames:
+        check_values(frame)
     structure, state, addresses = decoder.tables.structure, decoder.state, decoder.addresses
     plan.n_buses, plan.n_patches = len(structure.buses), structure.n_patches
     plan.n_modules, plan.n_sensors = structure.n_modules, structure.n_sensors

@@ -30,7 +30,7 @@ def figures(
     buses = []
     for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
         counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
-        path = DataPath(int(publisher.bus_data_path[line.ordinal])).name.lower()
+        path = DataPath(int(publisher.buses.data_path[line.ordinal])).name.lower()
         buses.append({**_bus(line), "data_path": path, **counters})
     patches = []
     for patch in range(structure.n_patches):
@@ -40,24 +40,16 @@ def figures(
             {
                 "name": generation.name_of(patch),
                 "bus": lines[int(structure.patch_bus[patch])].name,
-                "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
+                "state": PatchState(int(publisher.patches.state[patch])).name.lower(),
                 "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
                 "interval": _bounds(publisher.timing.intervals[patch].tolist()),
                 "age": _bounds(publisher.timing.ages[patch].tolist()),
                 **counters,
             }
         )
-    figures = {"sequence": writer.sequence, **path_figures(generation), "buses": buses, "patches": patches}
+    latency_ms = int(publisher.latency_ns[0]) / 1e6
+    figures = {"sequence": writer.sequence, "latency_ms": latency_ms, "buses": buses, "patches": patches}
     return {**figures, "machine": _machine(machine)}
-
-
-def path_figures(generation: Generation) -> dict[str, Any]:
-    """Which way frames take, why not the native one, and how long they may wait."""
-    return {
-        "data_path": generation.data_path.name.lower(),
-        "why_python": generation.why_python,
-        "latency_ms": int(generation.publisher.latency_ns[0]) / 1e6,
-    }
 
 
 def _machine(machine: MachineLimits) -> dict[str, int]:

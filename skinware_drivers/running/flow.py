@@ -20,7 +20,6 @@ from skinware_drivers.native.kernel_bus import KernelBus, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import bus_failure
-from skinware_drivers.running.native_path import NativePath
 
 _NEVER_NS = (1 << 63) - 1
 _OTHER_BUS, _NEWS, _NO_MEMORY = range(2, 5)  # of flow.c
@@ -62,9 +61,9 @@ def flow_of(
     fail: Callable[[BaseException], None],
 ) -> Flow | None:
     buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
-    if generation.native is None or not any(is_read_natively(bus) for bus in buses):
+    if not any(is_read_natively(bus) for bus in buses):
         return None
-    return Flow(generation, generation.native, epoll_fd, latency_s, take, fail)
+    return Flow(generation, epoll_fd, latency_s, take, fail)
 
 
 class Flow:
@@ -72,7 +71,6 @@ class Flow:
 
     Args:
         generation: what is in service.
-        path: its native path.
         epoll_fd: in which open buses are registered.
         latency_s: the longest rest.
         take: called in the loop when a bus has something that Python has to read.
@@ -82,13 +80,13 @@ class Flow:
     def __init__(
         self,
         generation: Generation,
-        path: NativePath,
         epoll_fd: int,
         latency_s: float,
         take: Callable[[], object],
         fail: Callable[[BaseException], None],
     ) -> None:
-        self._generation, self._path = generation, path
+        self._generation, self._path = generation, generation.path
+        path = self._path
         self._lines, self._batch = generation.lines, generation.batch
         self._latency_s = latency_s
         self._take, self._fail = take, fail
@@ -116,10 +114,10 @@ class Flow:
         flow = self._flow
         flow.loop_fd = loop_fd
         flow.until_ns = _NEVER_NS if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-        flow.silence_ns = max(NS_PER_S // 2, self._generation.publisher.silence_ns)
+        flow.silence_ns = max(NS_PER_S // 2, self._generation.publisher.pace.silence_ns)
         flow.latency_ns = round(self._rest_s() * NS_PER_S)
         self._hand_over()
-        self._generation.prepare_native()
+        self._generation.announce_waits()
         self._path.interrupt(self._generation.interrupted())
         try:
             return self._path.run(flow)

@@ -19,7 +19,7 @@ from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import failure
-from skinware_drivers.running.native_path import NativePath, path_for
+from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.news import Doubles, PatchChange
 from skinware_drivers.running.publisher import Publisher
 
@@ -74,8 +74,7 @@ class Generation:
         period_s: nominal time between two updates that the publisher counts on.
         batch: what buses fill.
         begun_ns: when it began.
-        native: does the work of decoder and publisher in C; None where numpy does.
-        why_python: why numpy does; empty where it does not.
+        path: decodes and publishes.
         flows: C reads the buses that it can read (see ``running.flow``).
     """
 
@@ -86,8 +85,7 @@ class Generation:
     period_s: float
     batch: FrameBatch = field(init=False)
     begun_ns: int = field(init=False)
-    native: NativePath | None = field(init=False)
-    why_python: str = field(init=False)
+    path: NativePath = field(init=False)
     flows: bool = False
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
@@ -97,14 +95,12 @@ class Generation:
     def __post_init__(self) -> None:
         self.batch = make_batch(self.lines, self.decoder.headroom)
         self.begun_ns = now_ns()
-        self._known_state = self.publisher.patch_state.copy()
-        self._doubles = Doubles(self.tables.structure, self.publisher.period_ns)
-        self.publisher.bus_counters = [line.bus.counters for line in self.lines]
+        self._known_state = self.publisher.patches.state.copy()
+        self._doubles = Doubles(self.tables.structure, self.publisher.pace.period_ns)
+        self.publisher.buses.counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
-        self.native, self.why_python = path_for(self.decoder, self.publisher, self.batch)
-        if self.native is not None:
-            self.native.hear, self.native.offer = self._hear, self._offer
-        self.publisher.data_path[:] = DataPath.PYTHON if self.native is None else DataPath.NATIVE
+        self.path = NativePath(self.decoder, self.publisher, self.batch)
+        self.path.hear, self.path.offer = self._hear, self._offer
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
@@ -114,47 +110,20 @@ class Generation:
         return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:
-        """The batch, with nothing in it but frames that wait for their partners."""
-        if self.native is not None:
-            self.native.empty()
-        else:
-            self.decoder.put_back(self.batch)
+        """Return the batch, with nothing in it but frames that wait for their partners."""
+        self.path.empty()
         return self.batch
 
-    def digest(self, batch: FrameBatch) -> None:
+    def digest(self, _batch: FrameBatch) -> None:
+        """Decode the batch, and publish what is due."""
         self.update_bus_states(settled=now_ns() >= self._look_ns)
-        if self.native is not None:
-            self.prepare_native()
-            self.native.digest(self.interrupted())
-            return
-        if any(line.link.expects_data for line in self.lines):
-            self._hear(np.arange(max(batch.start, batch.headroom), batch.stop))
-        found, foreign = self.decoder.decode(batch, self.interrupted())
-        if len(foreign):
-            self.decoder.count_unknown(batch, self._offer(foreign))
-        self.publisher.take(found)
+        self.announce_waits()
+        self.path.digest(self.interrupted())
 
-    def publish_if_due(self, read_ns: int) -> None:
-        """Publish if the time has come, and nothing speaks against it.
-
-        Args:
-            read_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
-        """
-        if self.native is not None:
-            self.native.publish_if_due(read_ns)
-        else:
-            self.publisher.publish_if_due(read_ns)
-
-    @property
-    def deadline_ns(self) -> int:
-        """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""
-        return self.publisher.deadline_ns if self.native is None else self.native.deadline_ns
-
-    def prepare_native(self) -> None:
-        """Before C code runs: say who waits for frames now."""
-        if self.native is not None:
-            self.native.expects_data = any(line.link.expects_data for line in self.lines)
-            self.native.awaited = [wanted for line in self.lines for wanted in line.link.awaited]
+    def announce_waits(self) -> None:
+        """Say which frames are waited for; before each call of C."""
+        self.path.expects_data = any(line.link.expects_data for line in self.lines)
+        self.path.awaited = [wanted for line in self.lines for wanted in line.link.awaited]
 
     def _hear(self, rows: Rows) -> None:
         for line, own in zip(self.lines, split_by_bus(self.batch, rows, len(self.lines)), strict=True):
@@ -182,21 +151,13 @@ class Generation:
         for line in self.lines:
             if not settled and line.is_in_order:
                 continue
-            line.look(self.publisher.silence_ns)
-            self.publisher.bus_state[line.ordinal] = line.state
-            self.publisher.bus_reason[line.ordinal] = line.reason
-            self.publisher.bus_since_ns[line.ordinal] = line.since_ns
-            self.publisher.bus_load[line.ordinal] = line.limits.permille
-            self.publisher.bus_samples[line.ordinal] = line.bus.samples.rows
+            line.look(self.publisher.pace.silence_ns)
+            buses, number = self.publisher.buses, line.ordinal
+            buses.state[number], buses.reason[number], buses.since_ns[number] = line.state, line.reason, line.since_ns
+            buses.load[number] = line.limits.permille
+            buses.samples[number] = line.bus.samples.rows
             in_c = self.flows and is_read_natively(line.bus)
-            self.publisher.bus_data_path[line.ordinal] = DataPath.NATIVE if in_c else DataPath.PYTHON
-
-    @property
-    def data_path(self) -> DataPath:
-        of_buses = set(self.publisher.bus_data_path.tolist())
-        if len(of_buses) > 1:
-            return DataPath.MIXED
-        return DataPath.PYTHON if self.native is None else DataPath.NATIVE
+            buses.data_path[number] = DataPath.NATIVE if in_c else DataPath.PYTHON
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
         return self.tables.patch_key.get((line.ordinal, patch.key))
@@ -207,12 +168,12 @@ class Generation:
     def patches_in(self, line: BusLine, *states: PatchState) -> list[Patch]:
         if not line.patches:
             return []
-        state = self.publisher.patch_state[self.tables.structure.patch_bus == line.ordinal]
+        state = self.publisher.patches.state[self.tables.structure.patch_bus == line.ordinal]
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
     def tell_patches(self) -> Iterator[PatchChange]:
         """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
-        now, before = self.publisher.patch_state, self._known_state
+        now, before = self.publisher.patches.state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
             if line.busy.locked():

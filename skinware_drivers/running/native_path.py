@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-import skinware.native
 from skinware.errors import PlatformError
 from skinware.native import Library
 from skinware.realtime import now_ns
@@ -22,7 +21,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
-from skinware_drivers.native.compiling import compile_batch, compile_decoder, why_not
+from skinware_drivers.native.compiling import compile_batch, compile_decoder
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.publisher import Publisher
 
@@ -31,24 +30,12 @@ Rows = npt.NDArray[np.int64]
 _real_now_ns = now_ns
 
 
-def path_for(decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> tuple[NativePath | None, str]:
-    """The data path in C for these; None where numpy has to do it, and why."""
-    library = native.library()
-    if library is None:
-        return None, native.why_python()
-    if publisher.ring_address is None:
-        return None, skinware.native.why_python()
-    why = why_not(decoder)
-    return (None, why) if why else (NativePath(library, decoder, publisher, batch), "")
-
-
 class NativePath:
     """Does what the decoder and the publisher do, on their arrays.
 
     Args:
-        library: where the code is.
         decoder: what frames mean, and what is known of the skin.
-        publisher: when frames are published, and what they say beside values.
+        publisher: when snapshots are published, and what they say beside values.
         batch: what buses fill.
 
     Attributes:
@@ -62,7 +49,7 @@ class NativePath:
         damaged: shown bytes of a serial line in which there is no frame, at most four times a second.
     """
 
-    def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
+    def __init__(self, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self.expects_data = False
         self.awaited: Sequence[Filter] = ()
@@ -78,6 +65,7 @@ class NativePath:
         compile_decoder(decoder, self._plan, arrays)
         self._compile_publisher(publisher, arrays)
         self._plan.hooks = self._make_hooks()
+        library = native.library()
         self._load(library)
         self._words.last_published_ns = now_ns()
         made = library.quick.skinware_path_new(
@@ -153,7 +141,7 @@ class NativePath:
         self._skipped_before[:] = counts[:, self._skipped_column]
         self._words.fixed_ns = 0 if now_ns is _real_now_ns else now_ns()
         self._words.wanted_ns = self._publisher.wanted_ns
-        self._words.ring, self._words.sequence = self._publisher.ring_address or 0, self._publisher.sequence
+        self._words.ring, self._words.sequence = self._publisher.writer.ring_address, self._publisher.writer.sequence
         self._words.expects_data = self.expects_data
         self._take_from_watch()
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in self.awaited]
@@ -163,7 +151,7 @@ class NativePath:
     def _leave(self) -> None:
         self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
         for bus in np.flatnonzero(self._skipped).tolist():
-            self._publisher.bus_counters[bus].updates_skipped += int(self._skipped[bus])
+            self._publisher.buses.counters[bus].updates_skipped += int(self._skipped[bus])
         self._skipped[:] = 0
         if self._words.hastened:
             self._words.hastened = 0
@@ -192,29 +180,29 @@ class NativePath:
         self._run.restype = ctypes.c_int64
 
     def _compile_publisher(self, publisher: Publisher, arrays: structs.Arrays) -> None:
-        plan, bursts, n_buses = self._plan, publisher.bursts, len(publisher.bus_counters)
-        plan.period_ns, plan.silence_ns = publisher.period_ns, publisher.silence_ns
-        plan.patience_ns, plan.pause_ns = publisher.patience_ns, publisher.pause_ns
-        plan.idle_ns, plan.by_cycle, plan.most_at_once = publisher.idle_ns, publisher.by_cycle, publisher.most_at_once
+        plan, pauses, patches, buses = self._plan, publisher.pauses, publisher.patches, publisher.buses
+        n_buses = len(buses.counters)
+        pace = publisher.pace
+        plan.period_ns, plan.silence_ns, plan.patience_ns = pace.period_ns, pace.silence_ns, pace.patience_ns
+        plan.pause_ns, plan.idle_ns = pace.pause_ns, pace.idle_ns
+        plan.by_cycle, plan.most_at_once = publisher.by_cycle, publisher.writer.slots
         plan.stale = int(Status.STALE)
         plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
-        plan.burst_pause_ns = arrays.at(bursts.pause_ns)
-        plan.standing_out_ns, plan.gap_ns = arrays.at(bursts.standing_out_ns), arrays.at(bursts.gap_ns)
-        plan.group_heard_ns = arrays.at(publisher.group_heard_ns)
+        plan.burst_pause_ns = arrays.at(pauses.pause_ns)
+        plan.standing_out_ns, plan.gap_ns = arrays.at(pauses.standing_out_ns), arrays.at(pauses.gap_ns)
         plan.is_prompt = arrays.at(self._decoder.state.is_prompt)
-        plan.age_limit_ns = arrays.at(publisher.age_limit_ns)
-        plan.patch_heard_ns = arrays.at(publisher.patch_heard_ns)
-        plan.patch_lives_until_ns = arrays.at(publisher.patch_lives_until_ns)
-        plan.patch_state = arrays.at(publisher.patch_state)
+        plan.group_heard_ns, plan.age_limit_ns = arrays.at(patches.group_heard_ns), arrays.at(patches.age_limit_ns)
+        plan.patch_heard_ns, plan.patch_state = arrays.at(patches.heard_ns), arrays.at(patches.state)
+        plan.patch_lives_until_ns = arrays.at(patches.lives_until_ns)
         self._module_status = publisher.watch.module_status.copy()  # a watch may replace its own
         self._module_untouched = publisher.watch.module_untouched.copy()
         plan.module_status = arrays.at(self._module_status)
         plan.module_untouched = arrays.at(self._module_untouched)
-        plan.bus_state, plan.bus_reason = arrays.at(publisher.bus_state), arrays.at(publisher.bus_reason)
-        plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
-        plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
+        plan.bus_state, plan.bus_reason = arrays.at(buses.state), arrays.at(buses.reason)
+        plan.bus_since_ns, plan.bus_load = arrays.at(buses.since_ns), arrays.at(buses.load)
+        plan.bus_samples, plan.bus_samples_bytes = arrays.at(buses.samples), buses.samples.nbytes
         plan.latency_ns, plan.data_path = arrays.at(publisher.latency_ns), arrays.at(publisher.data_path)
-        plan.bus_data_path = arrays.at(publisher.bus_data_path)
+        plan.bus_data_path = arrays.at(buses.data_path)
         self._skipped_column = OWN_BUS_COUNTERS.index("updates_skipped")
         counts = publisher.count_buses()
         plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
@@ -230,7 +218,7 @@ class NativePath:
         plan.sample_next_ns = arrays.at(self._sample_next_ns)
         timing = publisher.timing
         plan.timing, plan.timing_before_ns = arrays.at(timing.both), arrays.at(timing.before_ns)
-        for name, offset in publisher.column_offsets().items():
+        for name, offset in publisher.writer.column_offsets().items():
             setattr(plan.columns, name, offset)
         self._words.on_request = publisher.on_request
 

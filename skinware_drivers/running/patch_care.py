@@ -179,7 +179,7 @@ class PatchCare:
         line, generation = self._line, self._generation()
         if generation is None or self._listen_only or line.lost.is_set() or line.busy.locked():
             return
-        silence_ns = generation.publisher.silence_ns
+        silence_ns = generation.publisher.pace.silence_ns
         if now_ns() - max(line.opened_ns, generation.begun_ns) < 2 * silence_ns:
             return  # nobody listened, the boards may send: to set them up again would move their baseline
         states = [PatchState.STALE, PatchState.EXPECTED]

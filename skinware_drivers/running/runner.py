@@ -382,7 +382,7 @@ class Runner:
             return
         self.generation.publisher.excuse(hold_up)
         for line in self.lines:
-            line.excuse(hold_up.since_ns, self.generation.publisher.silence_ns)
+            line.excuse(hold_up.since_ns, self.generation.publisher.pace.silence_ns)
 
     def _publish_when_due(self) -> None:
         self._attend()
@@ -393,7 +393,7 @@ class Runner:
         self.writer.keep_files()
         self._machine.look()
         self.generation.update_bus_states()
-        self.generation.publish_if_due(self._intake.read_until_ns)
+        self.generation.path.publish_if_due(self._intake.read_until_ns)
         for change in self.generation.tell_patches():
             self._on_patches(change)
         self._arm_timer()
@@ -402,7 +402,7 @@ class Runner:
         if self.generation is None:
             return
         loop = asyncio.get_running_loop()
-        due_s = loop.time() + _LOOK_S if self._flows else self.generation.deadline_ns / NS_PER_S
+        due_s = loop.time() + _LOOK_S if self._flows else self.generation.path.deadline_ns / NS_PER_S
         if self._timer is not None:
             if not self._timer.cancelled() and loop.time() < self._timer.when() <= due_s:
                 return  # it comes early enough and then looks again

@@ -167,7 +167,7 @@ class Serving:
     @property
     def _silence_s(self) -> float:
         generation = self._generation()
-        return _SILENCE_S if generation is None else generation.publisher.silence_ns / NS_PER_S
+        return _SILENCE_S if generation is None else generation.publisher.pace.silence_ns / NS_PER_S
 
 
 @contextmanager

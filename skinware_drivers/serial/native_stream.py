@@ -6,7 +6,6 @@ import ctypes
 
 import numpy as np
 
-from skinware.native import Library
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
@@ -37,10 +36,8 @@ def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Str
         payload_size: of bodies, at most; frames with longer ones are counted as refused.
         counters: of the bus.
     """
-    library = native.library()
-    if library is None or not can_compile(framing):
-        return PythonStream(framing, payload_size, counters)
-    return NativeStream(library, framing, payload_size, counters)
+    made = NativeStream if can_compile(framing) else PythonStream
+    return made(framing, payload_size, counters)
 
 
 def can_compile(framing: Framing) -> bool:
@@ -167,15 +164,15 @@ class NativeStream(Stream):
     """A stream whose frames C finds, also while the event loop rests.
 
     Args:
-        library: where the code is.
         framing: what is on the line; one that C can find.
         payload_size: of bodies, at most; frames with longer ones are counted as refused.
         counters: of the bus.
     """
 
-    def __init__(self, library: Library, framing: Framing, payload_size: int, counters: BusCounters) -> None:
+    def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:
         super().__init__(counters)
         self._payload_size = payload_size
+        library = native.library()
         self._fill, self._add = library.quick.skinware_stream_fill, library.quick.skinware_stream_add
         self._fill.restype = ctypes.c_int64
         self._arrays = arrays = structs.Arrays()

@@ -25,13 +25,12 @@ import pytest
 
 from skinware_drivers.testing.fault_tests import FaultTests, SilenceTests
 from skinware_drivers.testing.life_tests import LifeTests
-from skinware_drivers.testing.path_tests import PathTests
 from skinware_drivers.testing.torn_tests import TornTests
 from skinware_drivers.testing.value_tests import ValueTests
 
 
 @pytest.mark.usefixtures("namespace")
-class DriverConformance(SilenceTests, PathTests, TornTests, FaultTests, LifeTests, ValueTests):
+class DriverConformance(SilenceTests, TornTests, FaultTests, LifeTests, ValueTests):
     """Tests for a driver. Subclass it, say which driver and which emulator, and nothing else.
 
     pytest begins with those of the last base class.

@@ -18,7 +18,8 @@ programs agree.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,16 +32,15 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.counters import BusCounters, FramerCounters
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.testing.both_paths import require_same
 from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.direct_path import DirectPath
 from skinware_drivers.testing.wire import make_bus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
@@ -155,36 +155,37 @@ def _decode(
     apart_ns: int = _MS,
 ) -> Shown:
     patches = _patches(adapter, devices)
-    decoder = Decoder([adapter.layout], assemble([("bus", patches)], adapter.types, adapter.dtype))
-    state, unknown, taken = decoder.state, 0, list[tuple[int, int, bytes]]()
-    batch = FrameBatch(1, adapter.payload_size, decoder.headroom)
+    tables = assemble([("bus", patches)], adapter.types, adapter.dtype)
+    with closing(DirectPath(adapter.layout, tables, adapter.payload_size)) as path:
+        problems += _feed(path, adapter, frames, apart_ns)
+        state = path.decoder.state
+        orphans, waiting = int(state.patch_counters[:, 1].sum()), path.waiting
+        if orphans:
+            problems.append(f"{orphans} frames have no partners of their cycle")
+        if waiting:
+            problems.append(f"{waiting} frames wait for the others of their cycle")
+        if strict and problems:
+            defect("not everything was shown (if that is right, say strict=False):\n" + "\n".join(problems))
+        unknown = int(state.bus_counters[0, 0])
+        return Shown(path.decoder.tables.structure, state.values.copy(), state.status.copy(), unknown, tuple(problems))
+
+
+def _feed(
+    path: DirectPath, adapter: AnyAdapter, frames: Sequence[tuple[int, str | bytes]], apart_ns: int
+) -> Iterator[str]:
+    """Feed frames one by one; yield what is wrong with each."""
+    counters = path.decoder.state.bus_counters[0]
     for number, (identifier, digits) in enumerate(frames):
         payload = _bytes(digits)
         if adapter.medium == "can":
             check_identifier(identifier)
         name = f"frame {number}, {identifier_text(identifier)} [{len(payload)}] {payload[:8].hex(' ').upper()}"
         if len(payload) > adapter.payload_size:
-            problems.append(f"{name}: too long, the longest of the layout has {adapter.payload_size} bytes")
+            yield f"{name}: too long, the longest of the layout has {adapter.payload_size} bytes"
             continue
-        decoder.put_back(batch)
-        taken.append(((number + 1) * apart_ns, identifier, payload))
-        batch.append(0, *taken[-1])
-        before = state.bus_counters[0].copy()
-        updates, foreign = decoder.decode(batch)
-        decoder.count_unknown(batch, foreign)
-        unknown += len(foreign)
-        state.show(updates)
-        problems += [f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(state.bus_counters[0] - before)]
-    require_same(adapter.layout, decoder.tables, adapter.period_s, adapter.payload_size, taken)
-    decoder.put_back(batch)
-    orphans = int(state.patch_counters[:, 1].sum())
-    if orphans:
-        problems.append(f"{orphans} frames have no partners of their cycle")
-    if len(batch):
-        problems.append(f"{len(batch)} frames wait for the others of their cycle")
-    if strict and problems:
-        defect("not everything was shown (if that is right, say strict=False):\n" + "\n".join(problems))
-    return Shown(decoder.tables.structure, state.values.copy(), state.status.copy(), unknown, tuple(problems))
+        before = counters.copy()
+        path.feed((number + 1) * apart_ns, identifier, payload)
+        yield from (f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(counters - before))
 
 
 class _Nobody:

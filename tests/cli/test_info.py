@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter, native
+from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter
 from skinware.cli._command import exit_status
 from skinware.cli._terminal import shown
 from skinware.cli.info import as_text, command
@@ -161,19 +161,19 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("own", "of_buses", "path", "line"),
     [
-        (DataPath.NATIVE, [DataPath.NATIVE, DataPath.NATIVE], "native", "native data path"),
-        (DataPath.PYTHON, [DataPath.PYTHON, DataPath.PYTHON], "python", "python data path"),
+        (DataPath.NATIVE, [DataPath.NATIVE, DataPath.NATIVE], "native", ""),
+        (DataPath.PYTHON, [DataPath.PYTHON, DataPath.PYTHON], "python", "Python receives the frames of can0, can1"),
         (
             DataPath.NATIVE,
             [DataPath.NATIVE, DataPath.PYTHON],
             "mixed",
-            "mixed data path; compiled code reads can0; Python reads can1",
+            "Python receives the frames of can1",
         ),
-        (DataPath.NATIVE, [DataPath.NOT_TOLD, DataPath.NOT_TOLD], "native", "native data path"),  # of an older version
+        (DataPath.NATIVE, [DataPath.NOT_TOLD, DataPath.NOT_TOLD], "native", ""),  # of an older version
         (DataPath.NOT_TOLD, [DataPath.NOT_TOLD, DataPath.NOT_TOLD], "not_told", ""),
     ],
 )
-def test_which_way_frames_take_is_shown(
+def test_buses_that_python_reads_are_shown(
     own: DataPath, of_buses: list[DataPath], path: str, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with FakeSkin("torso", fake_structure(2, 1, buses=2)) as skin:
@@ -185,12 +185,11 @@ def test_which_way_frames_take_is_shown(
         path,
         [way.name.lower() for way in of_buses],
     )
-    assert [text.strip() for text in out.splitlines() if "data path" in text] == [line] * bool(line)
+    assert [text.strip() for text in out.splitlines() if "Python receives" in text] == [line] * bool(line)
 
 
 def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
-    own = {"data_path": native.path(), "why_python": native.why_python()}
-    empty = {"namespace": namespace.name, **own, "drivers": [], "services": [], "problems": []}
+    empty = {"namespace": namespace.name, "drivers": [], "services": [], "problems": []}
     assert told(capsys) == empty
     out = text(capsys)
     assert "0 drivers, 0 services" in out
@@ -363,8 +362,6 @@ def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Nam
         assert told(capsys, "--namespace", namespace.name)["drivers"]
         assert told(capsys, "--namespace", f"{namespace.name}x") == {
             "namespace": f"{namespace.name}x",
-            "data_path": native.path(),
-            "why_python": native.why_python(),
             "drivers": [],
             "services": [],
             "problems": [],
@@ -403,7 +400,7 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
 
 
 def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
-    report = {"namespace": "x", "why_python": "no compiler", "drivers": [], "services": [], "problems": ["refused"]}
+    report = {"namespace": "x", "drivers": [], "services": [], "problems": ["refused"]}
     assert "\x1b[31mproblem: \x1b[0mrefused" in map(shown, as_text(report))
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from skinware import Namespace, native
-from tests.compiling import compiled, need_compiler
+from skinware import Namespace
+from tests.compiling import compiled
 from tests.core import workers
 from tests.core.c_programs import SOURCE
 from tests.core.users import Users, running_driver
+from tests.specification.ring import use_specification
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +43,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return compiled(SOURCE, "c99", tmp_path_factory)
 
 
-@pytest.fixture(params=["native", "python"])
-def data_path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Frames go through C, then through Python; also in processes that a test starts."""
-    if request.param == "native":
-        need_compiler("gcc")
-        monkeypatch.delenv("SKINWARE_NATIVE", raising=False)
-    else:
-        monkeypatch.setenv("SKINWARE_NATIVE", "0")
-    native.load.cache_clear()
-    assert native.path() == request.param, native.why_python()
-    yield request.param
-    native.load.cache_clear()
+@pytest.fixture(params=["ring", "specification"])
+def ring(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The ring of the package, then its specification in Python; also in processes that a test starts."""
+    if request.param == "specification":
+        use_specification(monkeypatch)
+    return str(request.param)

@@ -34,7 +34,7 @@ STATES = {
 }
 GENERATION, SEQUENCE, MISSED, BEGUN, TORN, STOP, PID, WON = range(8)
 
-pytestmark = pytest.mark.usefixtures("process_server", "data_path")
+pytestmark = pytest.mark.usefixtures("process_server", "ring")
 
 
 # -- those who are killed ----------------------------------------------------------------------------------------

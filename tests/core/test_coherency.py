@@ -13,7 +13,7 @@ import pytest
 
 from skinware import Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun
-from skinware.memory.ring import COPY_ATTEMPTS
+from skinware.memory.ring import COPY_ATTEMPTS, slot_headers_of
 from skinware.service import Columns
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.workers import PATIENCE_S, Board, Crew
@@ -28,7 +28,7 @@ slots; who reads at its own time may compare one more than once, and requests ta
 N_ANSWERS = 400
 COMPARED, OVERRUNS, TORN, READY, LAST, FIRST, TAKEN, LOST = range(8)
 
-pytestmark = pytest.mark.usefixtures("process_server", "data_path")
+pytestmark = pytest.mark.usefixtures("process_server", "ring")
 
 
 def fill(columns: dict[str, npt.NDArray[Any]], sequence: int) -> None:
@@ -161,7 +161,7 @@ def test_a_slot_that_is_never_whole_is_an_overrun(way: str) -> None:
             writer.commit(sequence, sequence)
             if sequence == 1 and way != "view":
                 assert is_whole(takes[way]())
-        words = writer._ring._slot_words
+        words = slot_headers_of(writer._ring.segment)
         words[0][0] = 0  # as if the writer had come past each time
         words[1][0] = 0
         with pytest.raises(Overrun, match=f"{COPY_ATTEMPTS} times"):
@@ -172,10 +172,8 @@ def test_a_slot_that_is_never_whole_is_an_overrun(way: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["copy", "view", "in order"])
-def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_attempts(
-    way: str, data_path: str
-) -> None:
-    if data_path == "native" and way != "view":
+def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_attempts(way: str, ring: str) -> None:
+    if ring == "ring" and way != "view":
         pytest.skip("C counts its attempts where no test can look")
     with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
         attempts = 0

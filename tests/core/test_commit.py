@@ -12,8 +12,6 @@ from skinware import Sample, ServiceReader, ServiceWriter
 from skinware.errors import ServiceError
 from skinware.realtime import NS_PER_S, now_ns
 
-pytestmark = pytest.mark.usefixtures("data_path")
-
 BAD = [
     pytest.param({"acquired_ns": 1 << 63}, ValueError, id="too wide"),
     pytest.param({"acquired_ns": 1.5}, TypeError, id="not whole"),

@@ -107,7 +107,6 @@ def test_a_forged_count_beside_the_lock_is_not_believed(namespace: Namespace) ->
         assert reader._ring.segment.published_before == 0
 
 
-@pytest.mark.usefixtures("data_path")
 def test_a_dead_writer_was_not_too_fast(namespace: Namespace, program: Path) -> None:
     forged(namespace, *ABSURD["latest"])
     with ServiceReader[Sample]("x") as reader:
@@ -354,7 +353,6 @@ def test_no_schema_does_harm(text: bytes) -> None:
     assert values.dtype.itemsize * np.prod(values.shape) == 20
 
 
-@pytest.mark.usefixtures("data_path")
 def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(namespace: Namespace) -> None:
     """Only the size of the file stays: all else changes between the looks of a reader that has attached."""
     generator = random.Random(7)

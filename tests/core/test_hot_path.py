@@ -13,8 +13,6 @@ from skinware.memory import futex
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
 
-pytestmark = pytest.mark.usefixtures("data_path")
-
 COLUMNS = {"values": ("<u2", 8), "times": ("<i8", 3)}
 
 

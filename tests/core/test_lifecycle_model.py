@@ -34,7 +34,7 @@ from skinware.errors import (
     StructureChanged,
 )
 
-pytestmark = pytest.mark.usefixtures("data_path")
+pytestmark = pytest.mark.usefixtures("ring")
 
 NAMES = ["a", "b"]
 SHAPES = [1, 5]

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverWriter, Skin, Snapshot, native
+from skinware import DriverWriter, Skin, Snapshot
+from skinware import skin as skin_module
 from skinware.errors import Closed, ServiceTimeout
-from skinware.memory.native_ring import Look
+from skinware.memory.look import Look
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 
@@ -26,27 +27,23 @@ NAMES = "abc"
 
 @pytest.fixture
 def skins(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Skin]]:
-    """A skin of each path."""
-    made = {path: OnItsPath(path, monkeypatch) for path in ("native", "python")}
+    """A skin that leaves its looks to C, and one that does not."""
+    made = {way: LookingIn(way, monkeypatch) for way in ("C", "Python")}
     yield dict(made)
     for skin in made.values():
         skin.close()
-    native.load.cache_clear()
 
 
-class OnItsPath(Skin):
-    """A skin whose readers are all of one path: they are made while it reads."""
-
-    def __init__(self, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+class LookingIn(Skin):
+    def __init__(self, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()
-        self.path, self.monkeypatch = path, monkeypatch
+        self.way, self.monkeypatch = way, monkeypatch
 
     def read(self, **how: Any) -> Snapshot:
-        self.monkeypatch.setenv("SKINWARE_NATIVE", "0" if self.path == "python" else "1")
-        native.load.cache_clear()
-        if native.path() != self.path:
-            pytest.skip(native.why_python())
-        return super().read(**how)
+        with self.monkeypatch.context() as patch:
+            if self.way == "Python":
+                patch.setattr(skin_module, "look_at", lambda _: None)
+            return super().read(**how)
 
 
 def publish(writer: DriverWriter, value: int) -> None:
@@ -121,8 +118,8 @@ def test_both_ways_see_the_same_whatever_happens(seed: int, skins: dict[str, Ski
                 publish(writer, value)
             newest[name] = writer.position
             wait_until(both_have_it)
-            in_c += isinstance(skins["native"]._in_c, Look)
-            assert seen(known["native"]) == seen(known["python"])
+            in_c += isinstance(skins["C"]._in_c, Look)
+            assert seen(known["C"]) == seen(known["Python"])
             for path, skin in skins.items():
                 with pytest.raises(ServiceTimeout):
                     skin.read(newer_than=known[path], timeout_s=0.0)
@@ -132,7 +129,7 @@ def test_both_ways_see_the_same_whatever_happens(seed: int, skins: dict[str, Ski
         for name in NAMES:
             clear_away(name)
     assert in_c > 60
-    assert skins["python"]._in_c is None
+    assert skins["Python"]._in_c is None
 
 
 def test_both_ways_count_the_same(skins: dict[str, Skin]) -> None:
@@ -144,7 +141,7 @@ def test_both_ways_count_the_same(skins: dict[str, Skin]) -> None:
             for _ in range(burst):
                 publish(a if value % 3 else b, value)
             known = {path: skin.read(newer_than=known[path]) for path, skin in skins.items()}
-            assert seen(known["native"]) == seen(known["python"])
+            assert seen(known["C"]) == seen(known["Python"])
             for skin in skins.values():
                 skin.read()
         for name in "ab":
@@ -152,16 +149,16 @@ def test_both_ways_count_the_same(skins: dict[str, Skin]) -> None:
             for path, skin in skins.items():
                 told = skin.reader(name).statistics
                 counts[path] = told.frames, told.lost, told.overruns, told.age.total, told.wall.count, told.cpu.count
-            assert counts["native"] == counts["python"]
-            assert counts["native"][0] == 21
+            assert counts["C"] == counts["Python"]
+            assert counts["C"][0] == 21
 
 
 def test_more_looks_than_are_noted_at_once_are_all_counted(skins: dict[str, Skin]) -> None:
     with DriverWriter("a", STRUCTURES[0]) as a:
         publish(a, 1)
         for _ in range(700):
-            skins["native"].read()
-        told = skins["native"].reader("a").statistics
+            skins["C"].read()
+        told = skins["C"].reader("a").statistics
         assert (told.frames, told.age.total, told.lost) == (700, 700, 0)
 
 
@@ -183,7 +180,7 @@ def test_what_anybody_still_has_is_never_filled_again(skins: dict[str, Skin]) ->
         for value in range(1, 100):
             publish(a, value)
             publish(b, value)
-            keep.append((value, ways[value % len(ways)](skins["native"].read())))
+            keep.append((value, ways[value % len(ways)](skins["C"].read())))
     for value, thing in keep:
         frames = thing.frames if isinstance(thing, Snapshot) else thing if isinstance(thing, tuple) else ()
         for frame in frames:
@@ -200,7 +197,7 @@ def test_snapshots_that_nobody_has_are_filled_again(skins: dict[str, Skin]) -> N
         seen_frames = set()
         for value in range(2, 12):
             publish(a, value)
-            snapshot = skins["native"].read()
+            snapshot = skins["C"].read()
             assert is_whole(snapshot)
             seen_frames.add(id(snapshot.frames[0]))
         assert len(seen_frames) <= 4  # those of the first look, in Python, among them
@@ -226,7 +223,7 @@ def test_readers_of_single_drivers_do_not_confuse_the_skin(skins: dict[str, Skin
                 for loop in loops.values():
                     next(loop)
             found = {path: seen(skin.read()) for path, skin in skins.items()}
-            assert found["native"] == found["python"]
+            assert found["C"] == found["Python"]
         for name in "ab":
             told = [skin.reader(name).statistics for skin in skins.values()]
             assert told[0].frames == told[1].frames
@@ -237,18 +234,18 @@ def test_readers_of_single_drivers_do_not_confuse_the_skin(skins: dict[str, Skin
 
 
 @contextmanager
-def two_drivers(data_path: str) -> Iterator[tuple[Skin, DriverWriter]]:
+def two_drivers() -> Iterator[tuple[Skin, DriverWriter]]:
     """A skin after a look that has all there is, and one of its two drivers."""
     with DriverWriter("a", STRUCTURES[0]) as a, DriverWriter("b", STRUCTURES[1]) as b, Skin() as skin:
         publish(a, 1)
         publish(b, 1)
         skin.read()
-        assert (skin._in_c is not None) == (data_path == "native")
+        assert skin._in_c is not None
         yield skin, a
 
 
-def test_a_publication_ends_a_wait(data_path: str) -> None:
-    with two_drivers(data_path) as (skin, writer):
+def test_a_publication_ends_a_wait() -> None:
+    with two_drivers() as (skin, writer):
         snapshot = skin.read()
         for value in range(2, 12):
             publisher = threading.Timer(0.02, publish, (writer, value))
@@ -259,14 +256,14 @@ def test_a_publication_ends_a_wait(data_path: str) -> None:
             assert is_whole(snapshot)
 
 
-def test_a_signal_ends_a_wait(data_path: str) -> None:
+def test_a_signal_ends_a_wait() -> None:
     class Rang(Exception):
         pass
 
     def ring(*_: object) -> None:
         raise Rang
 
-    with two_drivers(data_path) as (skin, writer):
+    with two_drivers() as (skin, writer):
         snapshot = skin.read()
         before = signal.signal(signal.SIGALRM, ring)
         try:
@@ -280,8 +277,8 @@ def test_a_signal_ends_a_wait(data_path: str) -> None:
         assert skin.read(newer_than=snapshot).of("a").sequence == 2
 
 
-def test_another_thread_stops_a_wait(data_path: str) -> None:
-    with two_drivers(data_path) as (skin, _):
+def test_another_thread_stops_a_wait() -> None:
+    with two_drivers() as (skin, _):
         snapshot = skin.read()
         stopper = threading.Timer(0.02, skin.stop)
         stopper.start()
@@ -290,8 +287,8 @@ def test_another_thread_stops_a_wait(data_path: str) -> None:
         stopper.join()
 
 
-def test_a_deadline_holds(data_path: str) -> None:
-    with two_drivers(data_path) as (skin, _):
+def test_a_deadline_holds() -> None:
+    with two_drivers() as (skin, _):
         snapshot = skin.read()
         for timeout_s in (0.0, 0.01, 0.12, 0.3):
             begun_ns = time.monotonic_ns()
@@ -300,8 +297,8 @@ def test_a_deadline_holds(data_path: str) -> None:
             assert time.monotonic_ns() - begun_ns >= timeout_s * 1e9
 
 
-def test_a_killed_driver_ends_a_wait(data_path: str) -> None:
-    with two_drivers(data_path) as (skin, writer):
+def test_a_killed_driver_ends_a_wait() -> None:
+    with two_drivers() as (skin, writer):
         snapshot = skin.read()
         kill(writer)
         snapshot = skin.read(newer_than=snapshot, timeout_s=20)
@@ -309,8 +306,8 @@ def test_a_killed_driver_ends_a_wait(data_path: str) -> None:
         clear_away("a")
 
 
-def test_the_child_of_a_fork_has_no_skin(data_path: str) -> None:
-    with two_drivers(data_path) as (skin, writer):
+def test_the_child_of_a_fork_has_no_skin() -> None:
+    with two_drivers() as (skin, writer):
         snapshot = skin.read()
         publish(writer, 2)
         child = os.fork()

@@ -9,8 +9,6 @@ from skinware.errors import Overrun, StructureChanged
 from tests.core.services import publish
 from tests.core.workers import seeded
 
-pytestmark = pytest.mark.usefixtures("data_path")
-
 COLUMNS = {"values": ("<u8", 4)}
 
 

@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,11 +19,14 @@ import numpy.typing as npt
 import pytest
 
 from skinware import Sample, ServiceReader, ServiceWriter, native
-from skinware.errors import Closed, ServiceTimeout
-from skinware.memory import native_ring
-from skinware.memory.native_ring import NativeRingReader, NativeRingWriter
+from skinware.errors import Closed, PlatformError, ServiceTimeout
+from skinware.memory import look, ring_reader, ring_writer
+from skinware.memory.ring_reader import RingReader
+from skinware.memory.ring_writer import RingWriter
+from skinware.service import _attachment, _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled
+from tests.specification.ring import SpecifiedReader, SpecifiedWriter
 
 COLUMNS = {"values": ("<u8", 509), "odd": ("u1", 7)}
 STRESS = Path(__file__).with_name("ring_stress.c")
@@ -53,20 +55,9 @@ def is_whole(frame: Sample, value: int) -> bool:
     )
 
 
-@pytest.fixture
-def native_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.delenv("SKINWARE_NATIVE", raising=False)
-    native.load.cache_clear()
-    if native.core() is None:
-        pytest.skip(native.why_python())
-    yield
-    native.load.cache_clear()
-
-
 # -- memory that is used again -------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("native_path")
 @pytest.mark.parametrize("way", WAYS)
 def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
     keep: list[tuple[int, Any]] = []
@@ -97,7 +88,6 @@ def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
             assert (np.sort(array.ravel()) == np.sort(np.ravel(expected))).all()
 
 
-@pytest.mark.usefixtures("native_path")
 def test_frames_that_nobody_has_are_filled_again() -> None:
     with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         take = taking(reader, "asap")
@@ -110,7 +100,6 @@ def test_frames_that_nobody_has_are_filled_again() -> None:
         assert len(seen) == 2
 
 
-@pytest.mark.usefixtures("native_path")
 def test_a_frame_of_a_dead_writer_is_stale_and_the_same_memory_afterwards_is_not() -> None:
     writer = ServiceWriter("x", COLUMNS)
     with ServiceReader[Sample]("x") as reader:
@@ -128,35 +117,28 @@ def test_a_frame_of_a_dead_writer_is_stale_and_the_same_memory_afterwards_is_not
             assert not take().stale
 
 
-# -- the two ways side by side -------------------------------------------------------------------------------------
+# -- beside the specification ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("writers", ["native", "python"])
-def test_both_ways_see_the_same(way: str, writers: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Readers of both kinds of one writer of either kind, through losses and a restart; all that they count agrees."""
-
-    def on(path: str) -> None:
-        monkeypatch.setenv("SKINWARE_NATIVE", "0" if path == "python" else "1")
-        native.load.cache_clear()
-        if native.path() != path:
-            pytest.skip(native.why_python())
-
-    on(writers)
+@pytest.mark.parametrize("writer_class", [RingWriter, SpecifiedWriter])
+def test_readers_see_what_the_specification_sees(
+    way: str, writer_class: type[RingWriter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One writer of either kind and a reader of each, through losses and a restart; all that they count agrees."""
+    monkeypatch.setattr(_ownership, "RingWriter", writer_class)
     writer = ServiceWriter("x", COLUMNS, slots=4)
+    classes = {"ring": RingReader, "specification": SpecifiedReader}
     readers = {}
-    for path in ("native", "python"):
-        on(path)
+    for path, reader_class in classes.items():
+        monkeypatch.setattr(_attachment, "RingReader", reader_class)
         readers[path] = ServiceReader[Sample]("x")
-    assert isinstance(readers["native"]._ring, NativeRingReader)
-    assert not isinstance(readers["python"]._ring, NativeRingReader)
     takes = {path: taking(reader, way) for path, reader in readers.items()}
     seen: dict[str, list[tuple[int, ...]]] = {path: [] for path in takes}
     value = 0
     for burst in (1, 1, 2, 1, 7, 1, 3, -1, 1, 1, 9, 1):
         if burst < 0:
             writer.close()
-            on(writers)
             writer = ServiceWriter("x", COLUMNS, slots=4)
             value = 0
             continue
@@ -164,25 +146,24 @@ def test_both_ways_see_the_same(way: str, writers: str, monkeypatch: pytest.Monk
             value += 1
             publish(writer, value)
         for path, take in takes.items():
+            monkeypatch.setattr(_attachment, "RingReader", classes[path])  # it attaches again after a restart
             while not seen[path] or seen[path][-1][:2] != writer.position:
                 frame = take()
                 assert is_whole(frame, frame.sequence)
                 times = frame.acquired_ns, frame.published_ns, frame.flags
                 seen[path].append((frame.generation, frame.sequence, *times, frame.stale))
-    assert seen["native"] == seen["python"]
+    assert seen["ring"] == seen["specification"]
     told = {path: reader.statistics for path, reader in readers.items()}
     counts = {path: (one.frames, one.lost, one.overruns, one.age.total, one.wall.count) for path, one in told.items()}
-    assert counts["native"] == counts["python"]
+    assert counts["ring"] == counts["specification"]
     for reader in readers.values():
         reader.close()
     writer.close()
-    native.load.cache_clear()
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
-def test_a_writer_tells_the_same_of_itself(data_path: str) -> None:
+@pytest.mark.usefixtures("ring")
+def test_a_writer_counts_its_publications() -> None:
     with ServiceWriter("x", COLUMNS, slots=3) as writer, ServiceReader[Sample]("x") as reader:
-        assert isinstance(writer._ring, NativeRingWriter) == (data_path == "native")
         now_ns = time.monotonic_ns()
         for acquired_ns in (-1, -(1 << 63), 0, now_ns, now_ns + (1 << 40), now_ns - 3_000_000):
             writer.begin()
@@ -201,9 +182,8 @@ def test_a_writer_tells_the_same_of_itself(data_path: str) -> None:
 # -- whoever ends a wait -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", WAYS)
-def test_a_signal_ends_a_wait(way: str, data_path: str) -> None:
+def test_a_signal_ends_a_wait(way: str) -> None:
     class Rang(Exception):
         pass
 
@@ -227,9 +207,8 @@ def test_a_signal_ends_a_wait(way: str, data_path: str) -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", WAYS)
-def test_another_thread_stops_a_wait(way: str, data_path: str) -> None:
+def test_another_thread_stops_a_wait(way: str) -> None:
     with ServiceWriter("x", COLUMNS) as writer:
         reader = ServiceReader[Sample]("x")
         take = taking(reader, way)
@@ -243,9 +222,8 @@ def test_another_thread_stops_a_wait(way: str, data_path: str) -> None:
         reader.close()
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", ["asap", "in order"])
-def test_the_child_of_a_fork_has_no_reader(way: str, data_path: str) -> None:
+def test_the_child_of_a_fork_has_no_reader(way: str) -> None:
     with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         take = taking(reader, way)
         for value in (1, 2):
@@ -264,9 +242,8 @@ def test_the_child_of_a_fork_has_no_reader(way: str, data_path: str) -> None:
         assert is_whole(take(), 3)
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
 @pytest.mark.parametrize("way", ["asap", "in order"])
-def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str, data_path: str) -> None:
+def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str) -> None:
     with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
 
         def frames() -> Iterator[Sample]:
@@ -285,8 +262,7 @@ def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str, data_path:
         assert reader.lost == 0
 
 
-@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
-def test_a_killed_writer_is_noticed_by_a_loop(data_path: str) -> None:
+def test_a_killed_writer_is_noticed_by_a_loop() -> None:
     writer = ServiceWriter("x", COLUMNS)
     with ServiceReader[Sample]("x") as reader:
         take = taking(reader, "asap")
@@ -307,31 +283,18 @@ def test_a_killed_writer_is_noticed_by_a_loop(data_path: str) -> None:
 # -- the library ---------------------------------------------------------------------------------------------------
 
 
-def test_a_library_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    if native.core() is None:
-        pytest.skip(native.why_python())
-    refused = native.load(native._CORE, native.ABI + 1)
-    assert refused.library is None
-    assert refused.why_python.startswith(f"libskinware.so is of another version ({native.ABI}, not {native.ABI + 1})")
+def test_a_library_of_another_version_is_refused() -> None:
+    with pytest.raises(PlatformError, match=f"has interface {native.ABI}, not {native.ABI + 1}: install this package"):
+        native.load(native._CORE, native.ABI + 1)
 
 
-def test_what_is_no_library_or_not_there_leaves_python(tmp_path: Path) -> None:
-    broken = tmp_path / "libskinware.so"
+def test_what_is_no_library_or_missing_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "libbroken.so"
     broken.write_bytes(b"no library")
-    assert "cannot be loaded" in native.load(broken, native.ABI).why_python
-    assert "was not compiled" in native.load(tmp_path / "libnothing.so", native.ABI).why_python
-
-
-@pytest.mark.parametrize(("given", "path"), [("0", "python"), (None, "native")])
-def test_a_program_chooses_by_its_environment(given: str | None, path: str) -> None:
-    if path == "native" and native.core() is None:
-        pytest.skip(native.why_python())
-    environment = {name: value for name, value in os.environ.items() if name != "SKINWARE_NATIVE"}
-    if given is not None:
-        environment["SKINWARE_NATIVE"] = given
-    code = "from skinware import native; print(native.path(), native.why_python())"
-    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert told.stdout.split() == [path, *(["SKINWARE_NATIVE=0"] if given else [])]
+    with pytest.raises(PlatformError, match=r"libbroken.so cannot be loaded .*: install this package again"):
+        native.load(broken, native.ABI)
+    with pytest.raises(PlatformError, match="is missing: install this package again"):
+        native.load(tmp_path / "libnothing.so", native.ABI)
 
 
 # -- the protocol under the checkers -------------------------------------------------------------------------------
@@ -353,11 +316,10 @@ def test_no_frame_is_torn_whatever_is_checked(
     assert told["torn"] == 0
     assert told["timed"] == told["ages"] == 10000
     assert all(told[way] > 0 for way in ("turns", "in_order", "copies", "waits", "looks")), told
-    structures = native_ring._Request, native_ring._TurnsState, native_ring._WriterState, native_ring._LookState
+    structures = ring_reader._Request, ring_reader._TurnsState, ring_writer._WriterState, look._LookState
     assert told["sizes"] == [ctypes.sizeof(one) for one in structures]
 
 
-@pytest.mark.usefixtures("native_path")
 def test_a_reader_beside_a_thread_that_computes_gets_every_frame() -> None:
     """It lets go of the interpreter lock only to sleep, so that it catches up once it has it."""
     over = threading.Event()

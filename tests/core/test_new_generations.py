@@ -12,12 +12,14 @@ import pytest
 
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, StructureChanged
-from skinware.memory import file_layout, native_ring, ring, ring_writer, segments
+from skinware.memory import file_layout, ring_writer, segments
+from skinware.memory.ring_reader import RingReader
 from skinware.service import _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
+from tests.specification import ring as specification
 
-pytestmark = pytest.mark.usefixtures("data_path")
+pytestmark = pytest.mark.usefixtures("ring")
 
 OTHER = {"values": ("<u8", 3)}
 
@@ -95,18 +97,18 @@ def test_pausing_an_old_generation_does_not_hide_that_there_is_a_new_one() -> No
         assert reader._ring.state == file_layout.STATE_SUPERSEDED
 
 
-@pytest.mark.parametrize("where", ["ring_writer", "publish"])
+@pytest.mark.parametrize("where", ["RingWriter", "publish"])
 def test_a_failure_before_it_is_there_leaves_the_old_one(
     where: str, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
-        raise MemoryError if where == "ring_writer" else NamespaceError("no")
+        raise MemoryError if where == "RingWriter" else NamespaceError("no")
 
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         inode = namespace.ring_path("x").stat().st_ino
         with monkeypatch.context() as patched:
-            patched.setattr(*((_ownership, where) if where == "ring_writer" else (segments, where)), fail)
+            patched.setattr(*((_ownership, where) if where == "RingWriter" else (segments, where)), fail)
             with pytest.raises((MemoryError, NamespaceError)):
                 writer.restructure(OTHER, rate_hz=7)
         publish(writer, 2)
@@ -125,8 +127,8 @@ class Interrupt:
         self.left = lines
 
     def __call__(self, frame: types.FrameType, _event: str, _argument: object) -> Any:
-        files = ring_writer.__file__, native_ring.__file__
-        of_commit = frame.f_code.co_name in ("commit", "_publish") and frame.f_code.co_filename in files
+        files = ring_writer.__file__, specification.__file__
+        of_commit = frame.f_code.co_name in ("commit", "_note", "wake") and frame.f_code.co_filename in files
         return self.line if of_commit else None
 
     def line(self, _frame: types.FrameType, event: str, _argument: object) -> Any:
@@ -137,7 +139,7 @@ class Interrupt:
         return self.line
 
 
-def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice(data_path: str) -> None:
+def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice(ring: str) -> None:
     seen: dict[int, int] = {}
     interrupted = 0
     with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Sample]("x") as reader:
@@ -164,26 +166,23 @@ def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice(data_pa
             writer.commit(1)
             look()
             assert reader.read().position == writer.position
-    assert interrupted > (10 if data_path == "python" else 4)
+    assert interrupted > (10 if ring == "specification" else 4)
 
 
-def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(
-    monkeypatch: pytest.MonkeyPatch, data_path: str
-) -> None:
+def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(monkeypatch: pytest.MonkeyPatch) -> None:
     from skinware import threads
     from skinware.errors import Overrun
 
-    ring_class: Any = native_ring.NativeRingReader if data_path == "native" else ring.RingReader
-    copy = ring_class.copy
+    copy = RingReader.copy
     overruns = iter([True] * 3)
 
-    def sometimes(self: ring.RingReader[Sample], sequence: int | None = None) -> Sample | None:
+    def sometimes(self: RingReader[Sample], sequence: int | None = None) -> Sample | None:
         if next(overruns, False):
             raise Overrun("too fast")
         frame: Sample | None = copy(self, sequence)
         return frame
 
-    monkeypatch.setattr(ring_class, "copy", sometimes)
+    monkeypatch.setattr(RingReader, "copy", sometimes)
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)

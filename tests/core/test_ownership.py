@@ -85,7 +85,6 @@ def fork_in_c() -> int:
     return int(ctypes.CDLL(None).fork())
 
 
-@pytest.mark.usefixtures("data_path")
 def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
     tmp_path: Path, namespace: Namespace, program: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

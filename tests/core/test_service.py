@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 
 from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter, native
-from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
-from skinware.memory import file_layout, futex, segments
+from skinware.errors import Overrun, Paused, ServiceError, ServiceTimeout, StructureChanged
+from skinware.memory import file_layout, ring_reader, segments
 from skinware.memory import ring as ring_module
-from skinware.memory.native_ring import ring_reader, ring_writer
+from skinware.memory.ring_reader import RingReader
+from skinware.memory.ring_writer import RingWriter
 from skinware.memory.schema import Schema
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
-
-pytestmark = pytest.mark.usefixtures("data_path")
 
 # -- coherency ----------------------------------------------------------------------------------------------------
 
@@ -72,15 +71,13 @@ def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
             look(reader, writer)
 
 
-@pytest.mark.parametrize("compiled", [None, native.core()], ids=["libatomic", "compiled"])
-def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch, compiled: native.Library | None) -> None:
-    fence = futex.fence_for("aarch64", compiled)
-    monkeypatch.setattr(ring_module, "fence", fence)
+def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ring_module, "fence", native.core().quick.skinware_native_fence)
+    monkeypatch.setattr(ring_reader, "fence", native.core().quick.skinware_native_fence)
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 7)
-        assert reader.read().column("values")[0] == 7
-    with pytest.raises(PlatformError, match="libatomic1"):
-        futex.fence_for("aarch64", library="libmissing.so.9")
+        with reader.view() as sample:
+            assert sample.column("values")[0] == 7
 
 
 # -- losses -------------------------------------------------------------------------------------------------------
@@ -242,9 +239,9 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     lock = segments.take_name(namespace, "x")
     schema = Schema.of(SMALL, "")
     segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
-    writer = ring_writer(segment)
+    writer = RingWriter(segment)
     segments.publish(segment, namespace, "x")
-    reader = ring_reader(segments.attach(namespace, "x"), Sample)
+    reader = RingReader(segments.attach(namespace, "x"), Sample)
     writer._half_words[file_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1
     assert writer.commit(5) == 1

@@ -20,7 +20,7 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
 from tests.core.workers import PATIENCE_S, PROCESSES, kill, running
 
-pytestmark = pytest.mark.usefixtures("process_server", "data_path")
+pytestmark = pytest.mark.usefixtures("process_server", "ring")
 
 
 def write_until_killed(published: Any, fill_only: bool) -> None:

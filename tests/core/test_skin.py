@@ -15,8 +15,6 @@ from skinware.threads import SkinReplica
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, kill
 
-pytestmark = pytest.mark.usefixtures("data_path")
-
 
 class Told:
     """What a skin said of its drivers."""

@@ -12,13 +12,12 @@ import pytest
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.memory import ring
 from skinware.memory.announcement import living_readers
+from skinware.memory.ring import slot_headers_of
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import publish
 from tests.core.workers import kill, running
-
-pytestmark = pytest.mark.usefixtures("data_path")
 
 SMALL = {"values": ("<i8", 4)}
 MS = 1_000_000
@@ -172,7 +171,7 @@ def test_overruns_are_counted() -> None:
         writer.begin()
         writer.commit(now_ns())
         reader.read()
-        writer._ring._slot_words[1][0] = 0  # as if the writer had come past each time
+        slot_headers_of(writer._ring.segment)[1][0] = 0  # as if the writer had come past each time
         with pytest.raises(Overrun, match="64 times in a row"):
             reader.read()
         assert reader.statistics.overruns == 1
@@ -196,7 +195,7 @@ def test_a_rate_is_that_of_the_data_where_it_was_held_up(
         for number in range(20):
             writer.begin()
             sequence = writer.commit(round((5 + number * acquired_ms) * MS))
-            words = writer._ring._slot_words[sequence % writer._ring.segment.layout.slot_count]
+            words = slot_headers_of(writer._ring.segment)[sequence % writer._ring.segment.layout.slot_count]
             words[ring.PUBLISHED] = round((100 + number * published_ms) * MS)
         assert reader.rate_hz() == pytest.approx(rate_hz)
 

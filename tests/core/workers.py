@@ -25,6 +25,7 @@ import numpy.typing as npt
 import pytest
 
 import skinware
+from tests.specification import ring as specification
 
 PATIENCE_S = 60.0
 """How long anything may take on a machine that others use too."""
@@ -111,8 +112,9 @@ def _environment() -> dict[str, str]:
 
 
 def _work_in(environment: dict[str, str], work: Callable[..., None], *arguments: Any) -> None:
-    os.environ.pop("SKINWARE_NATIVE", None)  # the process server has the environment of the test that started it
+    os.environ.pop(specification.VARIABLE, None)  # the process server has the environment of the test that started it
     os.environ.update(environment)
+    specification.use_ring_of_environment()
     work(*arguments)
 
 

@@ -123,7 +123,7 @@ def ill_machine(seen: Evidence) -> Evidence:
     return dataclasses.replace(
         seen,
         machine=dataclasses.replace(
-            seen.machine, native={"core": "it is damaged"}, memory_bytes=100, memory_available_bytes=0,
+            seen.machine, memory_bytes=100, memory_available_bytes=0,
             shared_bytes=100, shared_free_bytes=0, shared_problem="read-only", softnet_dropped=9, clock_set_s=9.0,
         ),
         namespaces=(

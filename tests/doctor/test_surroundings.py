@@ -126,7 +126,6 @@ def test_ports_that_may_not_be_opened_or_are_taken(tmp_path: Path, monkeypatch: 
         ({"softnet_dropped": 12}, "machine", "dropped before any socket saw them"),
         ({"memory_bytes": 1 << 34, "memory_available_bytes": 1 << 28}, "machine", "memory is nearly full"),
         ({"shared_bytes": 1 << 26, "shared_free_bytes": 0}, "machine", "shared memory is nearly full"),
-        ({"native": {"core": "libskinware.so is of another version (3, not 4)"}}, "machine", "cannot be used"),
         ({"shared_problem": "/dev/shm: Permission denied"}, "permissions", "no driver can publish here"),
     ],
 )
@@ -139,8 +138,6 @@ def test_a_machine_with_a_problem(changes: dict[str, object], area: str, words: 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"native": {"core": "SKINWARE_NATIVE=0"}},
-        {"native": {"core": "no libskinware.so: it was not compiled when this package was installed"}},
         {"load": 50.0, "governors": ("powersave",), "realtime_priority": 0, "locked_memory_bytes": 1 << 16},
         {"softnet_dropped": None, "memory_bytes": 0, "shared_bytes": 0},
         {"clock_set_s": 3600.0},

@@ -38,7 +38,6 @@ from skinware_drivers.streams.icub_eth import IcubEthDriver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.streams.yarp import YarpDriver
-from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.allegro_v5 import (
@@ -71,6 +70,7 @@ from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
+from tests.specification.path_tests import DriverConformance
 
 
 class TestXela(DriverConformance):

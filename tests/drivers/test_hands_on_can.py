@@ -23,7 +23,6 @@ from skinware_drivers.description import Patch, assemble
 from skinware_drivers.hand import FINGERS
 from skinware_drivers.link import Link, Match
 from skinware_drivers.registry import class_for, load_driver
-from skinware_drivers.testing.both_paths import why_python
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
@@ -542,8 +541,6 @@ def test_every_pad_has_a_place(model: str, side: str) -> None:
 @pytest.mark.usefixtures("namespace")
 @pytest.mark.parametrize("name", FUZZED)
 def test_random_frames_raise_nothing_and_c_does_with_them_what_numpy_does(name: str) -> None:
-    if why_python():
-        pytest.skip(f"no data path in C: {why_python()}")
     outcome = fuzz(FUZZED[name](), 40_000, seed=1)
     assert outcome.updates
     assert outcome.counted

@@ -6,17 +6,16 @@ from typing import Any
 
 import pytest
 
-from skinware_drivers import native
+from skinware_drivers.modbus import bus
+from skinware_drivers.modbus.master import Master
 from tests.modbus.peers import rtu_server, tcp_server
 
 
 @pytest.fixture(params=["native", "python"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Who asks while all is well."""
+    """Which master asks while all is well."""
     if request.param == "python":
-        monkeypatch.setattr(native, "library", lambda: None)
-    elif native.library() is None:
-        pytest.skip(native.why_python())
+        monkeypatch.setattr(bus, "NativeMaster", Master)
     return str(request.param)
 
 

@@ -24,8 +24,8 @@ from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.both_paths import Pair, hand_clock
-from skinware_drivers.testing.one_path import Publishing
+from tests.specification.both_paths import Pair, hand_clock
+from tests.specification.one_path import Publishing
 
 MS = 1_000_000
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from skinware_drivers.testing.conformance import DriverConformance
 from tests.modbus.hands import Array, EmulatedArray, EmulatedHand, Hand
+from tests.specification.path_tests import DriverConformance
 
 
 class TestArray(DriverConformance):

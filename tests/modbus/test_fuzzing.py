@@ -6,14 +6,12 @@ import random
 
 import pytest
 
-from skinware_drivers.testing.both_paths import hand_clock
 from tests.modbus import fuzzing
-from tests.native import needs_native
+from tests.specification.both_paths import hand_clock
 
 pytestmark = pytest.mark.usefixtures("namespace")
 
 
-@needs_native
 @pytest.mark.parametrize("seed", range(4))
 def test_c_and_python_make_the_same_of_anything(seed: int) -> None:
     rng = random.Random(seed)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.modbus.hostile import FUZZED, fuzz
-from tests.native import needs_native
 
 
-@needs_native
 @pytest.mark.usefixtures("namespace")
 @pytest.mark.parametrize("over_tcp", [False, True], ids=["rtu", "tcp"])
 @pytest.mark.parametrize("name", FUZZED)

@@ -288,7 +288,7 @@ class _Fuzz:
         for wire, line in zip(self._wires, self._lines, strict=True):
             if not line.lost.is_set():
                 wire.check()
-        return self._generation.publisher.sequence
+        return self._generation.publisher.writer.sequence
 
     def _make_generation(self) -> Generation:
         adapters = [line.adapter for line in self._lines]
@@ -356,7 +356,7 @@ class _Fuzz:
             step_ns = int.from_bytes(self._script.bytes(6), "little", signed=True) >> self._script.number(40)
             line.bus._stamper.state = offset_ns + step_ns, last_poll_ns
         else:
-            self._generation.publish_if_due(self._clock.now_ns)
+            self._generation.path.publish_if_due(self._clock.now_ns)
 
     def _not_wanted(self) -> None:
         raise AssertionError("C can read all of these buses")

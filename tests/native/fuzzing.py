@@ -37,8 +37,6 @@ from skinware_drivers.layout import (
     Values,
 )
 from skinware_drivers.registry import DRIVERS, load_driver
-from skinware_drivers.testing.both_paths import Pair
-from skinware_drivers.testing.one_path import Publishing, Way
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import flow_fuzzing
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths
@@ -46,6 +44,8 @@ from tests.native.traffic import identifier_of
 from tests.serial.framings import EXAMPLES, Example
 from tests.serial.fuzzing import Script, examples_of_drivers
 from tests.serial.fuzzing import run as run_on_line
+from tests.specification.both_paths import Pair
+from tests.specification.one_path import Publishing, Way
 
 _PERIOD_S = 0.02
 _MOST_ROWS = 256
@@ -212,8 +212,6 @@ def run(clock: HandClock, data: bytes) -> int:
     size = longest + (0, 64, 512)[script.number(3)]
     skin = design.layouts, design.tables(), design.periods_s
     with Pair(clock, *skin, publishing, rows=_MOST_ROWS, payload_size=size) as pair:
-        if pair.why_not:
-            return 0
         _Fuzz(design, pair, script, is_alone).run()
         return pair.frames
 
@@ -249,7 +247,9 @@ class _Fuzz:
                 self._digest()
             elif what == 14:
                 self._digest()
-                self._pair.clock.now_ns += self._script.number(1 << 16) * self._pair.numpy.publisher.period_ns // 4096
+                self._pair.clock.now_ns += (
+                    self._script.number(1 << 16) * self._pair.numpy.publisher.pace.period_ns // 4096
+                )
                 self._read_ns = max(self._read_ns, self._pair.clock.now_ns - self._script.number(1 << 10) * 10_000)
                 self._do(lambda way: way.publish_if_due(self._read_ns))
             else:

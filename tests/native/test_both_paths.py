@@ -8,20 +8,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
-from hypothesis import HealthCheck, Phase, assume, event, given, settings
+from hypothesis import HealthCheck, Phase, event, given, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.testing.both_paths import Pair, hand_clock
-from skinware_drivers.testing.one_path import Marking, MarkingAll, Publishing
 from skinware_drivers.virtual.hand_clock import HandClock
-from tests.native import needs_native
 from tests.native.fuzzing import designs
 from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
 from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
+from tests.specification.both_paths import Pair, hand_clock
+from tests.specification.one_path import Marking, MarkingAll, Publishing
 
-pytestmark = [needs_native, pytest.mark.timeout(600)]  # a failure takes long to shrink
+pytestmark = [pytest.mark.timeout(600)]  # a failure takes long to shrink
 EXAMPLES = int(os.environ.get("SKINWARE_EXAMPLES", "0"))
 """Of each test here; 0: few, and the same each time."""
 
@@ -56,10 +55,8 @@ def clock() -> Iterator[HandClock]:
 def playing(
     clock: HandClock, design: SkinDesign, publishing: Publishing, watch: type[Marking] = Marking
 ) -> Iterator[Player]:
-    """Both paths for such a skin, and who feeds them; where numpy alone can do it, there is nothing to compare."""
+    """Both paths for such a skin, and the player that feeds them."""
     with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing, watch=watch) as pair:
-        event(pair.why_not or "both")
-        assume(not pair.why_not)
         yield Player(design, pair)
         event(f"{min(pair.frames, 10)} frames or more")
 

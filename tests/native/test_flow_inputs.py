@@ -6,11 +6,9 @@ import random
 
 import pytest
 
-from skinware_drivers.testing.both_paths import hand_clock
-from tests.native import flow_fuzzing, needs_native
+from tests.native import flow_fuzzing
 from tests.serial.fuzzing import Script
-
-pytestmark = needs_native
+from tests.specification.both_paths import hand_clock
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from skinware.memory.namespace import Namespace
-from tests.native import needs_native, sanitizing
+from tests.native import sanitizing
 from tests.sharing import made_once
 
-pytestmark = [needs_native, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 ROOT = Path(__file__).parents[2]
 BESIDE = """
 from tests.native import sanitizing
 sanitizing.use_library()
 from tests.native.fuzzing import designs
-from skinware_drivers.testing.both_paths import Pair, hand_clock
+from tests.specification.both_paths import Pair, hand_clock
 
 design = designs()["headers"]
 with hand_clock() as clock, Pair(clock, design.layouts, design.tables(), design.periods_s, rows=8) as pair:

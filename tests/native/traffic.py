@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout, SequenceNumber
-from skinware_drivers.testing.both_paths import Pair
-from skinware_drivers.testing.one_path import Way
 from tests.native.skins import SkinDesign
+from tests.specification.both_paths import Pair
+from tests.specification.one_path import Way
 
 Wire = tuple[int, int, int, bytes]
 """Bus, time_ns, identifier, payload."""
@@ -198,7 +198,7 @@ class Player:
 
     @property
     def _period_ns(self) -> int:
-        return self.pair.numpy.publisher.period_ns
+        return self.pair.numpy.publisher.pace.period_ns
 
     def play(self, script: Sequence[Event]) -> None:
         """Do all of it, and wait for what is left."""

@@ -78,6 +78,7 @@ class EveryFrame:
         self.reader: DriverReader = DriverReader(name)
         assert running.runner.generation is not None
         generation = running.runner.generation
+        places: list[tuple[object, str]] = [(generation, "digest"), (generation.path, "publish_if_due")]
         frames = self.reader.in_order(timeout_s=30)
 
         def and_read(publish: Callable[..., None]) -> Callable[..., None]:
@@ -89,12 +90,12 @@ class EveryFrame:
             return call
 
         def read() -> None:
-            for name in ("digest", "publish_if_due"):
-                setattr(generation, name, and_read(getattr(generation, name)))
+            for place, name in places:
+                setattr(place, name, and_read(getattr(place, name)))
 
         def forget() -> None:
-            for name in ("digest", "publish_if_due"):
-                delattr(generation, name)
+            for place, name in places:
+                delattr(place, name)
 
         running.do(read)
         self._forget: Callable[[], None] = lambda: running.do(forget)

@@ -74,5 +74,5 @@ def test_what_was_heard_before_the_machine_slept_is_not_fresh(monkeypatch: pytes
     desk.publisher.publish()
     frame = desk.reader.read()
     assert not frame.fresh("pressure", at_ns=desk.clock.now_ns).any()
-    assert (frame.module_time_ns > 0).sum() == np.count_nonzero(desk.publisher._state.group_time_ns)
+    assert (frame.module_time_ns > 0).sum() == np.count_nonzero(desk.publisher.state.group_time_ns)
     desk.close()

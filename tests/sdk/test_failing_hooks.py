@@ -290,7 +290,7 @@ def test_nothing_that_fails_in_the_event_loop_is_only_logged(where: str, error: 
         assert runner._desk is not None
         broken, method = {
             "a take": (runner.generation, "digest"),
-            "a publication": (runner.generation, "publish_if_due"),
+            "a publication": (runner.generation.path, "publish_if_due"),
             "requests": (runner._desk._server, "take"),
         }[where]
         running.do(lambda: setattr(broken, method, fail))

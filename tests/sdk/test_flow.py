@@ -21,7 +21,6 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, Status
 from skinware.errors import DriverError
 from skinware.status import DataPath
-from skinware_drivers import native
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
@@ -40,8 +39,6 @@ from skinware_drivers.virtual.roboskin.options import RoboskinOptions as Emulato
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.cable import Cable
 from tests.sdk.driving import emulated, follow
-
-pytestmark = pytest.mark.skipif(native.library() is None, reason=f"no native data path: {native.why_python()}")
 
 BOARDS = (3, 7)
 
@@ -123,7 +120,6 @@ def test_a_driver_flows_and_its_frames_are_whole(cable: Cable) -> None:
         counters = reader.bus_counters(reader.read())[0]
         assert counters["frames"] <= bus.counters.frames + 200
         assert counters["lost"] == bus.counters.lost == 0
-    assert running.status()["data_path"] == "native"
 
 
 def test_a_bus_that_c_cannot_read_is_read_beside_one_that_it_can(cable: Cable, spare_cable: Cable) -> None:
@@ -180,7 +176,6 @@ def test_buses_that_only_python_can_read_flow_beside_others(cable: Cable) -> Non
         assert frame.data_path == DataPath.MIXED
         assert frame.bus_data_path.tolist() == [DataPath.NATIVE, DataPath.PYTHON]
         status = running.status()
-        assert (status["data_path"], status["why_python"]) == ("mixed", "")
         assert [bus["data_path"] for bus in status["buses"]] == ["native", "python"]
 
 

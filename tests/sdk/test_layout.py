@@ -34,7 +34,7 @@ from skinware_drivers.layout import (
     StatusBytes,
     Values,
 )
-from skinware_drivers.testing.both_paths import require_same
+from tests.specification.both_paths import require_same
 
 TYPES = [PRESSURE.measured(unit="counts")]
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)

@@ -70,7 +70,9 @@ class Stage:
         nothing: Callable[..., None] = lambda *_: None  # noqa: E731
         generation = SimpleNamespace(
             begun_ns=0,
-            publisher=SimpleNamespace(silence_ns=0, lose=nothing, silent_ns=lambda _patch: 1 << 62),
+            publisher=SimpleNamespace(
+                pace=SimpleNamespace(silence_ns=0), lose=nothing, silent_ns=lambda _patch: 1 << 62
+            ),
             decoder=SimpleNamespace(forget=self.forgotten.append),
             watch=SimpleNamespace(forget=nothing),
             patches_in=lambda _line, *states: [patch for patch in PATCHES if self.states[patch.key] in states],

@@ -9,8 +9,10 @@ from skinware import DriverReader, DriverWriter, PatchState, Status
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.polling import Watch
 from skinware_drivers.running import publisher as publisher_module
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
 from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
+from tests.specification import publishing
+from tests.specification.publishing import SpecifiedPublisher
 
 PERIOD_S = 0.05
 SLOTS = 8
@@ -32,14 +34,15 @@ class Desk:
         slots: int = SLOTS,
     ) -> None:
         self.clock = clock = Clock()
-        monkeypatch.setattr(publisher_module, "now_ns", lambda: clock.now_ns)
+        for module in (publisher_module, publishing):
+            monkeypatch.setattr(module, "now_ns", lambda: clock.now_ns)
         self.rig = Rig(boards=boards)
         tables = self.rig.decoder.tables
         self.writer = DriverWriter(
             "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS, slots=slots
         )
         self.watch = self.rig.driver.watch(tables) if watched else Watch(tables)
-        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)
+        self.publisher = SpecifiedPublisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)
         self.reader = DriverReader("desk")
 
     def feed(self, frames: list[Wire]) -> None:
@@ -125,7 +128,7 @@ def test_a_take_publishes_no_more_than_the_ring_holds_and_counts_what_it_skips(
     desk = Desk(monkeypatch)
     desk.feed(desk.burst(1, triangles))
     counters = [BusCounters()]
-    desk.publisher.bus_counters = counters
+    desk.publisher.buses.counters = counters
     before, taken = desk.writer.sequence, 40
     frames: list[Wire] = []
     for value in range(1, taken + 1):
@@ -134,7 +137,7 @@ def test_a_take_publishes_no_more_than_the_ring_holds_and_counts_what_it_skips(
     desk.feed(frames)
     published = desk.writer.sequence - before
     assert 2 <= published <= SLOTS
-    if desk.publisher._state.updated.any():  # the last one waits for the others of its board
+    if desk.publisher.state.updated.any():  # the last one waits for the others of its board
         desk.clock.now_ns += 100 * MS
         desk.publisher.publish_if_due(desk.clock.now_ns)
         published = desk.writer.sequence - before

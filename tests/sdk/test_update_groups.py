@@ -15,8 +15,8 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables, assemble, taxels
 from skinware_drivers.layout import Cycle, Expand, Frame, Identifier, Layout, Values
-from skinware_drivers.testing.both_paths import Pair, hand_clock, why_python
-from skinware_drivers.testing.one_path import Publishing
+from tests.specification.both_paths import Pair, hand_clock
+from tests.specification.one_path import Publishing
 
 MS = 1_000_000
 TAXELS, THERMOMETER, MORE = 0x123, 0x124, 0x125
@@ -51,11 +51,11 @@ class Play:
 
     def look(self) -> None:
         way = self.pair.numpy
-        if not way.publisher.sequence:
+        if not way.publisher.writer.sequence:
             return
         frame = way.reader.read()
         now_ns, structure = self.pair.clock.now_ns, frame.structure
-        limits_ns = structure.age_limits_ns(way.publisher.period_ns)
+        limits_ns = structure.age_limits_ns(way.publisher.pace.period_ns)
         fresh = (frame.status == 0) & (frame.sensor_time_ns > 0) & (frame.sensor_time_ns >= now_ns - limits_ns)
         self.frames.append((frame.status, fresh, frame.patch_state.tolist()))
 
@@ -72,8 +72,6 @@ class Played(Protocol):
 
 @pytest.fixture
 def played() -> Iterator[Played]:
-    if why_python():
-        pytest.skip(f"no data path in C: {why_python()}")
     with hand_clock() as clock, ExitStack() as stack:
 
         def make(layout: Layout, tables: SkinTables, period_s: float = 0.01, *, by_cycle: bool = True) -> Play:

@@ -11,7 +11,6 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framed, Framer, Framing
@@ -20,8 +19,8 @@ from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.serial.stuffing import LINES
 from skinware_drivers.serial.text_matrix import TextMatrix
-from skinware_drivers.testing.path_tests import made
 from tests.serial.framings import Example
+from tests.specification.path_tests import made
 
 _ROWS = 3
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -90,7 +89,7 @@ def compare_with_c(framing: Framing, chunks: Iterable[bytes], rows: int = _ROWS)
     """Both ways to find frames, into batches of so many rows, some of which are too short for the longest bodies."""
     for size in (framing.maximum_body, framing.maximum_body // 2):
         batch = FrameBatch(rows, max(8, -(-size // 8) * 8))
-        stream = made(native.library(), framing, size, BusCounters(), TightStream)
+        stream = made(framing, size, BusCounters(), TightStream)
         for number, chunk in enumerate(chunk for chunk in chunks if chunk):
             stream.add(chunk, 1000 + number)
             while True:

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from skinware_drivers.testing.both_paths import why_python
-
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(bool(why_python()), reason="there is nothing in C to compare with")
 def test_damaged_lines_of_drivers() -> None:
     drivers = ("flexitac", "flexitac:firmware=text,rows=16,columns=16", "ability_hand", "tactile_glove")
     command = [

@@ -23,10 +23,8 @@ from skinware_drivers.serial.framing import Framed, Framer, Framing
 from skinware_drivers.serial.packets import Packet, PacketFramer
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import wait_until
-from tests.native import needs_native
 from tests.serial.lines import DATA, FRAMING, N_TAXELS, Line, data_frame, line
 
-pytestmark = needs_native
 _FEW = 4
 """Sources that flow.c asks without a look before."""
 

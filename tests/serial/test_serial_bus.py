@@ -14,10 +14,10 @@ from serial.rfc2217 import PortManager
 
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import now_ns
-from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.registry import make_bus
+from skinware_drivers.serial import native_stream
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
@@ -28,11 +28,9 @@ from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line
 
 @pytest.fixture(autouse=True, params=["native", "python"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who finds frames."""
+    """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(native, "library", lambda: None)
-    elif native.library() is None:
-        pytest.skip(native.why_python())
+        monkeypatch.setattr(native_stream, "can_compile", lambda _: False)
 
 
 PACKETS = Packet(

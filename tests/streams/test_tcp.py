@@ -10,10 +10,10 @@ import threading
 import pytest
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name, place_of_bus
 from skinware_drivers.registry import make_bus
+from skinware_drivers.serial import native_stream
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Unframed
 from skinware_drivers.serial.stream import CHUNK
@@ -25,11 +25,9 @@ from tests.streams.peers import LOCAL, free_port, opened, server
 
 @pytest.fixture(autouse=True, params=["native", "python"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who finds frames."""
+    """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(native, "library", lambda: None)
-    elif native.library() is None:
-        pytest.skip(native.why_python())
+        monkeypatch.setattr(native_stream, "can_compile", lambda _: False)
 
 
 def send_until_refused(bus: SerialBus) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import os
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 import skinware
-from skinware import Namespace, Sample, ServiceReader, ServiceWriter, native
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import ServiceTimeout
 from skinware.realtime import now_ns
 
@@ -80,17 +79,6 @@ class Skinware:
 
     def subscriber(self, topic: str, _n_sensors: int) -> Subscriber:
         return _SkinwareSubscriber(topic, self._namespace)
-
-
-class SkinwareInPython(Skinware):
-    """Ours where nothing is compiled."""
-
-    name = "python"
-
-    def subscriber(self, topic: str, n_sensors: int) -> Subscriber:
-        os.environ["SKINWARE_NATIVE"] = "0"  # of the reader's process alone
-        native.load.cache_clear()
-        return super().subscriber(topic, n_sensors)
 
 
 class SkinwareInC(Skinware):
@@ -309,7 +297,6 @@ def products(names: list[str], namespace: Namespace, port: int) -> list[Product]
     makers: dict[str, Callable[[], Product]] = {
         "skinware": lambda: Skinware(namespace),
         "c": lambda: SkinwareInC(namespace),
-        "python": lambda: SkinwareInPython(namespace),
         "iceoryx2": Iceoryx2,
         "zenoh": lambda: Zenoh(port, shared_memory=True),
         "zenoh-tcp": lambda: Zenoh(port, shared_memory=False),
@@ -317,4 +304,4 @@ def products(names: list[str], namespace: Namespace, port: int) -> list[Product]
     return [makers[name]() for name in names]
 
 
-NAMES = ("skinware", "c", "iceoryx2", "zenoh", "python", "zenoh-tcp")
+NAMES = ("skinware", "c", "iceoryx2", "zenoh", "zenoh-tcp")

@@ -31,7 +31,6 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from skinware import DriverReader, DriverWriter, Namespace
-from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver
@@ -40,8 +39,9 @@ from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.native import structs
-from skinware_drivers.running.native_path import path_for
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.native_path import NativePath
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from tests.specification.publishing import SpecifiedPublisher
 
 BOARDS = range(7, 14)
 CAN_FRAME = struct.Struct("=IB3x8s")
@@ -72,7 +72,7 @@ def make_frames(cycles: int, seed: int = 1) -> list[bytes]:
 
 
 class Numpy:
-    """The product's path through numpy, from socket to ring."""
+    """The specification in numpy, from socket to ring."""
 
     def __init__(self, namespace: Namespace, sock: socket.socket) -> None:
         self.bus = SocketCanBus("bench")
@@ -88,8 +88,10 @@ class Numpy:
             bus_counters=ALL_BUS_COUNTERS,
             patch_counters=ALL_PATCH_COUNTERS,
         )
-        self.publisher = Publisher(self.writer, self.decoder, driver.watch(tables), driver.period_s, driver.by_cycle)
-        self.publisher.bus_counters = [self.bus.counters]
+        self.publisher = SpecifiedPublisher(
+            self.writer, self.decoder, driver.watch(tables), driver.period_s, driver.by_cycle
+        )
+        self.publisher.buses.counters = [self.bus.counters]
         self.batch = FrameBatch(2048, 8, self.decoder.headroom)
 
     def drain(self) -> int:
@@ -116,10 +118,7 @@ class Native(Numpy):
 
     def __init__(self, namespace: Namespace, sock: socket.socket) -> None:
         super().__init__(namespace, sock)
-        path, why = path_for(self.decoder, self.publisher, self.batch)
-        if path is None:
-            raise SystemExit(f"decode: no native data path: {why}")
-        self.path, self.epoll = path, select.epoll()
+        self.path, self.epoll = NativePath(self.decoder, self.publisher, self.batch), select.epoll()
         self.epoll.register(sock, select.EPOLLIN)
         self.source = (structs.Source * 1)()
         self.flow = structs.Flow(epoll_fd=self.epoll.fileno(), loop_fd=-1, until_ns=1 << 62, n_sources=1)
@@ -281,9 +280,6 @@ def main() -> None:
     few = frames[: max(1, len(frames) // 4)]
     print(f"{len(frames)} frames of {len(BOARDS)} boards x 16 triangles, {arguments.rounds} rounds")
     kinds: dict[str, type[Numpy | Kernel]] = {"native": Native, "numpy": Numpy, "kernel": Kernel}
-    if native.library() is None:
-        print(f"no native data path: {native.why_python()}")
-        del kinds["native"]
     found: dict[str, list[float]] = {name: [] for name in (*kinds, "python-can")}
     try:
         for _ in range(arguments.rounds):

@@ -36,14 +36,12 @@ from tests.native import sanitizing  # noqa: E402
 def fuzz(seconds: float, rng: random.Random) -> None:
     """Fuzz in this process, which the sanitizers end if C does what it must not."""
     from skinware_drivers import native
-    from skinware_drivers.testing.both_paths import hand_clock
     from tests.native.fuzzing import run
     from tests.serial.fuzzing import changed
+    from tests.specification.both_paths import hand_clock
 
     sanitizing.use_library()
     library = native.library()
-    if library is None:
-        sys.exit(f"no data path in C: {native.why_python()}")
     reached = np.ctypeslib.as_array((ctypes.c_uint8 * (1 << 16)).in_dll(library.quick, "reached"))
     logging.getLogger("skinware").addHandler(logging.NullHandler())
     corpus, places, runs, frames = list[bytes](), 0, 0, 0
@@ -63,8 +61,8 @@ def fuzz(seconds: float, rng: random.Random) -> None:
 
 def run_once(data: bytes) -> None:
     """Run one input in this process."""
-    from skinware_drivers.testing.both_paths import hand_clock
     from tests.native.fuzzing import run
+    from tests.specification.both_paths import hand_clock
 
     sanitizing.use_library()
     with hand_clock() as clock:

@@ -22,19 +22,18 @@ sys.path.insert(0, str(ROOT))
 
 
 from skinware.memory.namespace import Namespace  # noqa: E402
-from skinware_drivers import native  # noqa: E402
 from skinware_drivers.bus import FrameBatch  # noqa: E402
 from skinware_drivers.counters import BusCounters  # noqa: E402
 from skinware_drivers.description import SkinTables  # noqa: E402
 from skinware_drivers.registry import load_driver  # noqa: E402
 from skinware_drivers.serial.adapter import SerialAdapter  # noqa: E402
-from skinware_drivers.testing.both_paths import Pair, hand_clock, why_python  # noqa: E402
-from skinware_drivers.testing.one_path import Publishing  # noqa: E402
-from skinware_drivers.testing.path_tests import made  # noqa: E402
 from skinware_drivers.testing.rig import Case, Running, play  # noqa: E402
 from skinware_drivers.testing.suite import lively  # noqa: E402
 from skinware_drivers.virtual.hand_clock import HandClock  # noqa: E402
 from skinware_drivers.virtual.hardware import load_emulator  # noqa: E402
+from tests.specification.both_paths import Pair, hand_clock  # noqa: E402
+from tests.specification.one_path import Publishing  # noqa: E402
+from tests.specification.path_tests import made  # noqa: E402
 
 _HEARD_S = 2.0
 _PIECE, _MOST_DAMAGES = 30_000, 40
@@ -93,7 +92,7 @@ def fuzz(name: str, total: int, rng: random.Random, emulated: dict[str, Any], op
     """So many bytes; what came of it, in words."""
     adapter, tables, good = heard(name, emulated, options)
     counters, size = BusCounters(), adapter.payload_size
-    stream = made(native.library(), adapter.framing, size, counters)
+    stream = made(adapter.framing, size, counters)
     batch = FrameBatch(_ROWS, size)
     fed = 0
     with hand_clock() as clock:
@@ -138,8 +137,6 @@ def main() -> None:
     parser.add_argument("--bytes", type=int, default=10_000_000, help="of each")
     parser.add_argument("--seed", type=int, metavar="N", help="the same bytes each time")
     arguments = parser.parse_args()
-    if why_python():
-        sys.exit(f"there is nothing in C to compare with: {why_python()}")
     seed = time.time_ns() if arguments.seed is None else arguments.seed
     try:
         for told in arguments.names:

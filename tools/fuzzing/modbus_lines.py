@@ -25,8 +25,8 @@ sys.path.insert(0, str(ROOT))
 
 def fuzz(n_bytes: int, rng: random.Random) -> None:
     """Until so many bytes were heard by each of the three."""
-    from skinware_drivers.testing.both_paths import hand_clock
     from tests.modbus import fuzzing
+    from tests.specification.both_paths import hand_clock
 
     heard = frames = runs = in_c = 0
     with hand_clock() as clock:
@@ -52,8 +52,8 @@ def main() -> int:
     os.environ["SKINWARE_NAMESPACE"] = f"fuzz-modbus-{os.getpid()}"
     logging.getLogger("skinware").addHandler(logging.NullHandler())
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.testing.both_paths import hand_clock
     from tests.modbus import fuzzing
+    from tests.specification.both_paths import hand_clock
 
     Namespace().create()
     try:

@@ -17,15 +17,13 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-import skinware.native
 from skinware.memory.namespace import Namespace
-from skinware_drivers import native
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.testing.defect import require
-from skinware_drivers.testing.one_path import Marking, NativeWay, NumpyWay, Publishing, Way
 from skinware_drivers.virtual.hand_clock import HandClock, package_on
+from tests.specification.one_path import Marking, NativeWay, NumpyWay, Publishing, Way
 
 
 class Pair:
@@ -44,7 +42,6 @@ class Pair:
         payload_size: of the batch's rows; 0: what the layouts need.
 
     Attributes:
-        why_not: why there is nothing to compare with; empty if there is.
         frames: published so far.
     """
 
@@ -65,7 +62,6 @@ class Pair:
         self.clock = clock
         self.numpy = NumpyWay("numpy", *more)
         self.native = NativeWay("native", *more)
-        self.why_not: str = self.native.why_not
         self.frames = 0
         self._read_ns = 0
 
@@ -119,15 +115,15 @@ class Pair:
         return self.numpy.publisher.deadline_ns
 
     def do(self, action: Callable[[Way], object]) -> None:
-        before = self.numpy.publisher.sequence
+        before = self.numpy.publisher.writer.sequence
         told: list[list[str]] = []
         for way in self._both:
             with _listening() as lines:
                 action(way)
             told.append(sorted(lines))
         require(told[0] == told[1], f"numpy logs {told[0]}, C {told[1]}")
-        newest = self.numpy.publisher.sequence
-        sequence = self.native.publisher.sequence
+        newest = self.numpy.publisher.writer.sequence
+        sequence = self.native.publisher.writer.sequence
         require(sequence == newest, f"numpy has published {newest} frames, C {sequence}")
         for sequence in range(before + 1, newest + 1):
             _compare(self.numpy.frame(sequence), self.native.frame(sequence), f"frame {sequence}, ")
@@ -178,7 +174,7 @@ def hand_clock(begin_ns: int = 0) -> Iterator[HandClock]:
 def require_same(
     layout: Layout, tables: SkinTables, period_s: float, payload_size: int, frames: Sequence[tuple[int, int, bytes]]
 ) -> None:
-    """Fail the test unless both paths make the same of frames that come one by one; nothing where there is only one.
+    """Fail the test unless both paths make the same of frames that come one by one.
 
     Args:
         layout: of the only bus.
@@ -187,20 +183,12 @@ def require_same(
         payload_size: of the batch's rows.
         frames: (time_ns, identifier, payload) of each.
     """
-    if why_python():
-        return
     namespace = Namespace(f"both-paths-{os.getpid()}-{secrets.token_hex(4)}")
     publishing = Publishing(period_s)
     more: dict[str, Any] = {"rows": 1, "namespace": namespace, "payload_size": payload_size}
     try:
         with hand_clock() as clock, Pair(clock, [layout], tables, [period_s], publishing, **more) as pair:
-            require(not pair.why_not, f"C cannot do what this layout says: {pair.why_not}")
             for time_ns, identifier, payload in frames:
                 pair.feed([(0, time_ns, identifier, payload)])
     finally:
         shutil.rmtree(namespace.path, ignore_errors=True)
-
-
-def why_python() -> str:
-    """Why there is nothing to compare with on this machine; empty if there is."""
-    return native.why_python() or skinware.native.why_python()

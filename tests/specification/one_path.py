@@ -19,9 +19,10 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.native_path import NativePath, path_for
+from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
 from skinware_drivers.testing.defect import defect
+from tests.specification.publishing import SpecifiedPublisher
 
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
 _OF_STATE = (
@@ -34,7 +35,7 @@ _OF_STATE = (
     "bus_counters",
     "patch_counters",
 )
-_OF_PUBLISHER = ("group_heard_ns", "patch_heard_ns", "patch_lives_until_ns", "patch_state", "sequence")
+_OF_PATCHES = ("group_heard_ns", "heard_ns", "lives_until_ns", "state")
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ class Way:
         decoder, watch, publisher, desk: as the runner has them.
     """
 
+    publisher_class: type[Publisher] = Publisher
+
     def __init__(
         self,
         name: str,
@@ -133,7 +136,7 @@ class Way:
         self.reader = DriverReader(name, namespace=namespace)
         self.watch = watch(tables)
         self.desk = Asking() if publishing.has_desk else None
-        self.publisher = Publisher(
+        self.publisher = self.publisher_class(
             self.writer,
             self.decoder,
             self.watch,
@@ -142,7 +145,7 @@ class Way:
             self.desk,
             publishing.on_request,
         )
-        self.publisher.bus_counters = [BusCounters() for _ in layouts]
+        self.publisher.buses.counters = [BusCounters() for _ in layouts]
         longest = max((layout.payload_size for layout in layouts if layout is not None), default=8)
         self.batch = FrameBatch(rows, payload_size or longest, self.decoder.headroom)
 
@@ -163,18 +166,19 @@ class Way:
     def arrays(self) -> Arrays:
         decoder, state, publisher = self.decoder, self.decoder.state, self.publisher
         found: Arrays = {name: getattr(state, name) for name in _OF_STATE}
-        found |= {name: getattr(publisher, name) for name in _OF_PUBLISHER}
+        found |= {f"patches.{name}": getattr(publisher.patches, name) for name in _OF_PATCHES}
+        found["sequence"] = publisher.writer.sequence
         found |= {
             "last sequence numbers": decoder.sequences.last,
             "haste": decoder.haste,
             "unknown_identifiers": decoder.unknown_identifiers,
             "timing": publisher.timing.both,
             "timing, before_ns": publisher.timing.before_ns,
-            "bursts.pause_ns": publisher.bursts.pause_ns,
-            "bursts.gap_ns": publisher.bursts.gap_ns,
+            "bursts.pause_ns": publisher.pauses.pause_ns,
+            "bursts.gap_ns": publisher.pauses.gap_ns,
             "module_status": self.watch.module_status,
             "seen by the watch": repr(getattr(self.watch, "seen", None)),
-            "own counters": repr([read_own(counters) for counters in publisher.bus_counters]),
+            "own counters": repr([read_own(counters) for counters in publisher.buses.counters]),
             "desk": repr(vars(self.desk)) if self.desk is not None else "",
             "device clocks": repr(
                 [(patch, sorted(vars(clock).items())) for patch, clock in sorted(decoder.device_stamps.clocks.items())]
@@ -203,6 +207,9 @@ class Way:
 
 class NumpyWay(Way):
     """The specification."""
+
+    publisher_class = SpecifiedPublisher
+    publisher: SpecifiedPublisher
 
     def empty(self) -> None:
         self.decoder.put_back(self.batch)
@@ -235,13 +242,7 @@ class NativeWay(Way):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.path, self.why_not = path_for(self.decoder, self.publisher, self.batch)
-
-    @property
-    def _path(self) -> NativePath:
-        if self.path is None:
-            defect(f"there is no data path in C: {self.why_not}")
-        return self.path
+        self._path = NativePath(self.decoder, self.publisher, self.batch)
 
     def empty(self) -> None:
         self._path.empty()

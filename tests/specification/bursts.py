@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.decoding.skin_state import SkinState, Updates
+from skinware_drivers.running.publisher import BurstPauses, Pace
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 _NEVER = -1
 _BEFORE = 0
-_STANDS_OUT = 2.0  # a pause between bursts, against the mean spacing of a patch's modules
 _SIMILAR = 0.75  # what counts as such a pause again
 
 
@@ -31,7 +31,8 @@ class Bursts:
 
     Args:
         state: what is shown; its owner calls ``begin_frame`` after each publication.
-        period_ns: nominal time from burst to burst.
+        pauses: between bursts, learnt here.
+        pace: how long a burst may take.
         show: shows updates in ``state``.
         skip: told how many updates of each patch were skipped, (n_patches,) int64.
     """
@@ -39,20 +40,18 @@ class Bursts:
     def __init__(
         self,
         state: SkinState,
-        period_ns: int,
+        pauses: BurstPauses,
+        pace: Pace,
         show: Callable[[Updates], None],
         skip: Callable[[Indices], None],
     ) -> None:
         self._state = state
         self._group_patch = state.group_patch
         self._n_patches = len(state.patch_time_ns)
-        self.pause_ns: Indices = np.full(self._n_patches, period_ns // 2, np.int64)
+        self.pause_ns, self.standing_out_ns, self.gap_ns = pauses.pause_ns, pauses.standing_out_ns, pauses.gap_ns
         self._all_prompt = bool(state.is_prompt.all())
-        n_prompt = np.bincount(self._group_patch[state.is_prompt], minlength=self._n_patches)
-        self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * period_ns / np.maximum(1, n_prompt)
         self._first_group = np.searchsorted(self._group_patch, np.arange(self._n_patches))
-        self.gap_ns: Indices = np.zeros(len(self._group_patch), np.int64)  # before the last update of each group
-        self._longest_pause_ns = period_ns // 2
+        self._longest_pause_ns = pace.pause_ns
         self._show = show
         self._skip = skip
         self._left = 0  # publications of this take

@@ -10,22 +10,21 @@ from unittest.mock import patch
 
 import pytest
 
-from skinware.native import Library
-from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.serial import bus
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.native_stream import NativeStream, can_compile
 from skinware_drivers.serial.stream import PythonStream, Stream
-from skinware_drivers.testing.both_paths import Pair, hand_clock, why_python
+from skinware_drivers.testing import conformance
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.one_path import Publishing
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Heard
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
+from tests.specification.both_paths import Pair, hand_clock
+from tests.specification.one_path import Publishing
 
 
 class BothStreams(Stream):
@@ -97,10 +96,10 @@ def both_streams() -> Iterator[None]:
 
     What differs is raised where it is found, in the driver, and here again.
     """
-    library, streams = native.library(), list[Stream]()
+    streams = list[Stream]()
 
     def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Stream:
-        streams.append(made(library, framing, payload_size, counters))
+        streams.append(made(framing, payload_size, counters))
         return streams[-1]
 
     with patch.object(bus, "stream_of", stream_of):
@@ -113,7 +112,6 @@ def both_streams() -> Iterator[None]:
 
 
 def made(
-    library: Library | None,
     framing: Framing,
     payload_size: int,
     counters: BusCounters,
@@ -122,15 +120,14 @@ def made(
     """Both streams, or that of Python alone.
 
     Args:
-        library: the code in C, None: there is none.
         framing: what is on the line.
         payload_size: of bodies, at most.
         counters: of the bus.
         kind: of the stream in C.
     """
-    if library is None or not can_compile(framing):
+    if not can_compile(framing):
         return PythonStream(framing, payload_size, counters)
-    in_c = kind(library, framing, payload_size, deepcopy(counters))
+    in_c = kind(framing, payload_size, deepcopy(counters))
     return BothStreams(in_c, framing, payload_size, counters)
 
 
@@ -149,8 +146,6 @@ class PathTests(Suite):
 
         If they do not, that is a fault of Skinware's.
         """
-        if why_python():
-            pytest.skip(f"no data path in C: {why_python()}")
         with both_streams():
             heard, rig = self._hear(trouble)
         require(heard.takes, "the devices sent nothing")
@@ -168,7 +163,6 @@ class PathTests(Suite):
                 payload_size=adapter.payload_size,
             ) as pair,
         ):
-            require(not pair.why_not, f"C cannot do what this layout says: {pair.why_not}")
             for take in heard.takes:
                 pair.pass_to(take.now_ns)
                 pair.feed_rows(take.wire, take.time_ns)
@@ -193,3 +187,7 @@ class PathTests(Suite):
                 return heard, rig
 
         return play(scenario)
+
+
+class DriverConformance(PathTests, conformance.DriverConformance):
+    """The suite for drivers, and the comparison of both paths."""

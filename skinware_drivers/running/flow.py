@@ -86,15 +86,15 @@ class Flow:
         fail: Callable[[BaseException], None],
     ) -> None:
         self._generation, self._path = generation, generation.path
-        path = self._path
         self._lines, self._batch = generation.lines, generation.batch
         self._latency_s = latency_s
         self._take, self._fail = take, fail
         self._flow = structs.Flow(epoll_fd=epoll_fd)
         self._sources = (structs.Source * 0)()
         self._handed: list[tuple[BusLine, KernelBus, structs.Source]] = []
-        path.sort_out, path.lose, path.heard = self._sort_out, self._lose, self._heard
-        path.damaged = self._keep_sample
+        listeners = self._path.listeners
+        listeners.sort_out, listeners.lose = self._sort_out, self._lose
+        listeners.heard, listeners.damaged = self._heard, self._keep_sample
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, for so long at the most."""

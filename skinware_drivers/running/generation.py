@@ -100,7 +100,7 @@ class Generation:
         self.publisher.buses.counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
         self.path = NativePath(self.decoder, self.publisher, self.batch)
-        self.path.hear, self.path.offer = self._hear, self._offer
+        self.path.listeners.hear, self.path.listeners.offer = self._hear, self._offer
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
@@ -122,8 +122,8 @@ class Generation:
 
     def announce_waits(self) -> None:
         """Say which frames are waited for; before each call of C."""
-        self.path.expects_data = any(line.link.expects_data for line in self.lines)
-        self.path.awaited = [wanted for line in self.lines for wanted in line.link.awaited]
+        expects_data = any(line.link.expects_data for line in self.lines)
+        self.path.announce_waits(expects_data, [wanted for line in self.lines for wanted in line.link.awaited])
 
     def _hear(self, rows: Rows) -> None:
         for line, own in zip(self.lines, split_by_bus(self.batch, rows, len(self.lines)), strict=True):

@@ -116,8 +116,7 @@ def test_a_node_that_boots_is_configured_at_once_and_alone(stage: Stage, caplog:
 def test_errors_make_a_node_suspect_until_they_are_over(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
     for code in (0x4210, 0x4210, 0x4210):
         stage.do("report_error", 5, code)
-    frame = stage.read(lambda f: bool(f.status[0]))
-    assert frame.status.tolist() == [SUSPECT] * 16 + [0] * 16
+    stage.read(lambda f: f.status.tolist() == [SUSPECT] * 16 + [0] * 16)  # on a busy machine others are stale before
     stage.do("report_error", 5, 0)
     stage.read(lambda f: not f.status.any())
     assert caplog.text.count("node 5 reports an error: Temperature (code 4210)") == 1

@@ -29,6 +29,7 @@ print(json.dumps(paper_run.COLUMNS))
 """
 
 
+@pytest.mark.thorough
 def test_the_papers_experiment_writes_one_row_per_trial(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     modes = ["asap", "skin", *(["c asap", "c skin"] if shutil.which("cc") else [])]

@@ -160,11 +160,3 @@ def test_a_library_older_than_its_sources_is_compiled_again(project: Path, compi
     os.utime(compiling, (earlier_s, earlier_s))
     assert installs(project)
     assert not installs(project)
-
-
-def test_what_cannot_be_compiled_is_not_tried_each_time(project: Path) -> None:
-    done = prepare(project, compiler="no-such-compiler")
-    assert done.stderr.splitlines()[-1].startswith("the native data path is not compiled: Python runs instead")
-    assert prepare(project, compiler="no-such-compiler").stderr == ""
-    assert installs(project)  # there is a compiler, but what it needs is missing
-    assert not installs(project)

@@ -84,7 +84,7 @@ def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], 
             driver.wait_for("ready")
             with DriverReader("roboskin") as reader:
                 frames = reader.in_order(timeout_s=60)
-                for _ in range(200):
+                for _ in range(100):
                     check_no_torn_module(next(frames))
                 emulator.stop()  # first: what it loses while the driver stops, nobody would count
                 read_until(reader, is_silent)
@@ -94,9 +94,10 @@ def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], 
     both = len(halves) - len(set(halves))
     orphans = sum(patch["orphans"] for patch in stopped["patches"])
     late = sum(patch["late"] for patch in stopped["patches"])
-    assert len(halves) > 50
-    # at the very end, a burst can be cut; and so it is when a board is set up anew (see above)
-    assert len(halves) - 2 * both - 6 <= orphans - 2 * late <= len(halves) - 2 * both + 2
+    assert len(halves) > 25
+    # at the very end, a burst can be cut; and so it is when a board is set up again (see above). A late cycle may hide a
+    # lost half: only a starved emulator sends one
+    assert len(halves) - 2 * both - 6 - late <= orphans - 2 * late <= len(halves) - 2 * both + 2 + late
 
 
 def test_a_dead_board_beside_a_living_one(vcan: Callable[[], str]) -> None:
@@ -134,7 +135,6 @@ def test_link_down_and_up_and_interface_deleted_and_made_again(vcan: Callable[[]
                 assert back.generation == frame.generation
 
 
-@pytest.mark.quick
 def test_a_killed_driver_and_its_restart_with_the_reader_kept(vcan: Callable[[], str]) -> None:
     bus = vcan()
     # idle: who is pressed while a board is set up again reads out of range once the press ends

@@ -150,6 +150,7 @@ def test_no_permission_is_one_line(file: Path, tmp_path: Path) -> None:
         assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("package", "format_name"), [("h5py", "hdf5"), ("pyarrow", "parquet"), ("pyarrow", "lerobot")])
 def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: str, format_name: str) -> None:
     code = f"import sys; sys.modules[{package!r}] = None\nfrom skinware.cli.convert import main; main()"

@@ -7,12 +7,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from skinware import Namespace, ServiceWriter, native
-from skinware.memory import ring_writer
+from skinware import Namespace, ServiceWriter
 from skinware.realtime import now_ns
 from skinware.views import live
 from skinware.views.live import LiveDriver, LiveDrivers
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
+from tests.specification import ring
 
 
 @pytest.fixture(autouse=True)
@@ -88,10 +88,10 @@ def test_what_cannot_be_read_any_more_is_dropped() -> None:
 
 
 def test_two_frames_at_once_right_after_a_start_make_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "core", lambda: None)  # C has a clock of its own
+    ring.use_specification(monkeypatch)  # C has a clock of its own
     with FakeSkin("a", slots=8) as skin, closing(LiveDrivers(Namespace())) as drivers:
         clock_ns = now_ns()
-        monkeypatch.setattr(ring_writer, "now_ns", lambda: clock_ns)
+        monkeypatch.setattr(ring, "now_ns", lambda: clock_ns)
         skin.publish()
         clock_ns += 44_000
         skin.publish()

@@ -142,6 +142,7 @@ def test_services_that_are_no_drivers_are_read_too(any_program: Path) -> None:
 # -- coherency ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slots", [2, 3, 8])
 @pytest.mark.parametrize("way", ["copy", "view"])
 def test_no_torn_frame_from_a_writer_flat_out(program: Path, slots: int, way: str) -> None:

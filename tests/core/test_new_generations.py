@@ -14,7 +14,7 @@ from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, StructureChanged
 from skinware.memory import file_layout, ring_writer, segments
 from skinware.memory.ring_reader import RingReader
-from skinware.service import _ownership
+from skinware.service import _attachment, _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
 from tests.specification import ring as specification
@@ -173,7 +173,8 @@ def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(monkeypat
     from skinware import threads
     from skinware.errors import Overrun
 
-    copy = RingReader.copy
+    reader_class = vars(_attachment)["RingReader"]
+    copy = reader_class.copy
     overruns = iter([True] * 3)
 
     def sometimes(self: RingReader[Sample], sequence: int | None = None) -> Sample | None:
@@ -182,7 +183,7 @@ def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(monkeypat
         frame: Sample | None = copy(self, sequence)
         return frame
 
-    monkeypatch.setattr(RingReader, "copy", sometimes)
+    monkeypatch.setattr(reader_class, "copy", sometimes)
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)

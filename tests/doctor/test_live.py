@@ -33,6 +33,7 @@ Skins = Callable[..., EmulatedSkin]
 DRIVERS = sorted(entry_points(group="skinware.drivers").names)
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(150)
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_nothing_is_wrong_with_emulated_hardware(driver: str) -> None:

@@ -538,6 +538,7 @@ def test_every_pad_has_a_place(model: str, side: str) -> None:
     assert len({tuple(place) for place in adapter.geometry.position_m.tolist()}) == len(adapter.geometry)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("namespace")
 @pytest.mark.parametrize("name", FUZZED)
 def test_random_frames_raise_nothing_and_c_does_with_them_what_numpy_does(name: str) -> None:

@@ -57,6 +57,7 @@ def test_the_table_names_every_driver() -> None:
     assert sorted({row.driver for row in _rows()}) == sorted(registered(DRIVERS))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("row", _rows(), ids=lambda row: f"{row.driver}-{row.kind}")
 def test_the_row_is_what_is_shown(row: Row) -> None:
     suite = _suite(row.driver)

@@ -85,6 +85,7 @@ def _compare_old(device: Device, made: dict[tuple[int, int], BoardSetUp]) -> Non
         assert tact_setup_2[1:7] == bytes(old[key] for key in keys)
 
 
+@pytest.mark.thorough
 @needs_robots
 @of_each_robot
 @pytest.mark.parametrize("forearm", ["V2", "mesh", "nomesh"])

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from skinware_drivers.modbus import bus
-from skinware_drivers.modbus.master import Master
+from skinware_drivers.modbus.bus import ModbusBus
 from tests.modbus.peers import rtu_server, tcp_server
 
 
@@ -15,7 +14,8 @@ from tests.modbus.peers import rtu_server, tcp_server
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Which master asks while all is well."""
     if request.param == "python":
-        monkeypatch.setattr(bus, "NativeMaster", Master)
+        monkeypatch.setattr(ModbusBus, "reads_natively", False)
+        monkeypatch.setattr(ModbusBus, "hand_over", lambda *_: False)
     return str(request.param)
 
 

@@ -36,6 +36,7 @@ def devices(emulator: str, wire: str) -> Iterator[str]:
         yield f"udp://:{port}" if wire == "udp" else f"{where}://{LOCAL}:{port}"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("wire", "driver", "emulator", "options"),
     [

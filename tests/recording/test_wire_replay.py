@@ -105,6 +105,7 @@ def require_equal(
     assert compared.compared >= 10
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_every_driver_decodes_its_wire_to_the_same_values(tmp_path: Path, driver: str) -> None:
     kind, options = load_driver(driver), OPTIONS.get(driver, {})

@@ -127,6 +127,7 @@ def test_a_frame_holds_whole_bursts_of_drifting_boards(
     check_bursts(monkeypatch, clocks, cuts, {})
 
 
+@pytest.mark.thorough
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     clocks=st.tuples(*[senders(30)] * 3),

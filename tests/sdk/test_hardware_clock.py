@@ -38,6 +38,7 @@ def convert(clock: HardwareClock, hardware: Stamps, software: Stamps, batch: int
     return np.concatenate(parts)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("drift", [0.0, 2e-4, -2e-4])
 @pytest.mark.parametrize("batch", [1, 64])
 def test_stamps_are_far_better_than_the_kernels(drift: float, batch: int) -> None:

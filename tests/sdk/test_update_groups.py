@@ -114,6 +114,7 @@ THERMOMETERS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("by_cycle", [True, False])
 @pytest.mark.parametrize("where", THERMOMETERS)
 def test_a_slow_thermometer_is_fresh_until_three_of_its_own_periods(played: Played, where: str, by_cycle: bool) -> None:

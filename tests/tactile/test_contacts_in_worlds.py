@@ -43,6 +43,7 @@ def contacts_in(world: World, until_s: float) -> list[tuple[float, ContactSet]]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(20))
 def test_two_fingers_pass_each_other_and_keep_their_identities(seed: int) -> None:
     response = Response(width_m=0.004, sag=0.2, remainder=0.2)

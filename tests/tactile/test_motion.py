@@ -108,6 +108,7 @@ def strokes(seed: int) -> tuple[World, npt.NDArray[np.float64], float]:
     return world, velocity, 2.9
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(20))
 def test_a_stroke_through_noise_is_told(seed: int) -> None:
     world, velocity, end_s = strokes(seed)

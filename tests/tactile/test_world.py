@@ -380,6 +380,7 @@ def test_nonsense_is_refused_in_words(make: object, words: str) -> None:
         make()  # type: ignore[operator]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0])
 @pytest.mark.parametrize("drift", ["slow", "fast"])
 def test_the_bench_is_what_it_says(drift: str, rate_hz: float) -> None:

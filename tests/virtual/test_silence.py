@@ -28,6 +28,7 @@ def _kinds_sent(devices: Emulator[Any] | EmulatedRoboskin, until_ns: int) -> set
     return {devices.kind_of(frame.identifier, frame.payload) for frame in devices.emit(until_ns)}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(registered(EMULATORS)))
 def test_a_kind_falls_silent_at_its_time_and_no_other_does(name: str) -> None:
     usual = _powered_up(name)

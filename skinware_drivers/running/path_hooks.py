@@ -17,7 +17,7 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.path_plan import Exchange
+from skinware_drivers.running.path_plan import SharedArrays
 from skinware_drivers.running.publisher import Publisher
 
 Rows = npt.NDArray[np.int64]
@@ -65,7 +65,7 @@ class PathHooks:
         batch: FrameBatch,
         rows: structs.Batch,
         words: structs.Words,
-        exchange: Exchange,
+        exchange: SharedArrays,
     ) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self._rows, self._words, self._exchange = rows, words, exchange

@@ -14,7 +14,7 @@ from skinware_drivers.running.publisher import Publisher
 SKIPPED = OWN_BUS_COUNTERS.index("updates_skipped")
 
 
-class Exchange:
+class SharedArrays:
     """Arrays through which Python and C tell each other what changes between two calls.
 
     Attributes:
@@ -32,10 +32,10 @@ class Exchange:
         self.sample_next_ns = np.zeros((n_buses, len(Unused) + 1), np.int64)
 
 
-def compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs.Arrays) -> Exchange:
+def compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs.Arrays) -> SharedArrays:
     """Fill in what a plan says of publishing."""
     pauses, patches, buses, pace = publisher.pauses, publisher.patches, publisher.buses, publisher.pace
-    exchange = Exchange(publisher.watch, len(buses.counters))
+    exchange = SharedArrays(publisher.watch, len(buses.counters))
     plan.period_ns, plan.silence_ns, plan.patience_ns = pace.period_ns, pace.silence_ns, pace.patience_ns
     plan.pause_ns, plan.idle_ns = pace.pause_ns, pace.idle_ns
     plan.by_cycle, plan.most_at_once = publisher.by_cycle, publisher.writer.slots

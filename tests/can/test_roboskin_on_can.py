@@ -95,8 +95,8 @@ def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], 
     orphans = sum(patch["orphans"] for patch in stopped["patches"])
     late = sum(patch["late"] for patch in stopped["patches"])
     assert len(halves) > 25
-    # at the very end, a burst can be cut, and when a board is set up again (see above). A late cycle may hide a lost half:
-    # only a starved emulator sends one
+    # a burst can be cut at the very end, and when a board is set up again (see above); a late cycle, which only a
+    # starved emulator sends, may hide a lost half
     assert len(halves) - 2 * both - 6 - late <= orphans - 2 * late <= len(halves) - 2 * both + 2 + late
 
 

@@ -71,7 +71,7 @@ _BY_REASON = {
         ("ip -details -statistics link show {channel}",),
     ),
     "no-acknowledgement": _Advice(
-        "nobody acknowledges what is sent",
+        "no node acknowledges what is sent",
         "check power, cable and bit rate: no other node is awake on the wire",
         ("ip -details link show {channel}",),
     ),

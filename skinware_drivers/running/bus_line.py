@@ -180,7 +180,7 @@ class BusLine:
         was_there = self.opened_ns
         await self._open_bus()
         self._is_open()
-        self._news.tell(f"bus {self.name} is {'back' if was_there else 'there'}")
+        self._news.log(f"bus {self.name} is {'back' if was_there else 'there'}")
 
     def _is_away(self, error: Exception) -> None:
         if self._opening is not None:
@@ -190,7 +190,7 @@ class BusLine:
         else:
             state, reason = BusState.GONE, BusReason.FAILED
         if self._become(state, reason):
-            self._news.tell(f"{error}; waiting for it to {'come back' if self.opened_ns else 'appear'}")
+            self._news.log(f"{error}; waiting for it to {'come back' if self.opened_ns else 'appear'}")
 
     @property
     def is_in_order(self) -> bool:
@@ -252,15 +252,15 @@ class BusLine:
     def _tell(self, state: BusState, reason: BusReason) -> None:
         if self.reason == BusReason.NOTHING_HEARD:
             if state == BusState.LIVE and self._has_spoken:
-                self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
+                self._news.log(f"bus {self.name}: {WORDS[self.reason]}")
         elif self.reason:
             if self.reason != reason:
-                self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
+                self._news.log(f"bus {self.name}: {WORDS[self.reason]}")
         elif reason == BusReason.NOTHING_HEARD:
             if self._has_spoken:
-                self._news.tell(f"bus {self.name}: frames come again")
+                self._news.log(f"bus {self.name}: frames come again")
         elif reason:
-            self._news.tell(f"bus {self.name}: in order again (was {reason_text(reason)})")
+            self._news.log(f"bus {self.name}: in order again (was {reason_text(reason)})")
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
         """Ask what is attached to it, for as long as it takes.
@@ -304,7 +304,7 @@ class BusLine:
                     with hook("start", self.name):
                         await self.adapter.start(self.link)
             except BusError as error:
-                self._news.tell(f"{self.name}: set-up failed: {error}; trying again")
+                self._news.log(f"{self.name}: set-up failed: {error}; trying again")
                 self._check(now_ns())
             else:
                 self.set_up_ns = self._speaks_from_ns = now_ns()
@@ -335,7 +335,7 @@ class BusLine:
         self._let_go()
         self.patches = self.patches or ()
         self._become(BusState.DOWN, BusReason.SET_ASIDE)
-        self._news.tell(f"{error}; bus {self.name} is set aside, and tried again later")
+        self._news.log(f"{error}; bus {self.name} is set aside, and tried again later")
 
     async def stop(self) -> None:
         """Make its devices silent, if they may have been told to send and it can be done now.

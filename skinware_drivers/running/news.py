@@ -20,28 +20,28 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 LINES_AT_ONCE = 5
 """Lines about one bus before it has to be brief."""
 LINE_EVERY_S = 10.0
-"""From then on there is one line in this time, as long as there is anything to tell."""
+"""Afterwards one line in this time, as long as the bus keeps changing."""
 
 WORDS = {
     BusReason.NOTHING_HEARD: "nothing is heard any more",
     BusReason.BUS_OFF: "bus-off: the controller met too many errors and left the wire (short circuit, another bit"
     " rate?); it is back by itself if restart-ms is set, else after: ip link set INTERFACE type can restart",
-    BusReason.ERROR_PASSIVE: "error-passive: many errors (bad wires, another bit rate, nobody else on the wire?)",
+    BusReason.ERROR_PASSIVE: "error-passive: many errors (bad wires, another bit rate, no other node on the wire?)",
     BusReason.ERROR_WARNING: "error-warning: more errors than there should be (termination, wires?)",
     BusReason.OVERFLOW: "the controller lost frames: this machine did not fetch them in time",
-    BusReason.NO_ACKNOWLEDGEMENT: "nobody acknowledges what is sent (wires, power, another bit rate?)",
+    BusReason.NO_ACKNOWLEDGEMENT: "no node acknowledges what is sent (wires, power, another bit rate?)",
     BusReason.BUS_ERRORS: "broken frames are heard (another bit rate, termination, wires?)",
 }
-"""What a reason means, for people; the others come with words of their own."""
+"""The meaning of each reason, for people; the other reasons come with an error of their own."""
 
 
 def reason_text(reason: BusReason) -> str:
-    """A reason's name as people write it: ``bus-off``."""
+    """Return a reason's name as people write it: ``bus-off``."""
     return reason.name.lower().replace("_", "-")
 
 
-class Allowance:
-    """How often something may be told: a few times at once, then now and then.
+class LineLimit:
+    """Limits log lines: a few at once, then one in a while.
 
     Args:
         clock: CLOCK_MONOTONIC ns.
@@ -54,7 +54,7 @@ class Allowance:
         self._free_at_ns = clock() - self._savings_ns
 
     def take(self) -> bool:
-        """Whether a line may be told now; it then is."""
+        """Return whether a line may be logged now, and count it."""
         time_ns = self._clock()
         if time_ns < self._free_at_ns:
             return False
@@ -63,46 +63,46 @@ class Allowance:
 
 
 class BusNews:
-    """What is told of one bus, with a limit.
+    """Logs the changes of one bus, with a limit.
 
-    The last change of a burst is always told, late if need be, with the number of those before it that were not.
+    The last change of a burst is always logged, if only later, with the number of changes that were left out.
 
     Args:
         clock: CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, clock: Callable[[], int] = now_ns) -> None:
-        self._allowance = Allowance(clock)
-        self._untold = ""
-        self._kept_back = 0
+        self._limit = LineLimit(clock)
+        self._pending = ""
+        self._left_out = 0
 
-    def tell(self, text: str) -> None:
-        if self._untold:
-            self._kept_back += 1
-        self._untold = text
+    def log(self, text: str) -> None:
+        if self._pending:
+            self._left_out += 1
+        self._pending = text
         self.catch_up()
 
     def catch_up(self) -> None:
-        """Tell what was kept back, if its time has come; to be called now and then."""
-        if not self._untold or not self._allowance.take():
+        """Log the pending change if the limit allows it; to be called regularly."""
+        if not self._pending or not self._limit.take():
             return
-        before = f" ({self._kept_back} changes before this one were not told)" if self._kept_back else ""
-        log.warning("%s%s", self._untold, before)
-        self._untold, self._kept_back = "", 0
+        before = f" ({self._left_out} changes before this one were not logged)" if self._left_out else ""
+        log.warning("%s%s", self._pending, before)
+        self._pending, self._left_out = "", 0
 
 
 _SETTLED_NS, _LONGEST_NS = NS_PER_S // 5, NS_PER_S
-"""What changes within a moment of the change before is told with it, at the latest after a second."""
+"""Changes that follow each other within the first are logged together, at the latest after the second."""
 _MOST_NAMES = 6
 
 
 class PatchChange(NamedTuple):
-    """What changed on a bus since it was last told.
+    """The changes of a bus since its last log line.
 
     Attributes:
         bus: its name.
         silent: names of the patches that fell silent.
-        live: names of those that are live again, if only after a moment.
+        live: names of the patches that are live again.
     """
 
     bus: str
@@ -119,7 +119,7 @@ class PatchChange(NamedTuple):
 
 
 class PatchNews:
-    """What is told of the patches of one bus, with the limit that the news of a bus have.
+    """Logs the changes of the patches of one bus, with the limit of :class:`BusNews`.
 
     Args:
         bus: its name.
@@ -129,8 +129,8 @@ class PatchNews:
     def __init__(self, bus: str, clock: Callable[[], int] = now_ns) -> None:
         self._bus = bus
         self._clock = clock
-        self._allowance = Allowance(clock)
-        self._is_live: dict[str, bool] = {}  # of patches that changed since it was last told
+        self._limit = LineLimit(clock)
+        self._is_live: dict[str, bool] = {}  # patches that changed since the last line
         self._changes = 0
         self._first_ns = self._last_ns = 0
 
@@ -143,16 +143,16 @@ class PatchNews:
         self._is_live[patch] = is_live
 
     def catch_up(self) -> PatchChange | None:
-        """Tell what has changed, if its time has come; to be called now and then. What was told."""
+        """Log and return the changes once they have settled; to be called regularly."""
         if not self._changes:
             return None
         settled_ns = min(self._last_ns + _SETTLED_NS, self._first_ns + _LONGEST_NS)
-        if self._clock() < settled_ns or not self._allowance.take():
+        if self._clock() < settled_ns or not self._limit.take():
             return None
         by_state = {state: [name for name, now in self._is_live.items() if now is state] for state in (False, True)}
         change = PatchChange(self._bus, by_state[False], by_state[True])
-        untold = self._changes - len(self._is_live)
-        log.warning("%s%s", change, f" (changes not told before: {untold})" if untold else "")
+        left_out = self._changes - len(self._is_live)
+        log.warning("%s%s", change, f" (changes not logged before: {left_out})" if left_out else "")
         self._is_live, self._changes = {}, 0
         return change
 
@@ -177,7 +177,7 @@ _MUCH = 1.6
 class Doubles:
     """Compares how many updates each patch sends with how many its period allows.
 
-    Frames of two devices with one identifier, and one counter if they have any, cannot be told apart one by one.
+    Single frames of two devices with one identifier look alike; their number gives them away.
 
     Args:
         structure: what is in service.
@@ -194,7 +194,7 @@ class Doubles:
         self._windows = np.zeros(structure.n_patches, np.int64)
 
     def look(self, updates: npt.NDArray[np.int64]) -> list[tuple[int, float]]:
-        """Look at what was counted, as often as one likes.
+        """Compare the counts of the last window; may be called at any time.
 
         Args:
             updates: (n_patches,) int64, updates of each patch so far.
@@ -213,11 +213,11 @@ class Doubles:
 
 
 HIGH_LOAD = 0.8
-"""Of what the wire can carry. Beyond it, frames of low priority wait for long."""
+"""Share of the wire's time beyond which frames of low priority wait for long."""
 FULL = 0.9
 """From here on they may wait indefinitely: how many bits a frame takes is an estimate."""
 HIGH_FILL = 0.5
-"""Of the receive buffer."""
+"""Share of the receive buffer."""
 SOFTNET = Path("/proc/net/softnet_stat")
 _LOOK_PAUSE_NS = NS_PER_S
 TROUBLESHOOTING = 'see "Troubleshooting" in the documentation'
@@ -254,7 +254,7 @@ class BusLimits:
         self._looked_ns = clock()
         self._bits = bus.wire_bits
         self._lost = bus.counters.lost
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self.load: float | None = None
         self.load_from_ns = 0
 
@@ -268,12 +268,14 @@ class BusLimits:
         self.load = share_of_time(bus, bits, passed_ns)
         fill, bus.fullest = bus.fullest, 0.0
         if self.load is not None and self.load > HIGH_LOAD:
-            self._tell("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
+            self._log_once("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
         if fill > HIGH_FILL:
-            self._tell("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time")
+            self._log_once(
+                "fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time"
+            )
         if bus.counters.lost > self._lost:
             lost = bus.counters.lost - self._lost
-            self._tell("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+            self._log_once("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
 
     @property
     def is_full(self) -> bool:
@@ -291,17 +293,17 @@ class BusLimits:
             return LOAD_FILTERED if self._bus.narrows else LOAD_UNKNOWN
         return max(1, round(1000 * self.load))
 
-    def _tell(self, what: str, text: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
+    def _log_once(self, what: str, text: str) -> None:
+        if what not in self._logged:
+            self._logged.add(what)
             log.warning("bus %s: %s; logged once, %s", self._name, text, TROUBLESHOOTING)
 
 
 class MachineLimits:
-    """What this machine as a whole lost: no socket and no bus knows of it.
+    """Counts the packets that this machine dropped before any socket saw them.
 
     Packets of *all* network interfaces wait for a processor in a queue (``net.core.netdev_max_backlog``) before they
-    reach sockets; CAN frames too. What does not fit is only counted in /proc/net/softnet_stat, for the machine.
+    reach sockets; CAN frames too. The kernel counts those that do not fit in /proc/net/softnet_stat.
 
     Args:
         source: the file to read.
@@ -339,7 +341,7 @@ class MachineLimits:
 
 
 def softnet_dropped(source: Path = SOFTNET) -> int | None:
-    """Packets that this machine has dropped before any socket saw them; None where the kernel does not tell."""
+    """Return the packets that this machine has dropped before any socket saw them; None where the kernel does not say."""
     try:
         return sum(int(row.split()[1], 16) for row in source.read_text().splitlines())
     except (OSError, ValueError, IndexError):  # no such file, or of another form

@@ -323,7 +323,7 @@ def test_a_bus_that_comes_and_goes_for_an_hour_fills_no_log(caplog: pytest.LogCa
     news = BusNews(clock)
     with caplog.at_level(logging.WARNING):
         for number in range(36_000):
-            news.tell(f"bus can0: change {number}")
+            news.log(f"bus can0: change {number}")
             clock.pass_s(0.1)
         clock.pass_s(LINE_EVERY_S)
         news.catch_up()
@@ -342,10 +342,10 @@ def test_a_quiet_bus_may_speak_at_length_again(caplog: pytest.LogCaptureFixture)
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             for number in range(LINES_AT_ONCE):
-                news.tell(f"bus can0: {number}")
+                news.log(f"bus can0: {number}")
             clock.pass_s(LINES_AT_ONCE * LINE_EVERY_S)
     assert len(told(caplog, "bus can0")) == 3 * LINES_AT_ONCE
-    assert "were not told" not in caplog.text
+    assert "were not logged" not in caplog.text
 
 
 def test_a_flapping_bus_of_a_running_driver_is_told_of_a_few_times(

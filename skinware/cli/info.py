@@ -174,7 +174,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
 
 
 def _path_lines(driver: dict[str, Any]) -> list[str]:
-    names = ", ".join(bus["name"] for bus in driver["buses"] if bus["data_path"] == "python")
+    names = ", ".join(bus["name"] for bus in driver["buses"] if bus.get("data_path") == "python")
     parts = [f"Python receives the frames of {names}"] if names else []
     if driver["latency_ms"]:
         parts.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")

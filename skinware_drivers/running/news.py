@@ -270,9 +270,7 @@ class BusLimits:
         if self.load is not None and self.load > HIGH_LOAD:
             self._log_once("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
         if fill > HIGH_FILL:
-            self._log_once(
-                "fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time"
-            )
+            self._log_once("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little time")
         if bus.counters.lost > self._lost:
             lost = bus.counters.lost - self._lost
             self._log_once("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
@@ -341,7 +339,7 @@ class MachineLimits:
 
 
 def softnet_dropped(source: Path = SOFTNET) -> int | None:
-    """Return the packets that this machine has dropped before any socket saw them; None where the kernel does not say."""
+    """Return the packets that this machine dropped before any socket saw them; None where the kernel does not say."""
     try:
         return sum(int(row.split()[1], 16) for row in source.read_text().splitlines())
     except (OSError, ValueError, IndexError):  # no such file, or of another form

@@ -101,9 +101,7 @@ def test_a_board_that_comes_and_goes_for_an_hour_fills_no_log(
     lines = told(caplog)
     assert lines[:2] == ["can0: board 8 fell silent", "can0: board 8 is live again"]
     assert len(lines) == len([change for change in changes if change]) <= LINES_AT_ONCE + 3600 / LINE_EVERY_S + 1
-    assert lines[-1].startswith(
-        "can0: board 8 is live again (changes not logged before: "
-    )  # the last word is never lost
+    assert lines[-1].startswith("can0: board 8 is live again (changes not logged before: ")
     kept_back = sum(int(line.rpartition(" ")[2].rstrip(")")) for line in lines if "(" in line)
     assert kept_back + len(lines) == 3600
 

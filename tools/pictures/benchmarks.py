@@ -31,7 +31,6 @@ GROUPS: dict[str, list[Bar]] = {
     "A driver of 768 sensors at 20 Hz, % of a core (less is better)": [
         Bar("a C loop that only receives", "0.44", 0.44),
         Bar("skinware", "0.75", 0.75, True),
-        Bar("skinware without C", "8.5", 8.5, True),
     ],
     "240,000 frames/s of 30 buses, % of a core (less is better)": [
         Bar("a C loop that only receives", "12.2", 12.2),
@@ -40,7 +39,6 @@ GROUPS: dict[str, list[Bar]] = {
     "A serial line of 3 Mbaud, % of a core (less is better)": [
         Bar("a C loop that only reads", "0.42", 0.42),
         Bar("skinware", "0.77", 0.77, True),
-        Bar("skinware, frames found in Python", "7.1", 7.1, True),
     ],
     "Age of 30,848 sensors when a reader has them, 100 Hz, µs (less is better)": [
         Bar("a C program of skinware.h", "49", 49),

@@ -17,8 +17,8 @@ from rich.text import Text
 
 from skinware._printable import printable
 from skinware.cli import _heat_map as heat
-from skinware.cli._format import figure_text
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
+from skinware.text import figure_text
 
 Colours = tuple[ColorTriplet, ...]
 _T = TypeVar("_T")

@@ -11,7 +11,7 @@ import numpy as np
 
 from skinware import bridge_state
 from skinware.cli import _bridges
-from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
+from skinware.cli._format import terminal_width, wrapped
 from skinware.cli._terminal import echo, print_json, style
 from skinware.driver_service import KIND, DriverReader
 from skinware.driver_snapshot import DriverSnapshot
@@ -27,6 +27,7 @@ from skinware.status import DataPath, load_report
 from skinware.tactile.health_report import HealthKind, HealthReport
 from skinware.tactile.health_service import KIND as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
+from skinware.text import age_text, count_text, plural, table
 from skinware.views.health import (
     bus_reason_name,
     bus_state_name,

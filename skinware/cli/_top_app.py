@@ -18,7 +18,7 @@ from textual.widgets import DataTable, Footer, Static
 from skinware._printable import printable
 from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
-from skinware.cli._format import NOT_FRESH, plural
+from skinware.cli._format import NOT_FRESH
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._painting import Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
@@ -26,6 +26,7 @@ from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.tactile.regions import Regions
+from skinware.text import plural
 from skinware.views.beside import LiveBridges, live_contacts, places_of
 from skinware.views.health import LIVE, life_of
 from skinware.views.live import LiveDrivers

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
+from skinware.cli._format import state_shown
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.structure import Structure
+from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text
 from skinware.views.health import (
     DEAD,
     LIVE,

@@ -19,20 +19,9 @@ from skinware.cli._command import (
     run,
     version_option,
 )
-from skinware.cli._format import (
-    NO_VALUE,
-    NOT_FRESH,
-    age_text,
-    count_text,
-    plural,
-    rate_text,
-    redraw,
-    state_shown,
-    table,
-    terminal_width,
-    wrapped,
-)
+from skinware.cli._format import NOT_FRESH, redraw, state_shown, terminal_width, wrapped
 from skinware.cli._terminal import echo, print_json, style
+from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text, table
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skinware._printable import printable
-from skinware.cli._format import age_text, plural
+from skinware.text import age_text, plural
 from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding

@@ -3,7 +3,8 @@ from __future__ import annotations
 import click
 import pytest
 
-from skinware.cli._format import age_text, count_text, plural, rate_text, table, wrapped
+from skinware.cli._format import wrapped
+from skinware.text import age_text, count_text, plural, rate_text, table
 
 
 @pytest.mark.parametrize(

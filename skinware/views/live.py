@@ -14,8 +14,8 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.state import SkinHealth, health_of
 from skinware.structure import Structure
-from skinware.views.health import SkinHealth, health_of
 
 _LOOK_EVERY_NS = NS_PER_S // 4
 _RATE_WINDOW_NS = 2 * NS_PER_S

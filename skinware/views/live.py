@@ -15,8 +15,8 @@ from skinware.drivers import Drivers
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
+from skinware.state import SkinHealth, health_of
 from skinware.structure import Structure
-from skinware.views.health import SkinHealth, health_of
 
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _SAMPLE_EVERY_NS = NS_PER_S // 10

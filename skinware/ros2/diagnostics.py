@@ -7,9 +7,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from skinware.conversion.ros_messages import Cdr
-from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
-from skinware.state import DEAD, LIVE, PAUSED, SILENT, SkinHealth, bus_reason_name, bus_state_name
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, DriverReport, bus_state_name
 from skinware.status import BusState
 from skinware.views.live import LiveDriver
 
@@ -42,21 +41,23 @@ class Status(NamedTuple):
 
 
 _OF_LIFE = {SILENT: Level.STALE, PAUSED: Level.WARN, DEAD: Level.ERROR}
-_OF_BUS = {int(BusState.LIVE): Level.OK, int(BusState.CONNECTING): Level.WARN, int(BusState.SILENT): Level.WARN}
+_OF_BUS = {
+    bus_state_name(BusState.LIVE): Level.OK,
+    bus_state_name(BusState.CONNECTING): Level.WARN,
+    bus_state_name(BusState.SILENT): Level.WARN,
+}
 
 
 def statuses(driver: LiveDriver) -> Iterator[Status]:
-    health, frame = driver.health(), driver.frame
-    yield Status(
-        _level(health, frame), f"skin: {driver.name}", _in_words(health), driver.reader.driver_type, _values(health)
-    )
-    if frame is None or health.life != LIVE:
+    report = driver.report()
+    words = f"{report.fresh} of {report.sensors} sensors are fresh" if report.life == LIVE else report.life
+    kind = driver.reader.driver_type
+    yield Status(_level(report), f"skin: {driver.name}", words, kind, _values(report))
+    if report.life != LIVE:
         return
-    for name, state, reason in zip(
-        frame.structure.buses, frame.bus_state.tolist(), frame.bus_reason.tolist(), strict=True
-    ):
-        told = ": ".join(filter(None, (bus_state_name(state), bus_reason_name(reason))))
-        yield Status(_OF_BUS.get(state, Level.ERROR), f"skin: {driver.name}: {name}", told, name, {})
+    for bus in report.buses:
+        words = ": ".join(filter(None, (bus.state, bus.reason)))
+        yield Status(_OF_BUS.get(bus.state, Level.ERROR), f"skin: {driver.name}: {bus.name}", words, bus.name, {})
 
 
 def message(of: Iterable[Status], time_ns: int) -> bytes:
@@ -76,23 +77,18 @@ def message(of: Iterable[Status], time_ns: int) -> bytes:
     return cdr.done()
 
 
-def _level(health: SkinHealth, frame: DriverSnapshot | None) -> Level:
-    if health.life != LIVE or frame is None:
-        return _OF_LIFE.get(health.life, Level.WARN)
-    return Level.OK if health.statuses["fresh"] == health.sensors else Level.WARN
+def _level(report: DriverReport) -> Level:
+    if report.life != LIVE or report.age_ns is None:
+        return _OF_LIFE.get(report.life, Level.WARN)
+    return Level.OK if report.fresh == report.sensors else Level.WARN
 
 
-def _in_words(health: SkinHealth) -> str:
-    if health.life != LIVE:
-        return health.life
-    return f"{health.statuses['fresh']} of {health.sensors} sensors are fresh"
-
-
-def _values(health: SkinHealth) -> dict[str, str]:
-    values = {"state": health.life, "sensors": str(health.sensors)}
-    if health.rate_hz is not None:
-        values["rate_hz"] = f"{health.rate_hz:.1f}"
-    if health.age_ns is not None:
-        values["age_ms"] = f"{health.age_ns / NS_PER_S * 1e3:.1f}"
-    told = {**health.statuses, **{f"patches {state}": n for state, n in health.patches.items()}, **health.counters}
-    return values | {name: str(count) for name, count in told.items() if count}
+def _values(report: DriverReport) -> dict[str, str]:
+    values = {"state": report.life, "sensors": str(report.sensors)}
+    if report.rate_hz is not None:
+        values["rate_hz"] = f"{report.rate_hz:.1f}"
+    if report.age_ns is not None:
+        values["age_ms"] = f"{report.age_ns / NS_PER_S * 1e3:.1f}"
+    patches = {f"patches {state}": n for state, n in report.patch_states.items()}
+    counts = {**report.statuses, **patches, **report.counters}
+    return values | {name: str(count) for name, count in counts.items() if count}

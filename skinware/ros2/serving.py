@@ -229,6 +229,6 @@ class Ros2Server:
         live, topics = self._live.get(name), served.topics
         if live is None:
             return Told(GONE, 0.0, None, served.lost, topics.messages, topics.left_out)
-        health = live.health()
-        age_ms = None if health.age_ns is None else health.age_ns / 1e6
-        return Told(health.life, health.rate_hz, age_ms, served.lost, topics.messages, topics.left_out)
+        report = live.report()
+        age_ms = None if report.age_ns is None else report.age_ns / 1e6
+        return Told(report.life, report.rate_hz, age_ms, served.lost, topics.messages, topics.left_out)

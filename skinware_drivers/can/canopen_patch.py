@@ -23,7 +23,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout

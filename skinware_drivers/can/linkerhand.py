@@ -34,7 +34,7 @@ from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
 from skinware_drivers.conditions import Identifier
 from skinware_drivers.description import Patch, SkinTables

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin_boards import BoardOperations
 from skinware_drivers.can.roboskin_layout import (
     HEAD_BYTE,

@@ -208,7 +208,7 @@ def _can_data(
 ) -> dict[str, Any]:
     import msgspec
 
-    from skinware_drivers.can.interface import NO_CAN
+    from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.interfaces import NO_INTERFACE, kernel_has_can
 
     in_kernel = kernel_has_can()

@@ -33,10 +33,9 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Poll
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.delimited import HDLC, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.serial.stuffing import HDLC
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

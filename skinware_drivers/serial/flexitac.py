@@ -36,9 +36,8 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.framings import Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.serial.text_matrix import TextMatrix
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -12,11 +12,10 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch
 from skinware_drivers.serial.checksums import Checksum, Crc, Sum, Xor
+from skinware_drivers.serial.delimited import Cobs, Delimited, Escaped, Lines
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.packets import Length, LengthTable, Packet, Pattern, values_of
 from skinware_drivers.serial.stream import CHUNK, PythonStream, Stream
-from skinware_drivers.serial.stuffing import Cobs, Escaped, Lines
 
 _XOR, _SUM, _CRC_FROM_HIGH, _CRC_FROM_LOW = range(4)
 _PACKETS, _LINES, _COBS, _ESCAPED = range(4)

@@ -23,11 +23,10 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers, Refused
+from skinware_drivers.serial.adapter import Answers, Refused, SerialAdapter
 from skinware_drivers.serial.checksums import CRC32
+from skinware_drivers.serial.delimited import COBS, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     MAJOR,
@@ -39,7 +38,6 @@ from skinware_drivers.serial.openpatch_description import (
     Report,
     read_description,
 )
-from skinware_drivers.serial.stuffing import COBS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -24,7 +24,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.polling import Notice, Poll
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet

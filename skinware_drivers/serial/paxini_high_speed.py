@@ -33,7 +33,7 @@ from skinware_drivers.hand import Hand
 from skinware_drivers.layout import Flag, Frame, Identifier, Layout
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet

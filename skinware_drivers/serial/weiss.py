@@ -14,8 +14,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers
+from skinware_drivers.serial.adapter import Answers, SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet

@@ -37,7 +37,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch, ZeroWatch
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.stream import Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet

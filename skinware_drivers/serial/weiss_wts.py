@@ -31,7 +31,7 @@ from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier,
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
 

@@ -29,8 +29,7 @@ from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Senti
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers
+from skinware_drivers.serial.adapter import Answers, SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.packets import Length, Packet

@@ -19,11 +19,10 @@ from skinware_drivers.serial.checksums import (
     XOR,
     Sum,
 )
+from skinware_drivers.serial.delimited import COBS, HDLC, LINES, SLIP, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited, Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
-from skinware_drivers.serial.text_matrix import TextMatrix
 
 
 @dataclass(frozen=True)

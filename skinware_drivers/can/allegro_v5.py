@@ -191,8 +191,8 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         if (tips and pads) or doubled:
             what = " and ".join(f"{one:03X}" for one in sorted(tips | pads))
             raise BusError(
-                f"{link.bus_name}: {what} are heard, which no single hand sends: the values of two hands on one bus mix;"
-                " give each a bus of its own"
+                f"{link.bus_name}: {what} are heard, which no single hand sends: the values of two hands on one bus"
+                " mix; give each a bus of its own"
             )
         most = max((counted[one] for one in tips | pads), default=0)
         if most > _TWICE * self.options.learn_s / self.period_s + 1:

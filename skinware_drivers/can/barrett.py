@@ -134,7 +134,7 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
             await self.revive(link, patch)
 
     async def start(self, link: Link) -> None:
-        """Wait for a period, so that the data that answered ``configure`` is not taken for that of the first question."""
+        """Wait for a period, so that the answers to ``configure`` are not taken for those to the first question."""
         await link.sleep(self.period_s)
 
     async def probe(self, link: Link, patch: Patch) -> bool:

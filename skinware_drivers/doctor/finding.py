@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from skinware.cli._format import age_text, count_text, plural
 from skinware.errors import ConfigurationError
-from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.doctor.evidence import Counted, Evidence
 from skinware_drivers.operations import operations_of
 from skinware_drivers.registry import load_driver
@@ -145,7 +145,7 @@ def brief(bus_name: str) -> str:
 
 def _placed(bus_name: str) -> str:
     address, _, query = bus_name.partition("?")
-    placing = dict(place_of_bus(bus_name).options)
+    placing = dict(BusName.of(bus_name).place.options)
     kept = "&".join(part for part in query.split("&") if part.partition("=")[0] in placing)
     return f"{address}?{kept}" if kept else address
 
@@ -159,7 +159,7 @@ def typed(commands: Iterable[str], bus_name: str, driver: str = "") -> tuple[str
         bus_name: as the driver was told.
         driver: name of the driver.
     """
-    interface, channel, _ = place_of_bus(bus_name)
+    interface, channel, _ = BusName.of(bus_name).place
     names = {"driver": shlex.quote(driver)}
     names |= {} if interface in ("virtual", "replay") else {"name": shlex.quote(_placed(bus_name))}
     names |= {"channel": shlex.quote(channel)} if interface == "socketcan" else {}

@@ -11,7 +11,7 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.description import join_types
 from skinware_drivers.running.bus_line import BusLine
 
@@ -67,7 +67,7 @@ class BusChanges:
                     if same.adapter.options != adapter.options:
                         replaced[name] = same
                     continue
-                old = next((line for line in leaving if place_of_bus(line.name) == place_of_bus(name)), None)
+                old = next((line for line in leaving if BusName.of(line.name).place == BusName.of(name).place), None)
                 if old is None:
                     coming.append(name)
                 else:

@@ -203,7 +203,7 @@ def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) ->
 
 async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine[Any, Any, None]]) -> None:
     loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda _, context: _end(runner, context))  # by default it would be logged, and no more
+    loop.set_exception_handler(runner.ending.handle)
     reading: set[asyncio.Task[None]] = set()
 
     async def read_again() -> None:
@@ -211,7 +211,7 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
             await read_files()
         except (ConfigurationError, DriverError) as error:
             if isinstance(error, DriverError) and not error.bus:
-                runner.fail(error)
+                runner.ending.fail(error)
             else:
                 log.error("buses and places stay as they are: %s", error)
 
@@ -243,16 +243,7 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
             await asyncio.gather(reporting, return_exceptions=True)
         if as_json:
             with contextlib.suppress(BrokenPipeError):
-                print_json({"event": "stopped", "name": runner.name, **runner.status()})
-
-
-def _end(runner: Runner, context: dict[str, Any]) -> None:
-    """What went wrong in the event loop outside of everything that is looked after: it ends the driver."""
-    error = context.get("exception")
-    if error is None:
-        log.warning("%s", context["message"])
-    else:
-        runner.fail(error)
+                print_json({"event": "stopped", "name": runner.identity.name, **runner.status()})
 
 
 def _has_terminal() -> bool:

@@ -17,8 +17,9 @@ from skinware_drivers.cli.capturing import driver_of_recording, only_listened, o
 from skinware_drivers.loading import short_name
 from skinware_drivers.options.file import ConfigFile, DriverConfig
 from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
+from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.guard import hook
-from skinware_drivers.running.runner import PublishMode, Runner
+from skinware_drivers.running.runner import Runner
 
 if TYPE_CHECKING:
     from pathlib import Path

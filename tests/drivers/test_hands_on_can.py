@@ -38,7 +38,7 @@ def shown(adapter: AnyAdapter, *frames: tuple[int, str] | int) -> Decoder:
     """What is known after these frames; a number is a pause, ms."""
     tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
     decoder = Decoder([adapter.layout], tables, [adapter.period_s])
-    batch = FrameBatch(4096, 8, decoder.headroom)
+    batch = FrameBatch(4096, 8, decoder.compiled.headroom)
     time_ns = MS
     for frame in frames:
         if isinstance(frame, int):

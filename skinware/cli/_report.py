@@ -11,8 +11,7 @@ import numpy as np
 
 from skinware import bridge_state
 from skinware.cli import _bridges
-from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
-from skinware.cli._terminal import echo, print_json, style
+from skinware.cli._terminal import echo, print_json, style, terminal_width
 from skinware.driver_service import KIND, DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
@@ -23,11 +22,7 @@ from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
-from skinware.status import DataPath, load_report
-from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.health_service import KIND as HEALTH_KIND
-from skinware.tactile.health_service import HealthReader, HealthSample
-from skinware.views.health import (
+from skinware.state import (
     bus_reason_name,
     bus_state_name,
     life_of,
@@ -37,6 +32,11 @@ from skinware.views.health import (
     status_now,
     untouched,
 )
+from skinware.status import DataPath, load_report
+from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health_service import KIND as HEALTH_KIND
+from skinware.tactile.health_service import HealthReader, HealthSample
+from skinware.text import age_text, count_text, plural, table, wrapped
 
 SampleT = TypeVar("SampleT", bound=Sample)
 

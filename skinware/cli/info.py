@@ -19,20 +19,8 @@ from skinware.cli._command import (
     run,
     version_option,
 )
-from skinware.cli._format import (
-    NO_VALUE,
-    NOT_FRESH,
-    age_text,
-    count_text,
-    plural,
-    rate_text,
-    redraw,
-    state_shown,
-    table,
-    terminal_width,
-    wrapped,
-)
-from skinware.cli._terminal import echo, print_json, style
+from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
+from skinware.text import NO_VALUE, NOT_FRESH, age_text, count_text, plural, rate_text, state_shown, table, wrapped
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from skinware.bridge_state import BridgeState
 from skinware.cli._bridges import as_data, summary
-from skinware.cli._format import age_text, count_text, rate_text
+from skinware.text import age_text, count_text, rate_text
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Severity
 

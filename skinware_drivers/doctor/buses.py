@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from skinware.cli._format import age_text, count_text, plural
+from skinware.text import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import BusSeen, Change, DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity, brief, lost_text, typed
 from skinware_drivers.doctor.machine import circumstances

@@ -16,9 +16,9 @@ from skinware.driver_service import counters_of
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware.samples import sample_report, sample_text
+from skinware.state import bus_reason_name, bus_state_name, count_statuses, patch_state_name
 from skinware.status import Status, load_report
 from skinware.structure import Structure
-from skinware.views.health import bus_reason_name, bus_state_name, count_statuses, patch_state_name
 from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, PatchSeen
 from skinware_drivers.doctor.judging import whole_lines
 

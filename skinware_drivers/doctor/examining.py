@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from skinware._printable import printable
 from skinware.memory.namespace import Namespace
+from skinware.text import printable
 from skinware_drivers.doctor import bridges, buses, files, interfaces, machine, patches, permissions, taxels, timing
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked

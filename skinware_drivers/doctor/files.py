@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 
-from skinware.cli._format import age_text, count_text, plural
+from skinware.text import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import Evidence, NamespaceSeen, RecordingSeen
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Severity
 

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from skinware.cli._format import age_text, count_text, plural
 from skinware.errors import ConfigurationError
+from skinware.text import age_text, count_text, plural
 from skinware_drivers.bus_names import place_of_bus
 from skinware_drivers.doctor.evidence import Counted, Evidence
 from skinware_drivers.operations import operations_of

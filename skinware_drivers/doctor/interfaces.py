@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from skinware.cli._format import count_text, plural
+from skinware.text import count_text, plural
 from skinware_drivers.doctor.evidence import Evidence, InterfaceSeen
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
 from skinware_drivers.finding.interfaces import CanInterface

@@ -290,7 +290,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
 def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
     live = LiveBridges(namespace)
     try:
-        live.look(namespace.services())
+        live.look()
         return tuple(live.states())
     except NamespaceError:
         return ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from skinware.cli._format import plural
+from skinware.text import plural
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from statistics import median
 from typing import NamedTuple
 
-from skinware.cli._format import age_text, count_text, plural
+from skinware.text import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
 from skinware_drivers.doctor.finding import (
     Finding,

@@ -10,8 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skinware._printable import printable
-from skinware.cli._format import age_text, plural
+from skinware.text import age_text, plural, printable
 from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding

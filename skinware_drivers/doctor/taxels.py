@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skinware.cli._format import count_text, plural
 from skinware.tactile.calibration.checking import SHARED, UNKNOWN, check_file
+from skinware.text import count_text, plural
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity, has_operation
 

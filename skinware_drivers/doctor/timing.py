@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from skinware.cli._format import age_text, plural, rate_text
 from skinware.realtime import NS_PER_S
+from skinware.text import age_text, plural, rate_text
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Severity
 from skinware_drivers.doctor.machine import circumstances

@@ -26,8 +26,8 @@ from skinware.errors import (
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread, WriterStatistics
 from skinware.realtime import now_ns
+from skinware.state import life_of, rate_now_hz, status_now
 from skinware.status import Status
-from skinware.views.health import life_of, rate_now_hz, status_now
 from skinware_drivers.doctor.driver_log import DriverLog
 from skinware_drivers.doctor.evidence import DriverSeen, HealthSeen, TaxelFault, Timing
 from skinware_drivers.doctor.judging import TaxelJudge

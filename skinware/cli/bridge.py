@@ -200,7 +200,7 @@ def join(
             mode=None if mode == "auto" else mode,
             wish=wish,
             why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
-            tell=status.happened,
+            on_event=status.happened,
         )
         with contextlib.closing(joiner), signals_end(joiner.stop):
             if as_json:

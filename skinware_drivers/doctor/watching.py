@@ -6,6 +6,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,8 @@ import numpy as np
 from skinware.cli._report import health
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import (
-    BadServiceFile,
-    ConfigurationError,
-    NamespaceError,
-    Overrun,
-    ServiceError,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.drivers import Drivers
+from skinware.errors import NamespaceError, Overrun, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread, WriterStatistics
 from skinware.realtime import now_ns
@@ -47,15 +40,11 @@ def watch(namespace: Namespace, seconds: float, tell: Callable[[float], object])
     Raises:
         NamespaceError: the namespace cannot be trusted or read.
     """
-    with contextlib.ExitStack() as opened:
-        watches = []
-        for name in namespace.services():
-            try:
-                watches.append(
-                    _DriverWatch(opened.enter_context(DriverReader(name, namespace=namespace, announce=False)))
-                )
-            except (BadServiceFile, ServiceNotFound, ConfigurationError):
-                continue  # no driver, or told as a file that cannot be read
+    with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
+        drivers.look()
+        if drivers.trouble:
+            raise NamespaceError(drivers.trouble)
+        watches = [_DriverWatch(reader) for reader in drivers.readers.values()]
         begun_s = time.monotonic()
         while (passed_s := time.monotonic() - begun_s) < seconds:
             for one in watches:

@@ -265,8 +265,8 @@ class SkinTop(App[None]):
                 self._drivers.poll(driver)
                 count += 1
                 rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
-            self._contacts.look(self._drivers.others)
-            self._bridges.look(self._drivers.others)
+            self._contacts.look()
+            self._bridges.look()
             bridges = self._bridges.states()
         except NamespaceError as error:
             why = str(error)

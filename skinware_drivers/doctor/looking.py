@@ -9,11 +9,13 @@ import platform
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from skinware.bridge_state import BridgeState
-from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.drivers import Drivers
+from skinware.errors import ConfigurationError, NamespaceError
 from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import ROOT, Namespace
 from skinware.memory.ring import Sample
@@ -166,25 +168,21 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
     path = str(namespace.path)
     if not namespace.path.exists() and not namespace.path.is_symlink():
         return NamespaceSeen(namespace.name, path, is_ours)
-    living: list[str] = []
-    dead: list[str] = []
-    damaged: list[str] = []
-    size = 0
     try:
         namespace.check()
         idle_s = time.time() - namespace.path.stat().st_mtime
-        for name in namespace.services():
-            try:
-                with ServiceReader[Sample](name, namespace=namespace, announce=False) as reader:
-                    (living if reader.alive else dead).append(name)
-                    size += 0 if reader.alive else namespace.ring_path(name).stat().st_size
-            except (BadServiceFile, ConfigurationError) as error:
-                damaged.append(str(error))
-            except (ServiceNotFound, FileNotFoundError):
-                continue  # just withdrawn
+        with Drivers(namespace, partial(ServiceReader[Sample], announce=False)) as services:
+            services.look()
+            if services.trouble:
+                raise NamespaceError(services.trouble)
+            living = tuple(name for name, reader in services.readers.items() if reader.alive)
+            dead = tuple(name for name in services.readers if name not in living)
+            damaged = tuple(services.unreadable.values())
+        files = [namespace.ring_path(name) for name in dead]
+        size = sum(file.stat().st_size for file in files if file.exists())
     except (NamespaceError, OSError) as error:
         return NamespaceSeen(namespace.name, path, is_ours, problem=str(error))
-    return NamespaceSeen(namespace.name, path, is_ours, "", tuple(damaged), tuple(living), tuple(dead), size, idle_s)
+    return NamespaceSeen(namespace.name, path, is_ours, "", damaged, living, dead, size, idle_s)
 
 
 def _counts(one: CanInterface) -> dict[str, int]:
@@ -262,7 +260,7 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
 def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
     live = LiveBridges(namespace)
     try:
-        live.look(namespace.services())
+        live.look()
         return tuple(live.states())
     except NamespaceError:
         return ()

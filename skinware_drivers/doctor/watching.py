@@ -6,21 +6,14 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import (
-    BadServiceFile,
-    ConfigurationError,
-    NamespaceError,
-    Overrun,
-    ServiceError,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.drivers import Drivers
+from skinware.errors import NamespaceError, Overrun, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread, WriterStatistics
 from skinware.realtime import now_ns
@@ -47,15 +40,11 @@ def watch(namespace: Namespace, seconds: float, progress: Callable[[float], obje
     Raises:
         NamespaceError: the namespace cannot be trusted or read.
     """
-    with contextlib.ExitStack() as opened:
-        watches = []
-        for name in namespace.services():
-            try:
-                watches.append(
-                    _DriverWatch(opened.enter_context(DriverReader(name, namespace=namespace, announce=False)))
-                )
-            except (BadServiceFile, ServiceNotFound, ConfigurationError):
-                continue  # not a driver, or a damaged file, which is a finding of its own
+    with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
+        drivers.look()
+        if drivers.trouble:
+            raise NamespaceError(drivers.trouble)
+        watches = [_DriverWatch(reader) for reader in drivers.readers.values()]
         begun_s = time.monotonic()
         while (passed_s := time.monotonic() - begun_s) < seconds:
             for one in watches:
@@ -165,24 +154,19 @@ def _scheduling(pid: int) -> str:
 
 def _by_calm(reader: DriverReader, life: str) -> HealthSeen | None:
     """Return the health of a driver's taxels as a running ``skin-calm`` publishes it; None without one."""
-    if life == "dead":
-        return None
-    for namespace in (reader.namespace, Namespace(reader.namespace.calm_name)):
-        with contextlib.suppress(NamespaceError):
-            for name in namespace.services():
-                with contextlib.suppress(ServiceError, ConfigurationError):
-                    if (report := _live_report(reader, name, namespace)) is not None:
-                        return _calm_health(reader.structure, report)
+    for namespace in (reader.namespace, Namespace(reader.namespace.calm_name)) if life != "dead" else ():
+        with (
+            contextlib.suppress(NamespaceError, ServiceTimeout, Overrun),
+            Drivers(namespace, partial(HealthReader, announce=False)) as judges,
+        ):
+            judges.look()
+            for judge in judges.readers.values():
+                source = judge.source
+                if source.driver == reader.name and np.array_equal(source.uid, reader.structure.sensor_uid):
+                    sample = judge.read(timeout_s=0.0)
+                    if life_of(judge, sample) == "live":
+                        return _calm_health(reader.structure, sample.report)
     return None
-
-
-def _live_report(reader: DriverReader, name: str, namespace: Namespace) -> HealthReport | None:
-    with HealthReader(name, namespace=namespace, announce=False) as calm:
-        source = calm.source
-        if source.driver != reader.name or not np.array_equal(source.uid, reader.structure.sensor_uid):
-            return None
-        sample = calm.read(timeout_s=0.0)
-        return sample.report if life_of(calm, sample) == "live" else None
 
 
 def _calm_health(structure: Structure, report: HealthReport) -> HealthSeen:

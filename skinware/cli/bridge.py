@@ -236,7 +236,7 @@ class _Joined:
             echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
     def tell(self, bridge: BridgeState) -> None:
-        from skinware.cli._bridges import as_data
+        from skinware.views.bridges import as_data
 
         for name, service in bridge.services.items():
             shown = service.state, service.mode

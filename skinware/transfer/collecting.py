@@ -6,13 +6,14 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+from skinware.drivers import Drivers
 from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, StructureChanged
-from skinware.memory import futex, segments
+from skinware.memory import futex
 from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
-from skinware.service._tap import Tap, wake_word_of
+from skinware.service._tap import Tap
 from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50
@@ -92,13 +93,20 @@ class Collector:
     def __init__(
         self, namespace: Namespace, names: Collection[str] | None, listener: Listener, *, with_wires: bool = False
     ) -> None:
-        self._namespace = namespace
-        self._names = None if names is None else frozenset(names)
         self._wish = Announcement(namespace, WISH) if with_wires else None
-        self._left_out: set[str] = set()
+        if names is not None and with_wires:
+            names = [*names, *(service_name(name) for name in names)]
+        self._services: Drivers[Tap[Sample]] = Drivers(
+            namespace,
+            Tap,
+            names,
+            wants=lambda reader: with_wires or reader.kind != KIND,  # another program wants the wires
+            only_living=True,
+            every_ns=_DISCOVERY_NS,
+        )
         self._listener = listener
         self._sources: dict[str, _Source] = {}
-        self._next_discovery_ns = self._next_life_ns = 0
+        self._next_life_ns = 0
         self._is_first_look = True
         self._trouble: dict[str, str] = {}
         self._stopping = False
@@ -120,8 +128,7 @@ class Collector:
     def take(self) -> bool:
         """Take all frames that wait; return whether there were any."""
         time_ns = now_ns()
-        if time_ns >= self._next_discovery_ns:
-            self._next_discovery_ns = time_ns + _DISCOVERY_NS
+        if time_ns >= self._services.next_look_ns:
             self._discover()
         taken = [one for name, source in self._sources.items() for one in self._take_from(name, source)]
         for one in sorted(taken, key=lambda one: one.frame.published_ns):
@@ -140,8 +147,8 @@ class Collector:
 
     def wait(self, timeout_ns: int) -> None:
         """Sleep until a service publishes, or it is time to look for others; may return early."""
-        until_ns = min(now_ns() + timeout_ns, self._next_discovery_ns)
-        words = [wake_word_of(source.reader) for source in self._sources.values()]
+        until_ns = min(now_ns() + timeout_ns, self._services.next_look_ns)
+        words = self._services.wake_words()
         if not any(source.has_more for source in self._sources.values()):
             futex.sleep_on(words, until_ns)
 
@@ -161,8 +168,7 @@ class Collector:
         self._stopping = True
 
     def close(self) -> None:
-        for source in self._sources.values():
-            source.reader.close()
+        self._services.close()
         if self._wish is not None:
             self._wish.close()
 
@@ -201,37 +207,18 @@ class Collector:
         if self._wish is not None:
             self._wish.keep()
         try:
-            found = self._namespace.services()
+            self._services.look()
         except NamespaceError as error:
             self._report_trouble("", str(error))
             return
-        for name in found:
-            if name not in self._sources and name not in self._left_out and self._is_wanted(name):
-                self._attach(name)
+        for name, why in self._services.unreadable.items():
+            self._report_trouble(name, why)
+        for name, reader in self._services.readers.items():
+            if name not in self._sources:
+                reader.begin_in_order(with_first=not self._is_first_look)
+                self._sources[name] = _Source(reader)
+                self._report("found", name)
         self._is_first_look = False
-
-    def _is_wanted(self, name: str) -> bool:
-        if self._names is None or name in self._names:
-            return True
-        return self._wish is not None and any(name == service_name(driver) for driver in self._names)
-
-    def _attach(self, name: str) -> None:
-        if segments.living_inode(self._namespace, name) is None:
-            return
-        try:
-            reader: Tap[Sample] = Tap(name, namespace=self._namespace)
-        except ServiceNotFound:
-            return
-        except (BadServiceFile, NamespaceError) as error:
-            self._report_trouble(name, str(error))
-            return
-        if reader.kind == KIND and self._wish is None:  # another program asked for it
-            reader.close()
-            self._left_out.add(name)
-            return
-        reader.begin_in_order(with_first=not self._is_first_look)
-        self._sources[name] = _Source(reader)
-        self._report("found", name)
 
     def _look_at(self, name: str, source: _Source) -> None:
         reader = source.reader

@@ -113,5 +113,5 @@ def test_a_mistake_in_a_name_is_said_in_words(name: str, told: str) -> None:
 def test_a_line_has_no_unit_0_and_a_connection_may_have_one() -> None:
     driver = type("Fingertip", (Fingertip,), {"registers": [Registers(7, 12, unit=0)]})(NoOptions())
     driver.fit(make_bus("modbus:tcp://10.0.0.2"))
-    with pytest.raises(ConfigurationError, match="unit 0 is everybody on a line, and nobody answers"):
+    with pytest.raises(ConfigurationError, match="unit 0 means all units of a line, and none answers"):
         driver.fit(make_bus("modbus:/dev/ttyUSB0"))

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from skinware.conversion.ros_messages import Cdr
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, SkinHealth, bus_reason_name, bus_state_name
 from skinware.status import BusState
-from skinware.views.health import DEAD, LIVE, PAUSED, SILENT, SkinHealth, bus_reason_name, bus_state_name
 from skinware.views.live import LiveDriver
 
 

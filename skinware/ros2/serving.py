@@ -18,7 +18,7 @@ from skinware.ros2.topics import DriverTopics
 from skinware.ros2.transforms import Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service._tap import wake_word_of
-from skinware.views.health import WITHOUT_NEWS, life_of
+from skinware.state import WITHOUT_NEWS, life_of
 from skinware.views.live import LiveDriver, LiveDrivers
 
 RATE_HZ = 20.0
@@ -32,7 +32,7 @@ class Told:
     """How a driver is, and what was told of it.
 
     Attributes:
-        state: what it does; see :func:`skinware.views.health.life_of`; ``gone``: it was withdrawn.
+        state: what it does; see :func:`skinware.state.life_of`; ``gone``: it was withdrawn.
         rate_hz: frames that it publishes; None where not known yet.
         age_ms: of its newest data; None before its first frame.
         lost: frames so far that somebody wanted each of, and that could not be taken.

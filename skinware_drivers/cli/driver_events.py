@@ -6,8 +6,8 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-from skinware.cli._format import plural
 from skinware.cli._terminal import echo, print_json
+from skinware.text import plural
 
 if TYPE_CHECKING:
     from skinware_drivers.cli.capturing import Capture

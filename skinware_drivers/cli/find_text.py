@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from skinware.cli._format import count_text, plural
 from skinware.cli._terminal import style
+from skinware.text import count_text, plural
 from skinware_drivers.bus_names import BusName
 
 _WIDTH = 80

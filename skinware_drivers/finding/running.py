@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from skinware.driver_service import DriverReader
-from skinware.errors import BadServiceFile, BusNotAvailable, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.drivers import Drivers
+from skinware.errors import BusNotAvailable, ConfigurationError, NamespaceError
 from skinware.memory.namespace import ROOT, Namespace
 from skinware_drivers.bus_names import BusName, BusPlace
 from skinware_drivers.serial.opening import SerialOptions, find_port
@@ -45,15 +47,15 @@ def running_drivers() -> list[RunningDriver]:
     """All living drivers in namespaces that this user may read."""
     found = []
     for folder in sorted(ROOT.glob(f"{_PREFIX}*")):
-        try:
+        with contextlib.suppress(ConfigurationError, NamespaceError):
             namespace = Namespace(folder.name.removeprefix(_PREFIX))
-            services = namespace.services()
-        except (ConfigurationError, NamespaceError, NotADirectoryError):
-            continue
-        for name in services:
-            driver = _look_at(namespace, name)
-            if driver is not None:
-                found.append(driver)
+            with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
+                drivers.look()
+                found += [
+                    RunningDriver(name, namespace.name, reader.driver_type, reader.writer_pid, reader.structure.buses)
+                    for name, reader in drivers.readers.items()
+                    if reader.alive
+                ]
     return found
 
 
@@ -79,13 +81,3 @@ def _place_now(bus_name: str) -> BusPlace:
             device = SerialOptions(serial_number=usb["serial_number"], vid_pid=usb["vid_pid"])
             return BusName.of(find_port("", device)).place
     return place
-
-
-def _look_at(namespace: Namespace, name: str) -> RunningDriver | None:
-    try:
-        with DriverReader(name, namespace=namespace, announce=False) as reader:
-            if not reader.alive:
-                return None
-            return RunningDriver(name, namespace.name, reader.driver_type, reader.writer_pid, reader.structure.buses)
-    except (BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound):
-        return None  # no driver, just withdrawn, or nothing that may be read

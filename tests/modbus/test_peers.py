@@ -53,7 +53,7 @@ def test_names() -> None:
         ("modbus:tcp://", "which host"),
         ("modbus:tcp://host:0x10", "HOST:PORT"),
         ("modbus:tcp://host?baudrate=9600", "unknown option"),
-        ("modbus:tcp://host?listen=yes", "only a line can be tapped"),
+        ("modbus:tcp://host?listen=yes", "a connection cannot be tapped"),
         ("modbus:/dev/ttyUSB0?timeout_ms=0", "timeout_ms"),
         ("modbus:/dev/ttyUSB0?byte_order=middle", "byte_order"),
         ("modbus:/dev/ttyUSB0?patience_s=3", "unknown option"),

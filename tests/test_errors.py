@@ -79,6 +79,7 @@ def StructureError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 def DriverError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
     with hook("probe", "can0"):
         exec(compile(f"{37 * chr(10)}raise KeyError('board')", "my_skin.py", "exec"))
+    return None
 
 
 @produces

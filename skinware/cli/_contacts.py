@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from skinware.cli._format import NO_VALUE, age_text, figure_text, plural
 from skinware.cli._heat_map import Arrangement, Label
 from skinware.realtime import NS_PER_S
 from skinware.tactile.contacts import Contact
+from skinware.text import NO_VALUE, age_text, figure_text, plural
 from skinware.views.beside import TouchedPlace
 
 _LONGEST_PLACE = 22

@@ -15,10 +15,9 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from skinware._printable import printable
 from skinware.cli import _heat_map as heat
-from skinware.cli._format import figure_text
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
+from skinware.text import figure_text, printable
 
 Colours = tuple[ColorTriplet, ...]
 _T = TypeVar("_T")

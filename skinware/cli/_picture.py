@@ -10,17 +10,17 @@ import numpy as np
 import numpy.typing as npt
 from rich.text import Text
 
-from skinware.cli._format import figure_text
 from skinware.cli._heat_map import FRESH, UNMOVED, Arrangement, arrange, codes_of, levels_of, marks_of
 from skinware.cli._painting import TRUE_COLOURS, Palette, marks_text, scale_text
 from skinware.cli._top_rows import RowKey, patches_of, title_of
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.sensor_types import SensorType
 from skinware.skin_layout import SkinLayout
+from skinware.state import status_now
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
-from skinware.views.health import status_now
+from skinware.text import figure_text
 from skinware.views.quantities import ChangeSpan, Rest, ValueLimits
 from skinware.views.wiping import WipeTest
 

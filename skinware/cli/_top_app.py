@@ -15,19 +15,18 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware._printable import printable
-from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
-from skinware.cli._format import NOT_FRESH, plural
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._painting import Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
 from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
+from skinware.state import LIVE, life_of
 from skinware.tactile.regions import Regions
+from skinware.text import NOT_FRESH, plural, printable
 from skinware.views.beside import LiveBridges, live_contacts, places_of
-from skinware.views.health import LIVE, life_of
+from skinware.views.bridges import as_data, summary
 from skinware.views.live import LiveDrivers
 
 _REDRAWS_HZ = 15
@@ -266,12 +265,12 @@ class SkinTop(App[None]):
                 self._drivers.poll(driver)
                 count += 1
                 rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
-            self._contacts.look(self._drivers.others)
-            self._bridges.look(self._drivers.others)
+            self._contacts.look()
+            self._bridges.look()
             bridges = self._bridges.states()
         except NamespaceError as error:
             why = str(error)
-        told = [_bridges.summary(bridge.robot, _bridges.as_data(bridge)) for bridge in bridges]
+        told = [summary(bridge.robot, as_data(bridge)) for bridge in bridges]
         place = f"namespace {self._drivers.namespace.name}"
         self._heading = "   ".join(["skin-top", place, plural(count, "driver"), *told])
         _say(self._why, why)
@@ -343,7 +342,7 @@ def _say(line: Static, text: str | Text) -> None:
 
 
 def _printable(text: str | Text) -> str | Text:
-    """A text that came from others, as :func:`skinware._printable.printable` has it; its colours stay."""
+    """A text that came from others, as :func:`skinware.text.printable` has it; its colours stay."""
     if isinstance(text, str):
         return printable(text, "\n")
     text.plain = printable(text.plain, "\n")

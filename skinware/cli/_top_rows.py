@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.structure import Structure
-from skinware.views.health import (
+from skinware.state import (
     DEAD,
     LIVE,
     SILENT,
@@ -25,6 +23,8 @@ from skinware.views.health import (
     rate_now_hz,
     status_now,
 )
+from skinware.structure import Structure
+from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
 
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
 """Titles of the cells of a row."""

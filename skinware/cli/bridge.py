@@ -200,7 +200,7 @@ def join(
             mode=None if mode == "auto" else mode,
             wish=wish,
             why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
-            tell=status.happened,
+            on_event=status.happened,
         )
         with contextlib.closing(joiner), signals_end(joiner.stop):
             if as_json:
@@ -236,7 +236,7 @@ class _Joined:
             echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
     def tell(self, bridge: BridgeState) -> None:
-        from skinware.cli._bridges import as_data
+        from skinware.views.bridges import as_data
 
         for name, service in bridge.services.items():
             shown = service.state, service.mode

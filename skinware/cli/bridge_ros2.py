@@ -150,7 +150,7 @@ def _node(
     if rmw == "zenoh":
         from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
 
-        return ZenohNode(identity, connect=connect or (ROUTER,), tell=tell)
+        return ZenohNode(identity, connect=connect or (ROUTER,), router_changed=tell)
     from skinware.ros2.dds import DdsNode
 
     return DdsNode(identity, interfaces)

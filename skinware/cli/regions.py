@@ -48,8 +48,8 @@ def command() -> None:
 @json_option
 def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None:
     """List regions, and how many sensors the running drivers have in each."""
-    from skinware.cli._format import plural
     from skinware.skin import Skin
+    from skinware.text import plural
 
     regions = regions_of(files)
     with Skin(namespace) as skin:

@@ -110,7 +110,7 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
             if time.monotonic() >= lines_at_s:
                 _print_lines(drivers, contacts, as_json)
                 if not as_json:
-                    bridges.look(drivers.others)
+                    bridges.look()
                     _print_bridges(bridges)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
             next_s = time.monotonic() + _TAKE_PERIOD_S
@@ -133,7 +133,7 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as
     from skinware.views.beside import places_of
 
     found = drivers.look()
-    contacts.look(drivers.others)
+    contacts.look()
     for driver in found:
         places = places_of(contacts.of(driver.name), driver.reader.structure)
         if as_json:
@@ -146,7 +146,7 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as
 
 
 def _print_bridges(bridges: LiveBridges) -> None:
-    from skinware.cli._bridges import as_data, summary
+    from skinware.views.bridges import as_data, summary
 
     for bridge in bridges.states():
         echo(summary(bridge.robot, as_data(bridge)))

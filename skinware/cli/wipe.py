@@ -20,8 +20,8 @@ from skinware.cli._command import (
     seconds,
     version_option,
 )
-from skinware.cli._format import count_text, figure_text, plural
 from skinware.cli._terminal import echo, overwrite, print_json
+from skinware.text import count_text, figure_text, plural
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Collection
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
-from skinware.bridge_state import BridgeReader, BridgeSample, BridgeState
+from skinware.bridge_state import BridgeReader, BridgeState
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout, StructureError
+from skinware.drivers import Drivers
+from skinware.errors import StructureError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
 from skinware.realtime import now_ns
-from skinware.service import ServiceReader
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
@@ -21,63 +21,9 @@ from skinware.tactile.motion_service import MotionReader, MotionSample
 from skinware.tactile.source_reader import SourceReader
 from skinware.views.live import LiveDriver, LiveDrivers
 
-ReaderT = TypeVar("ReaderT", bound=ServiceReader[Any])
 
-
-class LiveServices(Generic[ReaderT, SampleT]):
-    """The services of one kind in one namespace.
-
-    Args:
-        namespace: where to look.
-        reader: class of the readers of this kind; attaching to a service of another one raises
-            :class:`skinware.errors.BadServiceFile`.
-    """
-
-    def __init__(self, namespace: Namespace, reader: Callable[..., ReaderT]) -> None:
-        self._namespace, self._reader = namespace, reader
-        self._readers: dict[str, ReaderT] = {}
-
-    def look(self, names: Iterable[str]) -> None:
-        """Look for services of the kind that are new, and for those that went.
-
-        Args:
-            names: of the services that there are now; those of drivers may be missing.
-        """
-        there = set(names)
-        for name in self._readers.keys() - there:
-            self._drop(name)
-        for name in there - self._readers.keys():
-            try:
-                self._readers[name] = self._reader(name, namespace=self._namespace)
-            except (BadServiceFile, ConfigurationError, ServiceNotFound):
-                continue  # another kind of service, or just gone
-        self._readers = dict(sorted(self._readers.items()))
-
-    def close(self) -> None:
-        for name in list(self._readers):
-            self._drop(name)
-
-    def _newest(self, name: str) -> SampleT | None:
-        """What a service of a living writer told last; None where there is nothing."""
-        reader = self._readers[name]
-        try:
-            reader.refresh()
-            if reader.structure_changed:
-                reader.reattach()
-            frame: SampleT = reader.read(timeout_s=0.0)
-        except (ServiceTimeout, Overrun):
-            return None  # nothing published yet
-        except (ServiceNotFound, BadServiceFile):
-            self._drop(name)
-            return None
-        return None if frame.stale else frame
-
-    def _drop(self, name: str) -> None:
-        self._readers.pop(name).close()
-
-
-class LiveBridges(LiveServices[BridgeReader, BridgeSample]):
-    """What the bridges of a namespace tell of themselves.
+class LiveBridges(Drivers[BridgeReader]):
+    """The bridges of a namespace.
 
     Args:
         namespace: where to look.
@@ -87,8 +33,9 @@ class LiveBridges(LiveServices[BridgeReader, BridgeSample]):
         super().__init__(namespace, BridgeReader)
 
     def states(self) -> list[BridgeState]:
-        frames = [self._newest(name) for name in list(self._readers)]
-        return [frame.state for frame in frames if frame is not None]
+        """Return the state of each bridge whose program lives."""
+        samples = [self.newest(name) for name in list(self.readers)]
+        return [sample.state for sample in samples if sample is not None and not sample.stale]
 
 
 class TouchedPlace(NamedTuple):
@@ -108,14 +55,15 @@ class TouchedPlace(NamedTuple):
     module: str
 
 
-class LiveSources(LiveServices[SourceReader[Any, SampleT], SampleT]):
-    """The services of one kind that tell something of drivers, in one namespace, followed live."""
+class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
+    """The services of one kind in a namespace, each of which says something of one driver."""
 
     def of(self, driver: str) -> SampleT | None:
-        """What was told last of a driver; None where no service tells anything."""
-        for name, reader in self._readers.items():
+        """Return the newest sample of the service for a driver; None where no living service has one."""
+        for name, reader in self.readers.items():
             if reader.source.driver == driver:
-                return self._newest(name)
+                sample: SampleT | None = self.newest(name)
+                return None if sample is None or sample.stale else sample
         return None
 
 
@@ -124,7 +72,6 @@ def live_contacts(namespace: Namespace) -> LiveSources[ContactsSample]:
 
 
 def live_motion(namespace: Namespace) -> LiveSources[MotionSample]:
-    """The services of motion over regions in a namespace."""
     return LiveSources(namespace, MotionReader)
 
 
@@ -177,10 +124,9 @@ class Beside:
 
     def __init__(self, drivers: LiveDrivers, names: Collection[str] = (), calm: Namespace | None = None) -> None:
         self._calm = None if calm is None else LiveDrivers(calm, names)
-        self._places = [drivers, *([self._calm] if self._calm is not None else [])]
-        self._contacts = [live_contacts(place.namespace) for place in self._places]
-        self._motion = [live_motion(place.namespace) for place in self._places]
-        self._others: list[tuple[str, ...]] = []
+        namespaces = [drivers.namespace, *([] if calm is None else [calm])]
+        self._contacts = [live_contacts(namespace) for namespace in namespaces]
+        self._motion = [live_motion(namespace) for namespace in namespaces]
 
     def look(self) -> None:
         """Look for what came and went.
@@ -190,12 +136,9 @@ class Beside:
         """
         if self._calm is not None:
             self._calm.look()
-        others = [place.others for place in self._places]
-        if others != self._others:
-            self._others = others
-            for contacts, motion, names in zip(self._contacts, self._motion, others, strict=True):
-                contacts.look(names)
-                motion.look(names)
+        for contacts, motion in zip(self._contacts, self._motion, strict=True):
+            contacts.look()
+            motion.look()
 
     def is_due(self, live: LiveDriver) -> bool:
         """Whether the newest frame of a driver may be shown: what is calm of it is here, or will not come."""

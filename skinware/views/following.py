@@ -12,12 +12,12 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.state import LIVE, STARTING, life_of, status_now
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
 from skinware.views.beside import Beside
-from skinware.views.health import LIVE, STARTING, life_of, status_now
 from skinware.views.live import LiveDriver, LiveDrivers
 from skinware.views.quantities import Past, Quantity, Rest, quantities_of
 from skinware.views.robot import Robot
@@ -42,7 +42,7 @@ class Followed:
         quantities: the pictures that there are of it.
         generation: in which the driver came with this structure.
         frame: its newest; None before the first.
-        life: what it is doing; see :func:`skinware.views.health.life_of`.
+        life: what it is doing; see :func:`skinware.state.life_of`.
         status: (n_sensors,) uint8, status of its sensors now, with what the calmed driver knows of their health.
         changes: counts frames and changes of status.
         past: its values of the last seconds.

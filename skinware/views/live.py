@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.drivers import Drivers
+from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import NS_PER_S
+from skinware.state import SkinHealth, health_of
 from skinware.structure import Structure
-from skinware.views.health import SkinHealth, health_of
 
-_LOOK_EVERY_NS = NS_PER_S // 4
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _SAMPLE_EVERY_NS = NS_PER_S // 10
 
@@ -52,30 +52,6 @@ class LiveDriver:
         """Of its newest frame; before the first of the service."""
         return self.reader.structure if self.frame is None else self.frame.structure
 
-    def poll(self) -> bool:
-        """Take the newest frame if there is a newer one; never waits.
-
-        Returns:
-            Whether ``frame`` is another one now.
-
-        Raises:
-            ServiceNotFound: the driver was withdrawn just as it had changed.
-            BadServiceFile: it came back as something that cannot be read.
-        """
-        position = self.reader.refresh()
-        if self.reader.structure_changed:
-            self.reader.reattach()
-            position = self.reader.latest
-        if position is None or (self.frame is not None and position == self.frame.position):
-            return False
-        try:
-            frame = self.reader.read(timeout_s=0.0)
-        except (ServiceTimeout, Overrun):
-            return False  # it restarted this very moment, or is too fast; the next poll may be luckier
-        self._sample(frame)
-        self.frame = frame
-        return True
-
     @property
     def rate_hz(self) -> float | None:
         """Frames per second over the last two seconds; shortly after a start, over the frames in the ring."""
@@ -107,10 +83,12 @@ class LiveDriver:
     def health(self) -> SkinHealth:
         return health_of(self.reader, self.frame, self.rate_hz)
 
-    def _sample(self, frame: DriverSnapshot) -> None:
+    def take(self, frame: DriverSnapshot) -> None:
+        """Make a frame the newest one."""
         samples = self._samples
         if self.frame is not None and frame.generation != self.frame.generation:
             samples.clear()
+        self.frame = frame
         if samples and frame.published_ns - samples[-1].time_ns < _SAMPLE_EVERY_NS:
             return
         samples.append(
@@ -126,58 +104,43 @@ class LiveDrivers:
     Args:
         namespace: where to look.
         names: of the drivers to follow; default: all.
-
-    Attributes:
-        others: names of the services that are no drivers.
     """
 
     def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
         self.namespace = namespace
-        self._wanted = frozenset(names)
-        self.others: tuple[str, ...] = ()
-        self._drivers: dict[str, LiveDriver] = {}
-        self._next_look_ns = 0
+        self._drivers = Drivers(namespace, DriverReader, names or None)
+        self._live: dict[str, LiveDriver] = {}
 
     def get(self, name: str) -> LiveDriver | None:
-        return self._drivers.get(name)
+        return self._live.get(name)
 
     def look(self) -> list[LiveDriver]:
-        """All drivers, by name, after looking for new ones and for those that went (four times a second at most).
+        """Look for drivers that came or went, if that is due, and return all by name.
 
         Raises:
             NamespaceError: the namespace cannot be trusted or read.
         """
-        if now_ns() >= self._next_look_ns:
-            self._next_look_ns = now_ns() + _LOOK_EVERY_NS
-            names = self.namespace.services()
-            for name in [name for name in self._drivers if name not in names]:
-                self._drop(name)
-            for name in names:
-                if name not in self._drivers and (not self._wanted or name in self._wanted):
-                    self._attach(name)
-            self._drivers = dict(sorted(self._drivers.items()))
-            self.others = tuple(name for name in names if name not in self._drivers)
-        return list(self._drivers.values())
+        self._drivers.look()
+        if self._drivers.trouble:
+            raise NamespaceError(self._drivers.trouble)
+        self._keep()
+        return list(self._live.values())
 
     def poll(self, driver: LiveDriver) -> bool:
-        """``driver.poll()``; one that cannot be read any more is dropped, until it can."""
-        try:
-            return driver.poll()
-        except (ServiceNotFound, BadServiceFile):
-            self._drop(driver.name)
-            return False
+        """Take the newest frame of a driver; return whether there was a newer one. It never waits."""
+        frame = self._drivers.newest(driver.name, newer_than=driver.frame)
+        if frame is not None:
+            driver.take(frame)
+        else:
+            self._keep()
+        return frame is not None
 
     def close(self) -> None:
-        for driver in self._drivers.values():
-            driver.reader.close()
-        self._drivers = {}
+        self._drivers.close()
+        self._live = {}
 
-    def _attach(self, name: str) -> None:
-        try:
-            reader = DriverReader(name, namespace=self.namespace)
-        except (BadServiceFile, ConfigurationError, ServiceNotFound):
-            return  # no driver (skin-info says what is wrong with it), or just gone
-        self._drivers[name] = LiveDriver(reader)
-
-    def _drop(self, name: str) -> None:
-        self._drivers.pop(name).reader.close()
+    def _keep(self) -> None:
+        readers = self._drivers.readers
+        if [live.reader for live in self._live.values()] != list(readers.values()):
+            kept = {id(live.reader): live for live in self._live.values()}
+            self._live = {name: kept.get(id(reader)) or LiveDriver(reader) for name, reader in readers.items()}

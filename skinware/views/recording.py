@@ -14,8 +14,8 @@ from skinware.errors import ConfigurationError, ServiceError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import PendingRequest
 from skinware.service.messages import OPERATIONS
+from skinware.state import DEAD
 from skinware.views.following import Followed
-from skinware.views.health import DEAD
 
 _END_S = 10.0
 """How long it may take to complete its file."""

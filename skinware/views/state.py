@@ -7,10 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.status import BusState, PatchState, Status, load_report
-from skinware.structure import Structure
-from skinware.views.following import Followed
-from skinware.views.health import (
+from skinware.state import (
     DEAD,
     LIVE,
     PAUSED,
@@ -23,6 +20,9 @@ from skinware.views.health import (
     patch_state_name,
     rate_now_hz,
 )
+from skinware.status import BusState, PatchState, Status, load_report
+from skinware.structure import Structure
+from skinware.views.following import Followed
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 _SEVERITIES = (ERROR, WARNING, NOTE)

@@ -20,8 +20,8 @@ from skinware.cli._command import (
     seconds,
     version_option,
 )
-from skinware.cli._format import age_text, plural
 from skinware.cli._terminal import echo, overwrite, print_json, style
+from skinware.text import age_text, plural
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding, Severity

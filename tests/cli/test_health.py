@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Structure
+from skinware import state as health
 from skinware.memory.ring import Sample
-from skinware.status import Status
-from skinware.views import health
-from skinware.views.health import (
+from skinware.state import (
     bus_state_name,
     count_statuses,
     health_of,
@@ -20,6 +19,7 @@ from skinware.views.health import (
     rate_now_hz,
     status_now,
 )
+from skinware.status import Status
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 SECOND = 1_000_000_000

@@ -9,7 +9,6 @@ import pytest
 
 from skinware import Namespace, ServiceWriter
 from skinware.realtime import now_ns
-from skinware.views import live
 from skinware.views.live import LiveDriver, LiveDrivers
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.specification import ring
@@ -17,7 +16,7 @@ from tests.specification import ring
 
 @pytest.fixture(autouse=True)
 def look_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
 
 
 def names(drivers: LiveDrivers) -> list[str]:
@@ -121,8 +120,7 @@ def test_the_rate_is_measured_over_two_seconds() -> None:
             patch_interval_counts=counts,
             structure=fake_structure(2, 2),
         )
-        driver._sample(cast(Any, frame))
-        driver.frame = cast(Any, frame)
+        driver.take(cast(Any, frame))
 
     assert driver.rate_hz == 7.0  # that of the ring
     assert driver.patch_rates_hz == [None, None]

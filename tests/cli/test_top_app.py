@@ -14,6 +14,7 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable, Static
 
 from skinware import DriverReader, Namespace, Status
+from skinware import state as health
 from skinware.cli import _top_app
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
@@ -21,7 +22,6 @@ from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region, Regions
-from skinware.views import health, live
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 
 SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
@@ -81,7 +81,7 @@ def go(scene: Callable[[], Awaitable[None]]) -> None:
 
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
 
 

@@ -18,7 +18,7 @@ from skinware.cli._top_rows import (
     plain_line,
     rows_of,
 )
-from skinware.views.health import SkinHealth, health_of
+from skinware.state import SkinHealth, health_of
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 HEALTH = SkinHealth(

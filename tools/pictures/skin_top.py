@@ -32,7 +32,7 @@ async def picture(namespace: str) -> str:
         async with asyncio.timeout(PATIENCE_S):
             while not app.query_one("#list", DataTable).row_count or not app._drivers.look()[0].frame:
                 await pilot.pause(0.1)
-            if app._drivers.others:
+            if app._contacts.readers:
                 await _followed(app, pilot)
             else:
                 await pilot.press("down", "down")

@@ -36,7 +36,7 @@ def tpdo(number: int, cob_id: int, *entries: tuple[int, int]) -> Tpdo:
 
 def decoded(made: PdoMap, *frames: tuple[int, str]) -> Decoder:
     decoder = Decoder([made.layout], assemble([("bus", made.patches)], made.types, made.dtype))
-    batch = FrameBatch(100, 8, decoder.headroom)
+    batch = FrameBatch(100, 8, decoder.compiled.headroom)
     for identifier, payload in frames:
         batch.append(0, 1, identifier, bytes.fromhex(payload))
     updates, foreign = decoder.decode(batch)

@@ -82,12 +82,11 @@ class Stage:
             name="can0",
             adapter=adapter,
             link=None,
-            lost=asyncio.Event(),
+            connection=SimpleNamespace(lost=asyncio.Event(), opened_ns=0),
+            condition=SimpleNamespace(limits=self),
             busy=asyncio.Lock(),
-            opened_ns=0,
             revived_ns=0,
             suspects=set(),
-            limits=self,
             set_up_ns=0,
         )
         self.care = PatchCare(cast(Any, line), lambda: cast(Any, generation), False, lambda: None, self._begin)

@@ -129,7 +129,7 @@ def shown(stream: bytes, **options: Any) -> DriverSnapshot:
 
             def is_shown() -> bool:
                 port.write(stream)
-                return running.runner is not None and running.runner.writer is not None
+                return running.runner is not None and running.runner.builder.writer is not None
 
             wait_until(is_shown)
             with DriverReader("pad", timeout_s=30) as reader:
@@ -205,7 +205,7 @@ def test_another_pad_is_plugged_in(firmware: str, tmp_path: Path) -> None:
                 link.symlink_to(path)
 
                 def is_live(count: int = rows * columns) -> bool:
-                    generation = running.runner and running.runner.generation
+                    generation = running.runner and running.runner.builder.generation
                     if not generation or generation.tables.structure.n_sensors != count:
                         return False
                     return bool(running.status()["patches"][0]["state"] == "live")

@@ -123,8 +123,9 @@ def _on_terminal() -> bool:
 
 
 def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
-    from skinware.cli import _bridges, _contacts
+    from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
+    from skinware.views import bridges
 
     for driver in drivers:
         places = overview.contacts_on(driver) or []
@@ -138,7 +139,7 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
     if not drivers:
         echo(f"no driver runs in namespace {overview.drivers.namespace.name!r}; start one: skin-driver --bus virtual")
     for bridge in overview.bridges.states():
-        echo(_bridges.summary(bridge.robot, _bridges.as_data(bridge)))
+        echo(bridges.summary(bridge.robot, bridges.as_data(bridge)))
 
 
 def main() -> None:

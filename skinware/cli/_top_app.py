@@ -15,7 +15,6 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._painting import Palette, palette_for
@@ -27,6 +26,7 @@ from skinware.state import LIVE, life_of
 from skinware.tactile.regions import Regions
 from skinware.text import NOT_FRESH, plural, printable
 from skinware.views.beside import LiveBridges, live_contacts, places_of
+from skinware.views.bridges import as_data, summary
 from skinware.views.live import LiveDrivers
 
 _REDRAWS_HZ = 15
@@ -270,7 +270,7 @@ class SkinTop(App[None]):
             bridges = self._bridges.states()
         except NamespaceError as error:
             why = str(error)
-        told = [_bridges.summary(bridge.robot, _bridges.as_data(bridge)) for bridge in bridges]
+        told = [summary(bridge.robot, as_data(bridge)) for bridge in bridges]
         place = f"namespace {self._drivers.namespace.name}"
         self._heading = "   ".join(["skin-top", place, plural(count, "driver"), *told])
         _say(self._why, why)

@@ -146,7 +146,7 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as
 
 
 def _print_bridges(bridges: LiveBridges) -> None:
-    from skinware.cli._bridges import as_data, summary
+    from skinware.views.bridges import as_data, summary
 
     for bridge in bridges.states():
         echo(summary(bridge.robot, as_data(bridge)))

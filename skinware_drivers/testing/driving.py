@@ -15,8 +15,9 @@ from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.flow import FlowLoop
-from skinware_drivers.running.runner import PublishMode, Runner
+from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.waiting import SLOWER

@@ -222,7 +222,7 @@ def _suffer(recording: Recording, troubles: Sequence[Trouble]) -> tuple[Indices,
 
 
 def _batch_of(decoder: Decoder, wire: npt.NDArray[Any], time_ns: Indices) -> FrameBatch:
-    batch = FrameBatch(len(wire), wire.dtype["payload"].shape[0], decoder.headroom)
+    batch = FrameBatch(len(wire), wire.dtype["payload"].shape[0], decoder.compiled.headroom)
     batch.stop = batch.start + len(wire)
     batch.wire[batch.start : batch.stop] = wire
     batch.time_ns[batch.start : batch.stop] = time_ns

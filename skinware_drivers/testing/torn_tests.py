@@ -112,11 +112,11 @@ class Heard:
     """
 
     def __init__(self, rig: Running) -> None:
-        if rig.runner is None or rig.runner.generation is None:
+        if rig.runner is None or rig.runner.builder.generation is None:
             defect("the driver publishes nothing yet")
         self._rig = rig
         self.takes: list[Take] = []
-        self.tables: SkinTables = rig.runner.generation.tables
+        self.tables: SkinTables = rig.runner.builder.generation.tables
         receive = rig.bus.receive
 
         def listen(batch: FrameBatch, ordinal: int) -> int:

@@ -1,4 +1,4 @@
-"""Many robots: where they meet, and how all of them are."""
+"""``skin-bridge route`` and ``skin-bridge list``: where robots meet, and the state of all of them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    caller_option,
-    examples,
-    insecure_option,
-    json_option,
-    signals_end,
-    tls_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
@@ -33,14 +25,14 @@ if TYPE_CHECKING:
 _PORT = 7447
 _PRESENCE = {0: "gone", 1: "there"}
 _PATIENCE_S = 3
-"""Until robots that are there have told how they are; one that has told nothing for so long is silent."""
+"""Time for a robot to send its state; a robot without news for so long is silent."""
 _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "silent patches", "problems", "clock")
 
 
 @click.command(
     "route",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            where robots and their users meet",
         "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   a robot that goes there",
         "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            one who uses it",
@@ -52,23 +44,21 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     metavar="ENDPOINT",
     help=f"Where others connect.  [default: tcp/127.0.0.1:{_PORT}]",
 )
-@click.option(
-    "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are to be reached here."
-)
-@tls_option
-@caller_option
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here too.")
+@cli.tls_option
+@cli.caller_option
 @click.option(
     "--robot",
     "robots",
     multiple=True,
     metavar="R",
-    help="Only who has a certificate of this name may serve, and only robot R; may be repeated.",
+    help="Only holders of a certificate of this name may serve, and only robot R; may be repeated.",
 )
 @click.option(
     "--router", "routers", multiple=True, metavar="NAME", help="The certificate of another router; may be repeated."
 )
-@insecure_option
-@json_option
+@cli.insecure_option
+@cli.json_option
 def route(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
@@ -79,7 +69,7 @@ def route(
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Be where robots and those who use them meet: one address for all of them. Reads nothing by itself.
+    """Let robots and their users meet at one address. A router reads nothing by itself.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -94,7 +84,7 @@ def route(
     )
     with contextlib.closing(Link(places)) as link:
         watcher = Watcher(link, asks=False)
-        with signals_end(watcher.stop):
+        with cli.signals_end(watcher.stop):
             if as_json:
                 print_json({"event": "ready", "listen": list(places.listen), "connect": list(places.connect)})
             else:
@@ -103,7 +93,7 @@ def route(
 
 
 class _Routed:
-    """Tells which robots come and go."""
+    """Report robots that come and go."""
 
     def __init__(self, watcher: Watcher, as_json: bool) -> None:
         self._watcher, self._as_json = watcher, as_json
@@ -121,18 +111,18 @@ class _Routed:
 
 @click.command(
     "list",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-bridge list --connect tcp/192.168.1.10:7448 --connect tcp/192.168.1.11:7448",
-        "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all that are there, every second",
+        "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all robots, every second",
     ),
 )
 @click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT.")
-@tls_option
+@cli.tls_option
 @click.option("--watch", is_flag=True, help="Update every second.")
-@json_option
+@cli.json_option
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
-    """Show all robots that are reached, with their drivers: rate, age, losses, silent patches, problems, clock error.
+    """List all reachable robots and their drivers: rate, age, losses, silent patches, problems, clock error.
 
     Each robot sends one small message a second for this; no frames are read.
 
@@ -146,14 +136,14 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
         listed = _Listed(watcher, places.connect, tls, as_json=as_json, watch=watch)
         if watch and as_json:
             print_json({"event": "ready", "connect": list(places.connect)})
-        with signals_end(watcher.stop):
+        with cli.signals_end(watcher.stop):
             watcher.run(listed.tell)
     if listed.why:
         raise BridgeError(listed.why)
 
 
 class _Listed:
-    """Prints each second how all robots are, or once."""
+    """Print the state of all robots, once or each second."""
 
     def __init__(
         self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
@@ -176,7 +166,7 @@ class _Listed:
         found = _report(robots)
         if not robots and is_late and self._seconds % _PATIENCE_S == 0:
             why = " ".join(filter(None, (why_unreachable(at, self._tls) for at in self._places)))
-            found["problems"].append(why or "something listens there, but no robot answers; does it want --tls?")
+            found["problems"].append(why or "something listens there, but no robot answers; does it need --tls?")
             if not self._watch:
                 self.why = found["problems"][-1]
                 return

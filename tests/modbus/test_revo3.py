@@ -217,7 +217,7 @@ def test_a_hand_that_does_not_say_its_mapping_is_refused_until_an_option_says_it
 class Fingertips(EmulatedRevo3):
     """A hand of forces and torques, by its maker's program."""
 
-    def _said(self, device: Device) -> dict[int, int]:
+    def _settings(self, device: Device) -> dict[int, int]:
         return {**super()._settings(device), 135: 3}
 
 

@@ -26,7 +26,7 @@ from skinware.cli._command import (
 )
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
-from skinware_drivers.cli.driver_events import report, tell_capture, tell_patches, tell_ready
+from skinware_drivers.cli.driver_events import print_capture, print_patches, print_ready, report
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 UNIT_FILE = "skinware@.service"
 _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
-"""What stands in that file for this program."""
+"""Stands in that file for this program."""
 
 
 class DriverCommand(HardwareCommand):
@@ -68,11 +68,11 @@ class DriverCommand(HardwareCommand):
         return short_name(name), load_driver(name).Options
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse; say what to do with a word that is no option."""
+        """Parse; explain a word that is not an option."""
         ctx.allow_extra_args = True
         left = super().parse_args(ctx, args)
         if left:
-            raise click.UsageError(f"{left[0]!r} is no option: name the driver with --driver, a bus with --bus", ctx)
+            raise click.UsageError(f"{left[0]!r} is not an option; name a driver with --driver, a bus with --bus", ctx)
         return left
 
 
@@ -99,8 +99,8 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
         "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
-        "skin-driver --bus can0 --capture it.mcap   record all of it, for who helps you",
-        "skin-driver --bus replay:it.mcap           decode that again, with the driver and options of then",
+        "skin-driver --bus can0 --capture it.mcap   make a capture for a bug report",
+        "skin-driver --bus replay:it.mcap           decode it again, with the recorded driver and options",
     ),
 )
 @click.option(
@@ -156,7 +156,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "--capture",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Record all that goes over the buses, and what comes of it, into a new file for who helps you.",
+    help="Record all frames on the buses, and the decoded values, into a new file, such as for a bug report.",
 )
 @click.option(
     "--systemd",
@@ -253,8 +253,8 @@ def command(
 
     async def read_again() -> None:
         new = _read(config)
-        geometry = geometry_of(new.settings)  # a mistake in it changes nothing else either
-        if config is not None and not buses:  # what the command line names is not the file's to change
+        geometry = geometry_of(new.settings)  # with a mistake in it, nothing is changed
+        if config is not None and not buses:  # buses of the command line do not change
             wanted_driver = new.settings.driver or DEFAULT_DRIVER
             if is_of_file and wanted_driver != driver_name:
                 raise ConfigurationError(
@@ -279,15 +279,15 @@ def command(
         slots=slots,
         group=group,
         geometry=geometry_of(settings),
-        on_ready=lambda: tell_ready(runner, as_json),
-        on_patches=lambda change: tell_patches(runner, change) if as_json else None,
+        on_ready=lambda: print_ready(runner, as_json),
+        on_patches=lambda change: print_patches(runner, change) if as_json else None,
     )
     with contextlib.ExitStack() as beside:
         if capture is not None:
             from skinware_drivers.cli.capturing import captured
 
-            beside.enter_context(captured(capture, name, place.name, lambda done: tell_capture(done, as_json)))
-        if profile is not None:  # not that of what records
+            beside.enter_context(captured(capture, name, place.name, lambda done: print_capture(done, as_json)))
+        if profile is not None:  # not for the recorder
             profile.apply()
         with asyncio.Runner(loop_factory=FlowLoop) as loop:
             loop.run(_run(runner, as_json, read_again))
@@ -295,7 +295,7 @@ def command(
 
 async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine[Any, Any, None]]) -> None:
     loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda _, context: _end(runner, context))  # by default it would be logged, and no more
+    loop.set_exception_handler(lambda _, context: _end(runner, context))  # which would only be logged by default
     reading: set[asyncio.Task[None]] = set()
 
     async def read_again() -> None:
@@ -339,7 +339,7 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
 
 
 def _end(runner: Runner, context: dict[str, Any]) -> None:
-    """What went wrong in the event loop outside of everything that is looked after: it ends the driver."""
+    """End the driver with an exception that nothing else caught in the event loop."""
     error = context.get("exception")
     if error is None:
         log.warning("%s", context["message"])
@@ -348,7 +348,7 @@ def _end(runner: Runner, context: dict[str, Any]) -> None:
 
 
 def _has_terminal() -> bool:
-    """Whether this process is attached to a terminal, wherever its input and output go."""
+    """Return whether this process is attached to a terminal, wherever its input and output go."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:
@@ -357,7 +357,7 @@ def _has_terminal() -> bool:
 
 
 def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:
-    """The real-time profile that was asked for; CPUs alone ask for the normal one."""
+    """Return the requested real-time profile; with CPUs alone, the normal one."""
     from skinware.realtime import Profile, cpus_from_text
 
     chosen = configured_cpus if cpus is None else cpus_from_text(cpus)
@@ -367,7 +367,7 @@ def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[i
 
 
 def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
-    """Refuse a bus that would silently go without what the file says of its own buses."""
+    """Refuse a bus without options, if the file has options for other buses only."""
     known = [bus.name for bus in settings.bus]
     for name in buses:
         if name not in known and any(bus.options for bus in settings.bus):
@@ -378,16 +378,16 @@ def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
 
 
 def _refuse_twice(bus_names: Sequence[str]) -> None:
-    """Refuse a bus that stands there twice: its boards would be set up twice, and be two skins."""
+    """Refuse a bus that is named twice: its boards would be set up twice."""
     from skinware_drivers.bus_names import parse_bus_name, place_of_bus
 
     seen: dict[BusPlace, str] = {}
     for name in bus_names:
-        parse_bus_name(name)  # refuses what is no name
+        parse_bus_name(name)  # refuses bad names
         place = place_of_bus(name)
         if place in seen:
             also = f", also as {seen[place]}" if seen[place] != name else ""
-            raise ConfigurationError(f"bus {name} is named twice{also}; a driver has each of its buses once")
+            raise ConfigurationError(f"bus {name} is named twice{also}; name each bus once")
         seen[place] = name
 
 

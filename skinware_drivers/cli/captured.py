@@ -12,7 +12,7 @@ from click.core import ParameterSource
 
 from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import hardware_values, value_of
+from skinware_drivers.cli.hardware_options import hardware_values, own_values
 
 if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
@@ -69,7 +69,7 @@ def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] |
 
     if not arguments:
         return None, {}
-    name = value_of("--driver", list(arguments)) or driver_type_of(capture)
+    name = own_values(driver_command, arguments).get("driver_name") or driver_type_of(capture)
     context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
     driver = load_driver(name)
     chosen = {

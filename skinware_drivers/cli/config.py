@@ -191,7 +191,7 @@ def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
     from skinware_drivers.options.file import ConfigFile
-    from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver
+    from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
 
     file = ConfigFile(config)
     driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
@@ -202,7 +202,7 @@ def _adapter(
         if not equals:
             raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
         given[key] = value
-    adapter_class = class_for(driver, bus_name, driver_type)
+    adapter_class = NamedBus(bus_name, driver_type).choose(driver)
     return driver_type, adapter_class(file.options_of_bus(driver.Options, bus_name, given))
 
 

@@ -16,26 +16,27 @@ if TYPE_CHECKING:
 
 
 def print_ready(runner: Runner, as_json: bool) -> None:
-    if runner.generation is None:
+    if runner.builder.generation is None:
         return
-    structure = runner.generation.tables.structure
+    structure = runner.builder.generation.tables.structure
     buses = [line.name for line in runner.lines]
     if as_json:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
-        ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
-        latency_ms = int(runner.generation.publisher.latency_ns[0]) / 1e6
+        identity = {"driver": runner.identity.driver_type, "name": runner.identity.name}
+        ready: dict[str, Any] = {"event": "ready", **identity, **counts}
+        latency_ms = int(runner.builder.generation.publisher.latency_ns[0]) / 1e6
         print_json({**ready, "types": types, "buses": buses, "latency_ms": latency_ms})
     else:
         patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
         what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
-        echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
+        echo(f"{runner.identity.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
 
 
 def print_patches(runner: Runner, change: PatchChange) -> None:
     """Print for programs that patches fell silent, or are live again; people see it in the log."""
     if runner.ready:
-        print_json({"event": "patches", "name": runner.name, **change._asdict()})
+        print_json({"event": "patches", "name": runner.identity.name, **change._asdict()})
 
 
 def print_capture(capture: Capture, as_json: bool) -> None:
@@ -57,7 +58,7 @@ async def report(runner: Runner) -> None:
         await asyncio.sleep(1)
         if runner.ready:
             try:
-                print_json({"event": "status", "name": runner.name, **runner.status()})
+                print_json({"event": "status", "name": runner.identity.name, **runner.status()})
             except BrokenPipeError:
                 runner.stop()
                 return

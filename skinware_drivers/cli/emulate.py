@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, namespace_option, run, seconds, version_option
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
+from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import msgspec
 
     from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
@@ -28,11 +30,11 @@ _LONGEST_COMMAND = {"can": 8, "serial": 4096, "modbus": 4096}
 class EmulateCommand(HardwareCommand):
     """The command, with the options of the chosen emulator."""
 
-    def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
+    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
         from skinware_drivers.loading import short_name
         from skinware_drivers.virtual.hardware import load_emulator
 
-        driver = value_of("--driver", args) or _DEFAULT_DRIVER
+        driver = given.get("driver") or _DEFAULT_DRIVER
         return f"emulated {short_name(driver)}", load_emulator(driver).Options
 
 

@@ -96,7 +96,7 @@ async def look(
         ConfigurationError: one of ``driver_names`` does not exist, or one of ``buses`` is not the name of a bus.
     """
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.bus_names import is_only_asked
+    from skinware_drivers.bus_names import BusName
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import Detection, can_interfaces, detect_adapters
     from skinware_drivers.finding.looking import listen
@@ -106,11 +106,11 @@ async def look(
     drivers = known_drivers("can", driver_names)
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
-    networks = [name for name in others if is_only_asked(name)]
+    networks = [name for name in others if BusName.of(name).is_only_asked]
     for name in networks:
         make_bus(name)  # refuses bad names, also without --probe
     buses_to_hear = [one.name for one in interfaces if one.up]
-    buses_to_hear += [name for name in others if not is_only_asked(name)]
+    buses_to_hear += [name for name in others if not BusName.of(name).is_only_asked]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
     detection: Detection
     detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
@@ -208,7 +208,7 @@ def _can_data(
 ) -> dict[str, Any]:
     import msgspec
 
-    from skinware_drivers.can.interface import NO_CAN
+    from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.interfaces import NO_INTERFACE, kernel_has_can
 
     in_kernel = kernel_has_can()

@@ -9,7 +9,7 @@ import click
 
 from skinware.cli._terminal import style
 from skinware.text import count_text, plural
-from skinware_drivers.bus_names import is_only_asked
+from skinware_drivers.bus_names import BusName
 
 _WIDTH = 80
 _MOST_CLASSES = 6
@@ -73,7 +73,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
     if bus["used_by"] is not None:
         lines += _wrapped(f"{bus['used_by']} runs on it")
     heard, probe = bus["heard"], bus["probe"]
-    if heard is None and probe is None and bus["used_by"] is None and is_only_asked(bus["bus"]):
+    if heard is None and probe is None and bus["used_by"] is None and BusName.of(bus["bus"]).is_only_asked:
         lines += _wrapped(
             f"not opened, because a connection may change what a device does; to ask which device is on it:"
             f" skin-find {bus['bus']} --probe"

@@ -11,7 +11,7 @@ from skinware.driver_service import DriverReader
 from skinware.drivers import Drivers
 from skinware.errors import BusNotAvailable, ConfigurationError, NamespaceError
 from skinware.memory.namespace import ROOT, Namespace
-from skinware_drivers.bus_names import BusPlace, place_of_bus
+from skinware_drivers.bus_names import BusName, BusPlace
 from skinware_drivers.serial.opening import SerialOptions, find_port
 
 _PREFIX = "skinware."
@@ -64,7 +64,7 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 
 
 def same_bus(one: str, other: str) -> bool:
-    """Whether two names, of one program or of two, mean one bus now, by :func:`place_of_bus`.
+    """Whether two names, of one program or of two, mean one bus now, by their :class:`BusPlace`.
 
     Serial lines that are named by their USB device are where that is plugged in now; while it is not plugged in, the
     names alone are compared. A ``virtual`` bus is nobody else's: each process has its own.
@@ -74,10 +74,10 @@ def same_bus(one: str, other: str) -> bool:
 
 
 def _place_now(bus_name: str) -> BusPlace:
-    place = place_of_bus(bus_name)
+    place = BusName.of(bus_name).place
     if (place.interface, place.channel) == ("serial", ""):
         with contextlib.suppress(BusNotAvailable, ConfigurationError):
             usb = dict(place.options)
             device = SerialOptions(serial_number=usb["serial_number"], vid_pid=usb["vid_pid"])
-            return place_of_bus(find_port("", device))
+            return BusName.of(find_port("", device)).place
     return place

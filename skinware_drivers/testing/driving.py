@@ -17,8 +17,9 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.flow import FlowLoop
-from skinware_drivers.running.runner import PublishMode, Runner
+from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.streams.tcp import TcpServerBus
 from skinware_drivers.testing.defect import defect, require

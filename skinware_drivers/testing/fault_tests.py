@@ -261,7 +261,7 @@ def _show(
     decoder: Decoder, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], silent: int | None
 ) -> npt.NDArray[np.bool_]:
     """Show frames without those of one kind, and return (n_sensors,) bool: the sensors that they have values of."""
-    batch = FrameBatch(len(wire) + decoder.headroom, wire.dtype["payload"].shape[0], decoder.headroom)
+    batch = FrameBatch(len(wire) + decoder.compiled.headroom, wire.dtype["payload"].shape[0], decoder.compiled.headroom)
     decoder.put_back(batch)
     rows = slice(batch.stop, batch.stop + len(wire))
     batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0

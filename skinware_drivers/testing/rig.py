@@ -92,9 +92,9 @@ class Recorder:
 
     def look(self, runner: Runner) -> None:
         if self.reader is None:
-            if runner.writer is None or runner.writer.closed:
+            if runner.builder.writer is None or runner.builder.writer.closed:
                 return
-            self.reader = DriverReader(runner.name)
+            self.reader = DriverReader(runner.identity.name)
         while True:
             last = self.frames[-1].position if self.frames else None
             newest = self.reader.refresh()
@@ -215,7 +215,7 @@ class Running(Rig):
 
         def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
             unwanted = offer(batch, rows)
-            self.answers += len(rows) if runner.generation is None else len(rows) - len(unwanted)
+            self.answers += len(rows) if runner.builder.generation is None else len(rows) - len(unwanted)
             return unwanted
 
         link.offer = offer_and_count  # type: ignore[method-assign]

@@ -131,11 +131,11 @@ class Heard:
     """
 
     def __init__(self, rig: Running) -> None:
-        if rig.runner is None or rig.runner.generation is None:
+        if rig.runner is None or rig.runner.builder.generation is None:
             defect("the driver publishes nothing yet")
         self._rig = rig
         self.takes: list[Take] = []
-        self.tables: SkinTables = rig.runner.generation.tables
+        self.tables: SkinTables = rig.runner.builder.generation.tables
         receive = rig.bus.receive
 
         def listen(batch: FrameBatch, ordinal: int) -> int:
@@ -346,7 +346,7 @@ def _suffer(recording: Recording, troubles: Sequence[Trouble]) -> tuple[Indices,
 
 
 def _batch_of(decoder: Decoder, wire: npt.NDArray[Any], time_ns: Indices) -> FrameBatch:
-    batch = FrameBatch(len(wire), wire.dtype["payload"].shape[0], decoder.headroom)
+    batch = FrameBatch(len(wire), wire.dtype["payload"].shape[0], decoder.compiled.headroom)
     batch.stop = batch.start + len(wire)
     batch.wire[batch.start : batch.stop] = wire
     batch.time_ns[batch.start : batch.stop] = time_ns

@@ -108,7 +108,7 @@ class DirectPath:
             namespace=self._namespace,
         )
         publisher = Publisher(self._writer, self.decoder, Watch(tables), 1.0, by_cycle=False)
-        self._batch = FrameBatch(1, payload_size, self.decoder.headroom)
+        self._batch = FrameBatch(1, payload_size, self.decoder.compiled.headroom)
         self._path = NativePath(self.decoder, publisher, self._batch)
 
     @property

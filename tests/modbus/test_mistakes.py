@@ -95,7 +95,7 @@ def test_blocks_of_several_patches_may_have_the_same_channels() -> None:
         ("modbus:", r"over TCP that is modbus:tcp://HOST, and a serial port modbus:/dev/ttyUSB0"),
         ("modbus:ttyUSB0", r"or modbus:\./ttyUSB0"),
         ("modbus:tcp://::1:502", r"an IPv6 address stands in brackets; write modbus:tcp://HOST:PORT"),
-        ("modbus:tcp://host:abc", r"'abc' is no number of a port"),
+        ("modbus:tcp://host:abc", r"'abc' is no port number"),
         ("modbus:tcp://host:99999", r"ports have numbers up to 65535"),
         ("modbus:tcp://host:502&byte_order=little", r"options begin with a question mark"),
         ("modbus:tcp://host?byte_order=middle", r"option byte_order=middle: give one of big, little$"),

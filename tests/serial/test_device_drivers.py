@@ -80,7 +80,7 @@ def test_it_is_unplugged_and_comes_back_as_another(
     bus = SerialBus(str(link), payload_size=driver.payload_size)
 
     def is_live(running: Driving, count: int) -> bool:
-        generation = running.runner and running.runner.generation
+        generation = running.runner and running.runner.builder.generation
         if not generation or generation.tables.structure.n_sensors != count:
             return False
         return bool(running.status()["patches"][0]["state"] == "live")

@@ -42,7 +42,7 @@ def test_a_device_that_hangs_up_is_called_again_and_again(namespace: object) -> 
     bus = make_bus(f"tcp://{LOCAL}:{port}", payload_size=adapter.payload_size)
     device = f"tcp://{LOCAL}:{port}"
     with driving_lines([(adapter, bus)], "wts", wait=False, wait_for_buses=True) as driving:
-        wait_until(lambda: driving.runner is not None and driving.runner.lines[0].lost.is_set())
+        wait_until(lambda: driving.runner is not None and driving.runner.lines[0].connection.lost.is_set())
         for _ in range(2):
             with emulated_on(make_bus(device, payload_size=4096, for_devices=True), emulator):
                 driving.wait()

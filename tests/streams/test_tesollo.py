@@ -141,7 +141,7 @@ class Says:
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ("0007 08 5F22 0105", "does not tell which sensors it has: say sensors"),
+        ("0007 08 5F22 0105", "does not report its sensors: say sensors"),
         ("0009 08 5F22 0105 00 00", "says it has no sensors"),
         ("0009 08 5F22 0105 03 00", "says it has no sensors"),
         ("0009 08 5F22 0105 09 1F", "says it has no sensors"),

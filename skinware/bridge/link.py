@@ -31,9 +31,6 @@ class Question:
     """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
 
     Attributes:
-        key: under which it was asked.
-        parameters: by name.
-        payload: bytes that came with it.
         reply: sends the answer.
         fail: sends the reason why there is no answer.
     """
@@ -95,12 +92,7 @@ def directly(call: Callable[[Any], None], over: Callable[[], None] | None = None
 
 
 class Sender:
-    """Sends bytes to all listeners without waiting; a receiver that is too slow misses some.
-
-    Args:
-        publisher: of zenoh.
-        close: ends it.
-    """
+    """Sends bytes to all listeners without waiting; a receiver that is too slow misses some."""
 
     def __init__(self, publisher: zenoh.Publisher, close: Callable[[], None]) -> None:
         self._publisher, self.close = publisher, close
@@ -120,9 +112,6 @@ class Sender:
 
 class Link:
     """A session of zenoh.
-
-    Args:
-        endpoints: where it listens and connects.
 
     Raises:
         BridgeError: it cannot be opened; the message says what to do.
@@ -259,11 +248,9 @@ _MOST_KINDS = 256
 class Guard:
     """Counts messages that cannot be read or used.
 
-    Args:
-        report: called with (kind of message, reason) for the first message of each kind, in the thread that found it.
+    ``report`` gets (kind of message, reason) for the first message of each kind, in the thread that found it.
 
     Attributes:
-        count: messages so far.
         last: kind and reason of the last one; empty: none so far.
     """
 

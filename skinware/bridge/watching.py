@@ -41,12 +41,7 @@ _MOST_NAMES = 4
 
 
 class Summaries:
-    """Sends the summary of a robot while there are listeners.
-
-    Args:
-        namespace: that is served.
-        send: sends it.
-    """
+    """Sends the summary of a robot while there are listeners."""
 
     def __init__(self, namespace: str, send: Sender) -> None:
         self._namespace, self._host, self._send = namespace, host_name(), send
@@ -118,10 +113,7 @@ class Seen:
     """A robot that is reached.
 
     Attributes:
-        robot: its name.
-        instance: number of the bridge that serves it.
-        version: of that bridge.
-        clock: of the robot.
+        instance, version: of the bridge that serves it.
         summary: the last one; None: none so far.
         told_ns: when that came; 0: never.
         bytes: of all summaries so far.

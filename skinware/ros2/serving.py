@@ -18,7 +18,7 @@ from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service import ServiceReader
 from skinware.service._tap import wake_word_of
-from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, bus_reason_name, bus_state_name, life_of
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, bus_state_name, life_of
 from skinware.status import BusState
 from skinware.views.live import LiveDriver, LiveDrivers
 
@@ -29,11 +29,15 @@ _LIFE_NS = NS_PER_S // 5
 _TARE_S = 10.0
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 _LEVEL_OF_LIFE = {SILENT: Level.STALE, PAUSED: Level.WARN, DEAD: Level.ERROR}
-_LEVEL_OF_BUS = {int(BusState.LIVE): Level.OK, int(BusState.CONNECTING): Level.WARN, int(BusState.SILENT): Level.WARN}
+_LEVEL_OF_BUS = {
+    bus_state_name(BusState.LIVE): Level.OK,
+    bus_state_name(BusState.CONNECTING): Level.WARN,
+    bus_state_name(BusState.SILENT): Level.WARN,
+}
 
 
 @dataclass(frozen=True)
-class DriverReport:
+class ServedReport:
     """State of a driver, and traffic of its topics.
 
     Attributes:
@@ -58,14 +62,10 @@ class _Served:
     """A driver that was found at any time.
 
     Attributes:
-        topics: of it.
-        end_tare: ends its service.
-        frame: the newest one.
         due_ns: when point clouds and images are due.
         look_ns: when to look whether it lives.
         is_over: its frame was published as the last one.
         wants_frames: each frame was wanted when the newest one was taken.
-        lost: as :attr:`DriverReport.lost`.
     """
 
     topics: DriverTopics
@@ -154,17 +154,17 @@ class Ros2Server:
             self._transforms.close()
         self._live.close()
 
-    def drivers(self) -> Mapping[str, DriverReport]:
+    def drivers(self) -> Mapping[str, ServedReport]:
         """Return the state of all drivers that were found at any time, by name."""
         reports = {}
         for name, served in self._served.items():
             live, traffic = self._live.get(name), (served.lost, served.topics.messages, served.topics.left_out)
             if live is None:
-                reports[name] = DriverReport(GONE, 0.0, None, *traffic)
+                reports[name] = ServedReport(GONE, 0.0, None, *traffic)
                 continue
-            health = live.health()
-            age_ms = None if health.age_ns is None else health.age_ns / 1e6
-            reports[name] = DriverReport(health.life, health.rate_hz, age_ms, *traffic)
+            report = live.report()
+            age_ms = None if report.age_ns is None else report.age_ns / 1e6
+            reports[name] = ServedReport(report.life, report.rate_hz, age_ms, *traffic)
         return reports
 
     # -- frames ---------------------------------------------------------------------------------------------------
@@ -251,25 +251,21 @@ class Ros2Server:
 
 def _statuses_of(driver: LiveDriver) -> Iterator[Status]:
     """Yield the status of a driver, and of each of its buses while it lives."""
-    health, frame = driver.health(), driver.frame
-    is_live = health.life == LIVE
-    fresh = health.statuses["fresh"]
-    words = f"{fresh} of {health.sensors} sensors are fresh" if is_live else health.life
-    level = _LEVEL_OF_LIFE.get(health.life, Level.WARN)
-    if is_live and frame is not None and fresh == health.sensors:
+    report = driver.report()
+    is_live = report.life == LIVE
+    words = f"{report.fresh} of {report.sensors} sensors are fresh" if is_live else report.life
+    level = _LEVEL_OF_LIFE.get(report.life, Level.WARN)
+    if is_live and report.age_ns is not None and report.fresh == report.sensors:
         level = Level.OK
-    values = {"state": health.life, "sensors": str(health.sensors)}
-    if health.rate_hz is not None:
-        values["rate_hz"] = f"{health.rate_hz:.1f}"
-    if health.age_ns is not None:
-        values["age_ms"] = f"{health.age_ns / NS_PER_S * 1e3:.1f}"
-    counts = {**health.statuses, **{f"patches {state}": n for state, n in health.patches.items()}, **health.counters}
+    values = {"state": report.life, "sensors": str(report.sensors)}
+    if report.rate_hz is not None:
+        values["rate_hz"] = f"{report.rate_hz:.1f}"
+    if report.age_ns is not None:
+        values["age_ms"] = f"{report.age_ns / NS_PER_S * 1e3:.1f}"
+    patches = {f"patches {state}": n for state, n in report.patch_states.items()}
+    counts = {**report.statuses, **patches, **report.counters}
     values |= {name: str(count) for name, count in counts.items() if count}
     yield Status(level, f"skin: {driver.name}", words, driver.reader.driver_type, values)
-    if frame is None or not is_live:
-        return
-    for name, state, reason in zip(
-        frame.structure.buses, frame.bus_state.tolist(), frame.bus_reason.tolist(), strict=True
-    ):
-        words = ": ".join(filter(None, (bus_state_name(state), bus_reason_name(reason))))
-        yield Status(_LEVEL_OF_BUS.get(state, Level.ERROR), f"skin: {driver.name}: {name}", words, name, {})
+    for bus in report.buses if is_live else ():
+        words = ": ".join(filter(None, (bus.state, bus.reason)))
+        yield Status(_LEVEL_OF_BUS.get(bus.state, Level.ERROR), f"skin: {driver.name}: {bus.name}", words, bus.name, {})

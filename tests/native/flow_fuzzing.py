@@ -24,7 +24,7 @@ from skinware.driver_service import DriverWriter
 from skinware.wire import read_pieces
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import read_own
 from skinware_drivers.decoding.decoder import Decoder

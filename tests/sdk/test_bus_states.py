@@ -15,7 +15,7 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions

@@ -12,7 +12,7 @@ import pytest
 from skinware.errors import HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import PatchState
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions

@@ -24,8 +24,8 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
 from skinware.status import DataPath, load_report
-from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.health_service import KIND as HEALTH_KIND
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.views.health import (
     bus_reason_name,

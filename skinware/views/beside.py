@@ -18,7 +18,7 @@ from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.motion_service import MotionReader, MotionSample
-from skinware.tactile.source_reader import SourceReader
+from skinware.tactile.source_service import SourceReader
 from skinware.views.live import LiveDriver, LiveDrivers
 
 ReaderT = TypeVar("ReaderT", bound=ServiceReader[Any])

@@ -11,7 +11,7 @@ from skinware.matrices import filled_by
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.chain_health import ChainHealth
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware_drivers.doctor.evidence import HealthSeen, TaxelFault
 
 

@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 from skinware.cli._command import warn
 from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
-from skinware.cli._format import plural, terminal_width
 from skinware.cli._heat_map import arrange
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import echo, print_json, terminal_width
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
 from skinware.tactile.calibration.sources import LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
+from skinware.text import plural
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Of a sensor: nothing at all; in between; all that is wanted."""

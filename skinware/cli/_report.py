@@ -10,9 +10,7 @@ import msgspec
 import numpy as np
 
 from skinware import bridge_state
-from skinware.cli import _bridges
-from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
-from skinware.cli._terminal import echo, print_json, style
+from skinware.cli._terminal import echo, print_json, style, terminal_width
 from skinware.driver_service import KIND, DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
@@ -23,11 +21,7 @@ from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
-from skinware.status import DataPath, load_report
-from skinware.tactile.health import HealthKind, HealthReport
-from skinware.tactile.health_service import NAME as HEALTH_KIND
-from skinware.tactile.health_service import HealthReader, HealthSample
-from skinware.views.health import (
+from skinware.state import (
     bus_reason_name,
     bus_state_name,
     life_of,
@@ -37,6 +31,12 @@ from skinware.views.health import (
     status_now,
     untouched,
 )
+from skinware.status import DataPath, load_report
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import NAME as HEALTH_KIND
+from skinware.tactile.health_service import HealthReader, HealthSample
+from skinware.text import age_text, count_text, plural, table, wrapped
+from skinware.views import bridges
 
 SampleT = TypeVar("SampleT", bound=Sample)
 
@@ -119,7 +119,7 @@ def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
     """What a bridge tells of itself; None before it has told anything."""
     with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
         frame = _newest(reader)
-        return None if frame is None else {"robot": frame.state.robot, **_bridges.as_data(frame.state)}
+        return None if frame is None else {"robot": frame.state.robot, **bridges.as_data(frame.state)}
 
 
 def _newest(service: ServiceReader[SampleT]) -> SampleT | None:

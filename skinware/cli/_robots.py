@@ -21,20 +21,10 @@ from skinware.cli._command import (
     signals_end,
     tls_option,
 )
-from skinware.cli._format import (
-    NO_VALUE,
-    age_text,
-    count_text,
-    plural,
-    rate_text,
-    redraw,
-    state_shown,
-    table,
-    terminal_width,
-)
-from skinware.cli._terminal import echo, print_json, style
+from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text, state_shown, table
 
 if TYPE_CHECKING:
     from skinware.bridge import Watcher

@@ -10,6 +10,7 @@ import os
 import re
 import secrets
 import select
+import shutil
 import stat
 import sys
 import threading
@@ -21,7 +22,7 @@ from typing import Any, TextIO
 import click
 import msgspec
 
-from skinware._printable import printable
+from skinware.text import printable
 
 _MOST_WAITING = 1 << 20
 """Bytes that wait to be read; what comes after them is left out."""
@@ -210,7 +211,17 @@ def overwrite(text: str, *, err: bool = False) -> None:
     click.echo(f"\r{shown(text)}\x1b[K", nl=False, err=err, color=True)
 
 
-def repaint(lines: list[str]) -> None:
+def terminal_width() -> int | None:
+    """Return the columns of the terminal on stdout; None without a terminal, where lines may have any length."""
+    is_terminal = sys.stdout is not None and sys.stdout.isatty()
+    return shutil.get_terminal_size().columns if is_terminal else None
+
+
+def redraw(lines: list[str]) -> None:
+    """Replace the text on the terminal without flicker; lines that do not fit are cut."""
+    height = shutil.get_terminal_size().lines - 1
+    if len(lines) > height:
+        lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
     if click.get_current_context().color is False:
         lines = [click.unstyle(line) for line in lines]
     text = "".join(f"{shown(line)}\x1b[K\n" for line in lines)

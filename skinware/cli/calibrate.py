@@ -124,11 +124,11 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     """
     import numpy as np
 
-    from skinware.cli._format import plural
     from skinware.geometry import geometry_to_toml
     from skinware.tactile.calibration.results import unrolled_comment, unrolled_groups
     from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
+    from skinware.text import plural
 
     how = _How(**options)
     with _opened(_beside(file, how), StrokeSession, how) as (gathering, session):

@@ -68,8 +68,9 @@ def command(
 
     A line of text has the minimum, maximum and mean of the fresh sensors of each type. JSON has everything.
     """
-    from skinware.cli._format import terminal_width, wrapped
+    from skinware.cli._terminal import terminal_width
     from skinware.memory.namespace import Namespace
+    from skinware.text import wrapped
 
     if physical:
         if counts:
@@ -112,7 +113,7 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
     """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
-    from skinware.cli._format import age_text, figure_text
+    from skinware.text import age_text, figure_text
 
     parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
     all_values = frame.values if counts else _physical(frame)
@@ -209,8 +210,8 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverSnapshot]:
     """Frames indefinitely, over restarts of the driver; says on stderr when it came back."""
-    from skinware.cli._format import plural
     from skinware.errors import StructureChanged
+    from skinware.text import plural
 
     generation = reader.generation
     while True:

@@ -48,8 +48,8 @@ def command() -> None:
 @json_option
 def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None:
     """List regions, and how many sensors the running drivers have in each."""
-    from skinware.cli._format import plural
     from skinware.skin import Skin
+    from skinware.text import plural
 
     regions = regions_of(files)
     with Skin(namespace) as skin:
@@ -145,7 +145,7 @@ class _Painter:
     """
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
-        from skinware.views.quantities import Rest
+        from skinware.views.history import Rest
 
         self._reader, self._as_json = reader, as_json
         self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
@@ -159,7 +159,7 @@ class _Painter:
         from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.regions import without_holes
-        from skinware.views.quantities import SETTLING_S
+        from skinware.views.history import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):
             self._touched(frame)
@@ -179,7 +179,7 @@ class _Painter:
     def _touched(self, frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
         """(n,) bool: which sensors of the type are far from rest."""
         from skinware.cli._driver_snapshots import physical_of
-        from skinware.views.wiping import threshold
+        from skinware.views.history import threshold
 
         physical = physical_of(frame, self.type_name)
         fresh = frame.status == 0

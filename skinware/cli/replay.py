@@ -25,8 +25,7 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
-from skinware.cli._format import terminal_width
-from skinware.cli._terminal import echo, overwrite, print_json
+from skinware.cli._terminal import echo, overwrite, print_json, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from skinware.cli._command import (
     seconds,
     version_option,
 )
-from skinware.cli._format import count_text, figure_text, plural
 from skinware.cli._terminal import echo, overwrite, print_json
+from skinware.text import count_text, figure_text, plural
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -87,8 +87,7 @@ class _Wipe:
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 
-        from skinware.views.quantities import Rest
-        from skinware.views.wiping import WipeTest
+        from skinware.views.history import Rest, WipeTest
 
         self._reader, self._as_json = reader, as_json
         self._structure = reader.structure
@@ -99,8 +98,7 @@ class _Wipe:
 
     def go_on(self, duration_s: float | None) -> None:
         from skinware.cli._driver_snapshots import after
-        from skinware.views.quantities import SETTLING_S
-        from skinware.views.wiping import threshold
+        from skinware.views.history import SETTLING_S, threshold
 
         resting = None
         for frame, physical in self._frames(SETTLING_S):

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from skinware_drivers.can.interface import Controller, read_controller
+from skinware_drivers.can.controller import Controller, read_controller
 
 _STATES = ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF", "STOPPED", "SLEEPING")
 _ARPHRD_CAN = 280

@@ -11,7 +11,7 @@ from skinware.errors import BusError, BusNotAvailable, ConfigurationError, Hands
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_names import is_only_asked
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, guess, likely, with_default_options
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.registry import make_bus
@@ -161,7 +161,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
             continue
         try:
             kind = "modbus" if driver.medium == "modbus" else "serial"
-            bus_name = path if is_only_asked(path) else f"{kind}:{path}"
+            bus_name = path if BusName.of(path).is_only_asked else f"{kind}:{path}"
             bus = make_bus(bus_name, payload_size=adapter.payload_size)
             adapter.fit(bus)
             told = await _ask_all(bus, path, {name: driver}, idle=False)

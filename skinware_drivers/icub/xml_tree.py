@@ -10,8 +10,8 @@ from xml.parsers import expat
 
 import msgspec
 
-from skinware._printable import printable
 from skinware.errors import ConfigurationError
+from skinware.text import printable
 
 Level = Literal["todo", "odd", "unknown", "missing", "info"]
 """``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not

@@ -221,9 +221,9 @@ class _Published:
 
     def look(self, runner: Runner, namespace: Namespace) -> None:
         if self._reader is None:
-            if runner.writer is None or runner.writer.closed:
+            if runner.builder.writer is None or runner.builder.writer.closed:
                 return
-            self._reader = DriverReader(runner.name, namespace=namespace, announce=False)
+            self._reader = DriverReader(runner.identity.name, namespace=namespace, announce=False)
         while self._reader.refresh() not in (None, self._last):
             try:
                 frame = next(self._reader.in_order(timeout_s=0))

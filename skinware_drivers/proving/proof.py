@@ -12,8 +12,8 @@ from typing import Any
 
 import msgspec
 
-from skinware._printable import printable
 from skinware.errors import ConfigurationError
+from skinware.text import printable
 from skinware_drivers.doctor.report import Secrets, scrubbed
 
 

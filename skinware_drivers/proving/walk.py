@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.cli._driver_snapshots import after, frames_until
-from skinware.cli._format import figure_text, plural
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
+from skinware.text import figure_text, plural
 from skinware_drivers.proving.proof import Proof, Verdict
 from skinware_drivers.proving.strokes import Matrix, judge
 

@@ -187,6 +187,6 @@ def test_a_robot_that_is_not_there_is_named(namespace: Namespace, here: Namespac
         assert "nothing listens there" in join.wait_for("trouble")["why"]
         with serving(port):
             assert (
-                f"there are: {ROBOT}"
+                f"robots there: {ROBOT}"
                 in join.wait_for("trouble", lambda event: "listens there, but" in event["why"])["why"]
             )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinware import Structure
-from skinware.views import health
+from skinware import state as health
 
 
 @pytest.fixture(autouse=True)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter
+from skinware import state as health
 from skinware.cli._command import exit_status
 from skinware.cli._terminal import shown
 from skinware.cli.info import as_text, command
@@ -21,7 +22,6 @@ from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.service import Columns
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, DataPath
-from skinware.views import health
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 

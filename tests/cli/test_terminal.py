@@ -16,7 +16,6 @@ import pytest
 import skinware
 import skinware_drivers
 from skinware import DriverWriter, Structure
-from skinware._printable import printable
 from skinware.cli._command import exit_status
 from skinware.cli._terminal import Formatter, echo, json_text, overwrite, shown, style
 from skinware.cli._top_app import _cell, _printable
@@ -24,6 +23,7 @@ from skinware.cli.top import show_lines
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
+from skinware.text import printable
 from tests.cli.test_all_commands import command_of
 
 HOSTILE = "\x1b]0;owned\x07\x1b[31m<b>[red]\x9b2J\u202eX"

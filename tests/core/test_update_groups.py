@@ -14,8 +14,8 @@ from skinware import DriverReader, DriverWriter, Structure
 from skinware.bridge.parts import Cut
 from skinware.errors import StructureError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.state import status_now
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
-from skinware.views.health import status_now
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled
 from tests.core.c_programs import structure as plain

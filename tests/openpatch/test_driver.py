@@ -202,8 +202,8 @@ def test_other_firmware_on_the_same_port_is_a_new_generation(firmware: Path) -> 
         wait_until(
             lambda: (
                 running.runner is not None
-                and running.runner.generation is not None
-                and running.runner.generation.tables.structure.n_modules == 1
+                and running.runner.builder.generation is not None
+                and running.runner.builder.generation.tables.structure.n_modules == 1
             )
         )
         with DriverReader("openpatch") as again:

@@ -17,8 +17,8 @@ from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording import Series, WireItem
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
-from skinware_drivers.bus_names import place_of_bus
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.bus_names import BusName
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.captures import check_capture
@@ -345,7 +345,9 @@ def test_files_that_cannot_be_replayed(tmp_path: Path) -> None:
 
 
 def test_two_recorded_buses_are_two_places() -> None:
-    places = [place_of_bus(f"replay:walk.mcap?bus={bus}&speed={speed}") for bus in ("can0", "can1") for speed in (1, 2)]
+    places = [
+        BusName.of(f"replay:walk.mcap?bus={bus}&speed={speed}").place for bus in ("can0", "can1") for speed in (1, 2)
+    ]
     assert places[0] == places[1] != places[2] == places[3]
 
 

@@ -58,6 +58,7 @@ def rest_after_a_take(
     line: Any = SimpleNamespace(
         bus=SimpleNamespace(receive=receive, fileno=lambda: read, asks=False),
         link=SimpleNamespace(is_awaiting=is_awaiting, expects_data=in_step),
+        condition=SimpleNamespace(heard_ns=0),
         ordinal=0,
     )
     try:
@@ -97,7 +98,8 @@ def test_a_wake_up_ends_in_time_however_much_waits() -> None:
         clock_ns += 15_000_000
 
     fd = os.eventfd(1)
-    line: Any = SimpleNamespace(bus=SimpleNamespace(receive=receive, fileno=lambda: fd), ordinal=0)
+    bus, condition = SimpleNamespace(receive=receive, fileno=lambda: fd), SimpleNamespace(heard_ns=0)
+    line: Any = SimpleNamespace(bus=bus, condition=condition, ordinal=0)
     with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
         patch.setattr(intake, "now_ns", lambda: clock_ns)
         epoll.register(fd, select.EPOLLIN)
@@ -126,7 +128,8 @@ def test_it_says_until_when_all_was_taken(first_ns: int, first_told_ns: int) -> 
 
     fd = os.eventfd(1, os.EFD_NONBLOCK)
     told: list[int] = []
-    line: Any = SimpleNamespace(bus=SimpleNamespace(receive=receive, fileno=lambda: fd), ordinal=0)
+    bus, condition = SimpleNamespace(receive=receive, fileno=lambda: fd), SimpleNamespace(heard_ns=0)
+    line: Any = SimpleNamespace(bus=bus, condition=condition, ordinal=0)
     with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
         patch.setattr(intake, "now_ns", lambda: clock_ns)
         epoll.register(fd, select.EPOLLIN)

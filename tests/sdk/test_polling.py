@@ -18,7 +18,7 @@ from skinware.errors import BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from skinware.bridge_state import BridgeState, ServiceState
-from skinware.cli._format import age_text, count_text, plural, rate_text, table
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.text import age_text, count_text, plural, rate_text, table
 
 _TITLES = ("service", "state", "mode", "rate", "age 50 %", "age 99 %", "not come")
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from skinware.cli._format import age_text, count_text, plural, rate_text, table, wrapped
+from skinware.text import age_text, count_text, plural, rate_text, table, wrapped
 
 
 @pytest.mark.parametrize(

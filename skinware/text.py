@@ -1,0 +1,147 @@
+"""Write numbers, times, tables and the text of others as people read them. Pure functions.
+
+All commands and views use these, so that an age or a count looks the same everywhere.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from skinware.status import Status
+
+NO_VALUE = "-"
+NOT_FRESH = "not fresh"
+"""Shown instead of ``live`` where frames arrive, but no sensor in them is fresh."""
+
+_BETWEEN = "  "
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def age_text(age_ns: float | None) -> str:
+    """Return a duration with its unit, in about two figures: ``40 us``, ``0.6 ms``, ``12 ms``, ``3.4 s``, ``5 min``."""
+    if age_ns is None:
+        return NO_VALUE
+    milliseconds = max(0.0, age_ns / 1e6)
+    if 0 < milliseconds < 0.0995:
+        return f"{max(1, round(milliseconds * 1e3))} us"
+    if milliseconds < 9.95:
+        return f"{milliseconds:.1f} ms"
+    if milliseconds < 999.5:
+        return f"{milliseconds:.0f} ms"
+    seconds = milliseconds / 1e3
+    if seconds < 99.95:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 99.5 else f"{minutes / 60:.0f} h"
+
+
+def age_text_ms(age_ms: float | None) -> str:
+    """Return a duration that is given in milliseconds, as :func:`age_text` does."""
+    return age_text(None if age_ms is None else age_ms * 1e6)
+
+
+def rate_text(rate_hz: float | None) -> str:
+    """Return a rate with its unit: ``0.25 Hz``, ``20.0 Hz``, ``1000 Hz``."""
+    if rate_hz is None:
+        return NO_VALUE
+    if 0 < rate_hz < 1:
+        return f"{rate_hz:.2f} Hz"
+    return f"{rate_hz:.1f} Hz" if rate_hz < 999.95 else f"{rate_hz:.0f} Hz"
+
+
+def count_text(count: int | None) -> str:
+    """Return a count with separated thousands: ``30,848``."""
+    return NO_VALUE if count is None else f"{count:,}"
+
+
+def figure_text(value: float, digits: int = 4) -> str:
+    """Return a measured value with this many digits, large ones whole: ``0.012``, ``150``, ``20,000``."""
+    return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
+
+
+def plural(count: int, what: str, several: str = "") -> str:
+    """Return a count and a noun: ``1 patch``, ``4 patches``."""
+    return f"{count_text(count)} {what if count == 1 else several or what + 's'}"
+
+
+def words(name: str) -> str:
+    """Return a name of the protocol as words: ``never_seen`` is ``never seen``."""
+    return name.replace("_", " ")
+
+
+def status_text(status: int) -> str:
+    """Return the bits of a sensor's status as words: ``stale, suspect``; ``fresh`` without any."""
+    return ", ".join(words(str(bit.name).lower()) for bit in Status if status & bit) or "fresh"
+
+
+def state_shown(state: str, fresh: int, sensors: int) -> str:
+    """Return a state for people: nothing without a fresh sensor is called live."""
+    return NOT_FRESH if state == "live" and sensors and not fresh else state
+
+
+def counters_text(counters: dict[str, int], *, besides: Sequence[str] = ()) -> str:
+    """Return the counters that are not 0, in the driver's own words, without those in ``besides``."""
+    return _BETWEEN.join(
+        f"{words(name)} {count_text(count)}" for name, count in counters.items() if count and name not in besides
+    )
+
+
+def table(
+    titles: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 1, width: int | None = None
+) -> list[str]:
+    """Return lines of aligned columns under their titles.
+
+    Args:
+        titles: one for each column.
+        rows: one text for each column.
+        left: the first so many columns are aligned left, the others right.
+        width: columns of a line; wider tables continue in a table below with the same first column.
+    """
+    lines = [list(titles), *(list(row) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(titles))]
+    parts = [[0]]
+    for column in range(1, len(titles)):
+        used = sum(widths[c] + len(_BETWEEN) for c in parts[-1])
+        if width is not None and used + widths[column] > width and len(parts[-1]) > 1:
+            parts.append([0])
+        parts[-1].append(column)
+    return [
+        _BETWEEN.join(line[c].ljust(widths[c]) if c < left else line[c].rjust(widths[c]) for c in columns).rstrip()
+        for columns in parts
+        for line in lines
+    ]
+
+
+def wrapped(line: str, width: int | None) -> list[str]:
+    """Return a line, which may contain colours, broken at ``width``; continuations are indented further."""
+
+    def length(text: str) -> int:
+        return len(_COLOUR.sub("", text))
+
+    if width is None or length(line) <= width:
+        return [line]
+    indent = line[: len(line) - len(line.lstrip())]
+    first, *others = line.lstrip().split(" ")
+    lines = [indent + first]
+    for word in others:
+        if length(lines[-1]) + 1 + length(word) <= width:
+            lines[-1] += f" {word}"
+        elif word:
+            lines.append(f"{indent}    {word}")
+    return lines
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return text of others with a question mark for every character that cannot be printed.
+
+    Nothing in it moves the cursor, changes colours, or turns the reading direction: control and format characters (also
+    of bidirectional text), lone surrogates and all line ends are replaced.
+
+    Args:
+        text: any.
+        keep: characters that stay.
+    """
+    if text.translate(dict.fromkeys(map(ord, keep))).isprintable():
+        return text
+    return "".join(sign if sign.isprintable() or sign in keep else "?" for sign in text)

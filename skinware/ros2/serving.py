@@ -62,14 +62,10 @@ class _Served:
     """A driver that was found at any time.
 
     Attributes:
-        topics: of it.
-        end_tare: ends its service.
-        frame: the newest one.
         due_ns: when point clouds and images are due.
         look_ns: when to look whether it lives.
         is_over: its frame was published as the last one.
         wants_frames: each frame was wanted when the newest one was taken.
-        lost: as :attr:`ServedReport.lost`.
     """
 
     topics: DriverTopics

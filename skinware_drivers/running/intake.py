@@ -58,12 +58,17 @@ class Intake:
         self._by_fd: dict[int, BusLine] = {}
 
     def start(self) -> None:
+        self._end_rest()  # two looks pending would be one that stop() does not know
         asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._look)
 
     def stop(self) -> None:
         asyncio.get_running_loop().remove_reader(self._epoll.fileno())
+        self._end_rest()
+
+    def _end_rest(self) -> None:
         if self._rest is not None:
             self._rest.cancel()
+            self._rest = None
 
     def take(self) -> Literal["nothing", "all", "some"]:
         """Take the frames that have arrived; ``some``: more are waiting."""

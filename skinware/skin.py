@@ -12,8 +12,8 @@ from skinware.drivers import Drivers
 from skinware.errors import Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.geometry import Geometry
 from skinware.memory import futex
-from skinware.memory.look import Look, PythonsTurn, look_at
 from skinware.memory.namespace import Namespace
+from skinware.memory.take import NEWER, NEWEST, Take, take_of
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._tap import Tap
 from skinware.skin_layout import SkinLayout
@@ -78,7 +78,7 @@ class Skin:
             only_living=True,
         )
         self._layout = SkinLayout((), ())
-        self._in_c: Look[DriverSnapshot] | None = None
+        self._in_c: Take[DriverSnapshot] | None = None
         self._latest: Snapshot | None = None  # the one that C waits for newer data than
         self._next_check_ns = 0
         self._closed = False
@@ -175,13 +175,14 @@ class Skin:
                 reader.tell()
         if self._in_c is None or self._closed or (known is not None and known is not self._latest):
             return False, None
-        try:
-            frames = self._in_c.newest(None if known is None else min(deadline_ns, self._drivers.next_look_ns))
-        except PythonsTurn:
-            self._in_c = None
-            return False, None
-        if frames is None:
-            return True, None
+        if known is None:
+            frames = self._in_c.next(NEWEST, 0)
+        else:
+            frames = self._in_c.next(NEWER, min(deadline_ns, self._drivers.next_look_ns) - now_ns())
+        if not frames:
+            if frames is None:
+                self._in_c = None
+            return frames is not None, None
         self._latest = Snapshot(self._layout, frames)
         return True, self._latest
 
@@ -189,7 +190,7 @@ class Skin:
         """Leave the looks after this one to C until something else happens than samples."""
         rings = [reader.ring_in_c() for reader in self._drivers.readers.values()]
         if self._in_c is None or self._in_c.rings != rings:
-            self._in_c = look_at(rings)
+            self._in_c = take_of(rings)
         self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> Snapshot | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from skinware.errors import ConfigurationError
 from skinware.text import age_text, count_text, plural
-from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.doctor.evidence import Counted, Evidence
 from skinware_drivers.operations import operations_of
 from skinware_drivers.registry import load_driver
@@ -176,7 +176,7 @@ def names_of_bus(bus_name: str) -> dict[str, str]:
 
     Emulated and replayed buses exist in the process of their driver only, so that they have neither.
     """
-    interface, channel, options = place_of_bus(bus_name)
+    interface, channel, options = BusName.of(bus_name).place
     address, _, query = bus_name.partition("?")
     placing = "&".join(part for part in query.split("&") if part.partition("=")[0] in dict(options))
     names = {} if interface in ("virtual", "replay") else {"name": f"{address}?{placing}" if placing else address}

@@ -20,7 +20,7 @@ from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import ROOT, Namespace
 from skinware.memory.ring import Sample
 from skinware.service import ServiceReader
-from skinware.views.beside import LiveBridges
+from skinware.views.live import LiveBridges
 from skinware_drivers.doctor.evidence import (
     Counted,
     DriverSeen,

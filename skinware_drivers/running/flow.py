@@ -1,8 +1,8 @@
-"""Frames flow from sockets and serial lines into the ring in C, in the place of the event loop's rest.
+"""Let frames flow from sockets and serial lines into the ring in C, while the event loop rests.
 
-An event loop that has nothing to do waits in its selector. Here it is there that frames are taken, published and rested
-from, in one call without the interpreter lock, until the loop's next moment, or until something else has become
-readable, or until the frames need Python (somebody waits for one, a bus went away).
+An event loop that has nothing to do waits in its selector. Here, the selector takes and publishes frames meanwhile, in
+one call without the interpreter lock, until the loop's next timer, or until another descriptor is readable, or until
+the frames need Python (a coroutine waits for one, a bus went away).
 """
 
 from __future__ import annotations
@@ -14,24 +14,23 @@ from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
-from skinware.status import BusReason, BusState
+from skinware.status import BusState
 from skinware_drivers.native import structs
 from skinware_drivers.native.kernel_bus import KernelBus, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
-from skinware_drivers.running.guard import bus_failure
 
 _NEVER_NS = (1 << 63) - 1
 _OTHER_BUS, _NEWS, _NO_MEMORY = range(2, 5)  # of flow.c
 _LATENCY_WHILE_ASKING_S, _LATENCY_IN_STEP_S = 5e-4, 5e-5
-"""The longest rest while devices are asked, and while the answer alone is what comes before the next question."""
+"""The longest rest while devices are asked, and while only the answer comes before the next question."""
 
 
 class FlowSelector(selectors.EpollSelector):
     """A selector in whose waits frames flow.
 
     Attributes:
-        flow: what lets them; called with this selector's descriptor and the longest wait, s. None: it only waits.
+        flow: lets frames flow; called with this selector's descriptor and the longest wait, s. None: it only waits.
     """
 
     def __init__(self) -> None:
@@ -60,21 +59,21 @@ def flow_of(
     take: Callable[[], object],
     fail: Callable[[BaseException], None],
 ) -> Flow | None:
-    buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
+    buses = [line.bus for line in generation.lines if not line.is_removed]
     if not any(is_read_natively(bus) for bus in buses):
         return None
     return Flow(generation, epoll_fd, latency_s, take, fail)
 
 
 class Flow:
-    """The buses of one generation, as long as C reads them; when one that it cannot read has something, it comes back.
+    """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable.
 
     Args:
-        generation: what is in service.
+        generation: in service.
         epoll_fd: in which open buses are registered.
         latency_s: the longest rest.
-        take: called in the loop when a bus has something that Python has to read.
-        fail: called with what goes wrong.
+        take: called in the loop when Python must read a bus.
+        fail: called with errors.
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class Flow:
         listeners.heard, listeners.damaged = self._heard, self._keep_sample
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
-        """Let frames flow, for so long at the most."""
+        """Let frames flow, at most for a time, s."""
         try:
             reason = self._run(loop_fd, timeout_s)
         except BaseException as error:  # noqa: BLE001
@@ -145,23 +144,23 @@ class Flow:
             source.stream = source.asker = None
             if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
                 source.bus = line.ordinal
-                source.heard_ns = line.heard_ns
-                source.is_watched = line.state != BusState.LIVE
+                source.heard_ns = line.condition.heard_ns
+                source.is_watched = line.condition.state != BusState.LIVE
                 self._handed.append((line, line.bus, source))
         n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
         self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)
 
     def _take_back(self) -> None:
         for line, bus, source in self._handed:
-            line.heard_ns = source.heard_ns
+            line.condition.heard_ns = source.heard_ns
             bus.take_back(source)
 
     def _heard(self) -> None:
         for line, _, source in self._handed:
-            line.heard_ns = source.heard_ns
+            line.condition.heard_ns = source.heard_ns
         self._generation.update_bus_states()
         for line, _, source in self._handed:
-            source.is_watched = line.state != BusState.LIVE
+            source.is_watched = line.condition.state != BusState.LIVE
 
     def _bus(self, ordinal: int) -> KernelBus:
         return next(bus for line, bus, _ in self._handed if line.ordinal == ordinal)
@@ -178,5 +177,5 @@ class Flow:
         line = self._lines[bus]
         try:
             self._bus(bus).nothing_received(number)
-        except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
-            line.lose(bus_failure(line.name, "receive", error))
+        except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)
+            line.lose("receive", error)

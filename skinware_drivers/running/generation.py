@@ -1,4 +1,4 @@
-"""What belongs to one structure of a driver's skin: tables, decoder, batch, watch and publisher, made together."""
+"""One structure of a driver's skin in service: its tables, decoder, batch, watch and publisher."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.guard import failure
+from skinware_drivers.running.guard import hook
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.news import Doubles, PatchChange
 from skinware_drivers.running.publisher import Publisher
@@ -41,24 +41,19 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
 
 
 def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
-    """The driver's look at a skin, which knows already of the patches that report errors.
+    """Return the driver's watch, which knows already of the patches that report errors.
 
     Raises:
-        DriverError: its code failed.
+        DriverError: the driver's own code failed.
     """
-    try:
+    with hook("watch", *(line.name for line in lines), of_all=True):
         watch = lines[0].adapter.watch(tables)
-    except Exception as error:
-        raise failure("watch", f"buses {', '.join(line.name for line in lines)}", error) from error
     for line in lines:
         for key in line.suspects:
             patch = tables.patch_key.get((line.ordinal, key))
-            if patch is None:
-                continue
-            try:
-                watch.suspect(patch)
-            except Exception as error:
-                raise failure("Watch.suspect", f"bus {line.name}", error) from error
+            if patch is not None:
+                with hook("Watch.suspect", line.name, of_all=True):
+                    watch.suspect(patch)
     return watch
 
 
@@ -68,12 +63,12 @@ class Generation:
 
     Attributes:
         lines: the buses; the list may change, their places do not.
-        decoder: frames to updates.
+        decoder: turns frames into updates.
         watch: marks doubtful modules.
-        publisher: updates to frames in the ring.
-        period_s: nominal time between two updates that the publisher counts on.
-        batch: what buses fill.
-        begun_ns: when it began.
+        publisher: turns updates into snapshots.
+        period_s: nominal time between two updates, for the publisher.
+        batch: filled by the buses.
+        begun_ns: when it began, CLOCK_MONOTONIC ns.
         path: decodes and publishes.
         flows: C reads the buses that it can read (see ``running.flow``).
     """
@@ -93,7 +88,7 @@ class Generation:
     _doubles: Doubles = field(init=False)
 
     def __post_init__(self) -> None:
-        self.batch = make_batch(self.lines, self.decoder.headroom)
+        self.batch = make_batch(self.lines, self.decoder.compiled.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patches.state.copy()
         self._doubles = Doubles(self.tables.structure, self.publisher.pace.period_ns)
@@ -110,18 +105,18 @@ class Generation:
         return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:
-        """Return the batch, with nothing in it but frames that wait for their partners."""
+        """Return the batch, empty except for frames that wait for their partners."""
         self.path.empty()
         return self.batch
 
     def digest(self, _batch: FrameBatch) -> None:
-        """Decode the batch, and publish what is due."""
+        """Decode the batch, and publish snapshots that are due."""
         self.update_bus_states(settled=now_ns() >= self._look_ns)
         self.announce_waits()
         self.path.digest(self.interrupted())
 
     def announce_waits(self) -> None:
-        """Say which frames are waited for; before each call of C."""
+        """Set the frames that handshakes wait for; before each call of C."""
         expects_data = any(line.link.expects_data for line in self.lines)
         self.path.announce_waits(expects_data, [wanted for line in self.lines for wanted in line.link.awaited])
 
@@ -130,18 +125,18 @@ class Generation:
             line.link.hear(self.batch, own)
 
     def _offer(self, rows: Rows) -> Rows:
-        """Show rows that are of no module to those who wait; those that nobody waited for."""
+        """Give rows that are of no module to the handshakes that wait; return the rest."""
         by_bus = split_by_bus(self.batch, rows, len(self.lines))
         return np.concatenate([line.link.offer(self.batch, own) for line, own in zip(self.lines, by_bus, strict=True)])
 
     def interrupted(self) -> list[int]:
-        """Buses that are known to have lost frames since this was last asked."""
+        """Return the buses that are known to have lost frames since the last call."""
         losses = {line.ordinal: line.losses for line in self.lines}
         before, self._known_losses = self._known_losses, losses
         return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]
 
     def update_bus_states(self, settled: bool = True) -> None:
-        """Tell the publisher what the buses do.
+        """Publish the states of the buses.
 
         Args:
             settled: look also at buses that were in order the last time.
@@ -149,12 +144,12 @@ class Generation:
         if settled:
             self._look_ns = now_ns() + _LOOK_PAUSE_NS
         for line in self.lines:
-            if not settled and line.is_in_order:
+            if not settled and line.condition.is_in_order:
                 continue
             line.look(self.publisher.pace.silence_ns)
-            buses, number = self.publisher.buses, line.ordinal
-            buses.state[number], buses.reason[number], buses.since_ns[number] = line.state, line.reason, line.since_ns
-            buses.load[number] = line.limits.permille
+            buses, number, condition = self.publisher.buses, line.ordinal, line.condition
+            buses.state[number], buses.reason[number] = condition.state, condition.reason
+            buses.since_ns[number], buses.load[number] = condition.since_ns, condition.limits.permille
             buses.samples[number] = line.bus.samples.rows
             in_c = self.flows and is_read_natively(line.bus)
             buses.data_path[number] = DataPath.NATIVE if in_c else DataPath.PYTHON
@@ -171,8 +166,8 @@ class Generation:
         state = self.publisher.patches.state[self.tables.structure.patch_bus == line.ordinal]
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
-    def tell_patches(self) -> Iterator[PatchChange]:
-        """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
+    def note_patches(self) -> Iterator[PatchChange]:
+        """Note changes of the patches' states, and the buses that need care; yield the changes that were logged."""
         now, before = self.publisher.patches.state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]

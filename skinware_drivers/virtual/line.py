@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 
-from skinware_drivers.bus import Bus
+from skinware_drivers.bus import Bus, chosen_by
 from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.options import options_from_strings
@@ -111,16 +111,20 @@ class _EmulatedPort(Port):
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
-def virtual_bus(
-    channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-) -> Bus:
-    """Make the bus ``virtual`` for an emulator's medium.
-
-    Raises:
-        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
-    """
+def _class_of(channel: str, _options: object) -> type[Bus]:
     emulator = load_emulator(channel or DEFAULT_EMULATOR)
     kinds: dict[str, type[Bus]] = {"serial": VirtualSerialBus, "modbus": VirtualModbusBus}
     has_places = isinstance(emulator, type) and issubclass(emulator, PlacedHardware)
-    kind = kinds.get(medium_of(emulator), PlacedCanBus if has_places else VirtualCanBus)
-    return kind(channel, options, payload_size=payload_size, listen_only=listen_only)
+    return kinds.get(medium_of(emulator), PlacedCanBus if has_places else VirtualCanBus)
+
+
+@chosen_by(_class_of)
+def virtual_bus(
+    channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+) -> Bus:
+    """Return the bus ``virtual``: CAN, a serial line or a Modbus line, as the devices need it.
+
+    Raises:
+        ConfigurationError: there is no such emulator, or an option is unknown or has a bad value.
+    """
+    return _class_of(channel, options)(channel, options, payload_size=payload_size, listen_only=listen_only)

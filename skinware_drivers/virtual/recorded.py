@@ -17,7 +17,7 @@ import msgspec
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
-from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus import Bus, FrameBatch, chosen_by
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.modbus.bus import ModbusBus
@@ -251,6 +251,17 @@ class ReplayedModbusBus(ModbusBus):
             port.close()
 
 
+_CLASSES: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": ReplayedModbusBus}
+
+
+def _class_of(channel: str, options: dict[str, str]) -> type[Bus]:
+    wanted = options_from_strings(ReplayOptions, options)
+    with _open(channel) as recording:
+        medium = medium_of(recording, wire_of(recording, wanted.bus, wanted.driver))
+        return _CLASSES.get(medium, ReplayedCanBus)
+
+
+@chosen_by(_class_of)
 def replayed_bus(
     channel: str,
     options: dict[str, str] | None = None,

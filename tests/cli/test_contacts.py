@@ -16,14 +16,14 @@ from skinware.cli import _top_app
 from skinware.cli._command import exit_status
 from skinware.cli._contacts import TITLES, labels_of, line_of, lines_of, plain_text
 from skinware.cli._heat_map import arrange
-from skinware.cli._heat_widget import HeatMap
+from skinware.cli._painting import HeatMap
 from skinware.cli._top_app import SkinTop
 from skinware.cli.top import command
 from skinware.geometry import Geometry
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
-from skinware.views.beside import live_contacts, places_of
+from skinware.views.live import live_contacts, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until

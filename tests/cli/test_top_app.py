@@ -16,8 +16,7 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware import state as health
 from skinware.cli import _top_app
-from skinware.cli._heat_widget import HeatMap
-from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
+from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, HeatMap, Palette
 from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
@@ -356,7 +355,7 @@ def test_nothing_is_drawn_again_that_has_not_changed(monkeypatch: pytest.MonkeyP
 
 
 def _taken(app: SkinTop) -> int:
-    driver = app._drivers.get("a")
+    driver = app._overview.drivers.get("a")
     return driver.frame.sequence if driver is not None and driver.frame is not None else 0
 
 

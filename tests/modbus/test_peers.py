@@ -84,8 +84,8 @@ def test_a_driver_reads_a_server(over: Any, way: str) -> None:
         counters = counted(driving)
         assert counters["polls_unanswered"] == counters["errors"] == counters["skipped_bytes"] == 0
         assert driving.runner is not None
-        assert driving.runner.generation is not None
-        assert driving.runner.generation.flows == (way == "native")
+        assert driving.runner.builder.generation is not None
+        assert driving.runner.builder.generation.flows == (way == "native")
 
 
 def test_values_follow_in_the_order_of_the_device(over: Any) -> None:

@@ -15,8 +15,7 @@ from skinware_drivers.description import assemble
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options, places
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
+from skinware_drivers.testing.driving import driving_lines, emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options

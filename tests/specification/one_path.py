@@ -20,7 +20,7 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher
 from skinware_drivers.testing.defect import defect
 from tests.specification.publishing import SpecifiedPublisher
 
@@ -72,7 +72,7 @@ class Asking:
     @property
     def wanted_ns(self) -> int:
         """Since when the first of them waits; far ahead if nobody does."""
-        return min(self.waiting, default=NOBODY_WAITS)
+        return min(self.waiting, default=NEVER_NS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
         self.answered.append((oldest_ns, position[1]))
@@ -147,7 +147,7 @@ class Way:
         )
         self.publisher.buses.counters = [BusCounters() for _ in layouts]
         longest = max((layout.payload_size for layout in layouts if layout is not None), default=8)
-        self.batch = FrameBatch(rows, payload_size or longest, self.decoder.headroom)
+        self.batch = FrameBatch(rows, payload_size or longest, self.decoder.compiled.headroom)
 
     def empty(self) -> None:
         """Empty the batch, but for what waits for partners."""
@@ -184,7 +184,7 @@ class Way:
                 [(patch, sorted(vars(clock).items())) for patch, clock in sorted(decoder.device_stamps.clocks.items())]
             ),
         }
-        for number, cycle in enumerate(decoder.cycles):
+        for number, cycle in enumerate(decoder.compiled.cycles):
             if cycle.punctuality is not None:
                 found[f"cycle {number}, last_ns"] = cycle.punctuality.last_ns
                 found[f"cycle {number}, spacings_ns"] = cycle.punctuality.spacings_ns

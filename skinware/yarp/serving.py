@@ -1,8 +1,7 @@
-"""Drivers of a namespace as ports of YARP: one vector a frame, the newest to each reader, and a name that is known.
+"""Publish the drivers of a namespace as ports of YARP: a vector for each frame, the newest one to each reader.
 
-The rings are read in the thread that calls ``run``; ports live in an event loop of another one, to which only the
-newest vector of each is handed. So neither a reader of a port nor a name server can hold up anything here, and nothing
-here a driver.
+The thread that calls ``run`` reads the rings; ports live in an event loop of another thread, which gets only the newest
+vector of each. So neither readers nor a name server can hold up this thread or a driver.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from skinware.errors import BadRecording, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.structure import Structure
 from skinware.tactile.regions import Region
 from skinware.transfer.collecting import Collector
 from skinware.transfer.generation import Generation
@@ -36,25 +34,25 @@ from skinware.yarp.vectors import Vector, vectors_of
 log: logging.Logger = logging.getLogger("skinware.yarp")
 
 _LOOK_S = 2.0
-"""Between two looks whether the name server still knows a port."""
+"""Time between two looks whether the name server still knows a port."""
 _END_S = 15.0
-_NOT_OF_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]")
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]")
 _NEWEST_YARP = 4
-ANYWHERE = ("0.0.0.0", "::", "")
+_ANYWHERE = ("0.0.0.0", "::", "")
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is served, and how.
+class Settings:
+    """Settings of the ports.
 
     Attributes:
-        names: of drivers; empty: all there are and come.
-        prefix: with which the names of ports begin.
+        names: of drivers; empty: all, also later ones.
+        prefix: before the names of all ports.
         type_name: of sensors.
-        full_scale: physical value that becomes 255; None: the type's greatest.
-        regions: body parts that have a port each.
+        full_scale: physical value that becomes 255; None: the maximum of the type.
+        regions: that have a port each.
         host: where ports listen.
-        yarp: major version of the YARP whose programs read in binary, 3 or 4; None: not known, and they are refused.
+        yarp: major version of the YARP of binary readers, 3 or 4; None: they are refused.
     """
 
     names: Collection[str] = ()
@@ -67,25 +65,25 @@ class Wanted:
 
 
 class _Served:
-    """One port, in the event loop; ``offer`` and what is told of it are for any thread."""
+    """A port in the event loop; other threads call ``offer`` and read its attributes."""
 
     def __init__(
-        self, name: str, driver: str, names: NameServer, wanted: Wanted, loop: asyncio.AbstractEventLoop
+        self, name: str, driver: str, names: NameServer, settings: Settings, loop: asyncio.AbstractEventLoop
     ) -> None:
         self.driver = driver
-        self.port = OutputPort(name, names, wanted.yarp)
-        self._yarp = wanted.yarp or _NEWEST_YARP
+        self.port = OutputPort(name, names, settings.yarp)
+        self._yarp = settings.yarp or _NEWEST_YARP
         self.messages = 0
         self.values = 0
         self.registered: Contact | None = None
         self.trouble = ""
-        self._names, self._host, self._loop = names, wanted.host, loop
+        self._names, self._host, self._loop = names, settings.host, loop
         self._lock = threading.Lock()
         self._newest: Message | None = None
         self._over = asyncio.Event()
 
     def offer(self, values: npt.NDArray[np.float64], acquired_ns: int) -> None:
-        """The newest vector; one that was not sent yet is passed over."""
+        """Send a vector, in place of one that was not sent yet."""
         self.messages += 1
         self.values = len(values)
         if not self.port.receivers:
@@ -105,10 +103,10 @@ class _Served:
 
     async def live(self) -> None:
         number = await self.port.open(self._host)
-        host = "..." if self._host in ANYWHERE else self._host
+        host = "..." if self._host in _ANYWHERE else self._host
         try:
             while not self._over.is_set():
-                await asyncio.to_thread(self._be_known, host, number)
+                await asyncio.to_thread(self._register, host, number)
                 try:
                     async with asyncio.timeout(_LOOK_S):
                         await self._over.wait()
@@ -116,13 +114,13 @@ class _Served:
                     pass
         finally:
             await self.port.close()
-            await asyncio.to_thread(self._be_unknown)
+            await asyncio.to_thread(self._unregister)
 
     def end(self) -> None:
         self._over.set()
 
-    def _be_known(self, host: str, number: int) -> None:
-        """Register, unless it is known; a name that another program has taken meanwhile is left to it."""
+    def _register(self, host: str, number: int) -> None:
+        """Register the port, unless its name is registered, perhaps by another program meanwhile."""
         try:
             known = self._names.query(self.port.name)
             if self.registered is not None and known is not None:
@@ -134,7 +132,7 @@ class _Served:
         except OSError as error:
             self.trouble = str(error)
 
-    def _be_unknown(self) -> None:
+    def _unregister(self) -> None:
         try:
             if self.registered is not None and self._names.query(self.port.name) == self.registered:
                 self._names.unregister(self.port.name)
@@ -143,57 +141,62 @@ class _Served:
         self.registered = None
 
 
-class Outlet:
-    """Serves drivers as ports until it is stopped.
+class YarpServer:
+    """Publishes drivers as ports.
 
     Args:
         namespace: whose drivers.
-        wanted: what is served.
+        settings: of the ports.
         names: where ports are registered.
-        tell: gets what happens (``port``, ``trouble``), as JSON has it.
+        on_event: called with events (``port``, ``trouble``), as JSON has them.
 
     Raises:
-        ConfigurationError: no port can have such a name.
+        ConfigurationError: the prefix cannot begin the name of a port.
     """
 
     def __init__(
         self,
         namespace: Namespace,
-        wanted: Wanted,
+        settings: Settings,
         names: NameServer,
-        tell: Callable[[dict[str, Any]], object] = lambda _: None,
+        on_event: Callable[[dict[str, Any]], object] = lambda _: None,
     ) -> None:
-        if not is_port_name(f"{wanted.prefix}/x"):
-            raise ConfigurationError(f"prefix {wanted.prefix!r}: write /name, or /name/name, without spaces")
-        self._wanted, self._names, self._tell = wanted, names, tell
+        if not is_port_name(f"{settings.prefix}/x"):
+            raise ConfigurationError(f"prefix {settings.prefix!r}: write /name, or /name/name, without spaces")
+        self._settings, self._names, self._on_event = settings, names, on_event
         self._ports: dict[str, _Served] = {}
         self._lives: list[Future[None]] = []
         self._vectors: dict[str, list[tuple[_Served, Vector]]] = {}
-        self._told: dict[str, str] = {}
-        self._collector = Collector(namespace, set(wanted.names) or None, self)
+        self._troubles: dict[str, str] = {}
+        self._collector = Collector(namespace, set(settings.names) or None, self)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="skinware yarp")
         self._thread.start()
 
     @property
     def lost(self) -> int:
+        """Frames that were missed in their rings."""
         return self._collector.lost
 
-    def run(self, tell: Callable[[], object] = lambda: None) -> None:
-        """Until ``stop``; ``tell`` is called once a second."""
+    def run(self, each_second: Callable[[], object] = lambda: None) -> None:
+        """Run until ``stop``; call ``each_second`` once a second."""
 
-        def each_second() -> None:
-            self._tell_trouble()
-            tell()
+        def second() -> None:
+            for name, served in self._ports.items():
+                self._report(name, served.trouble)
+            for life in self._lives:
+                if life.done() and not life.cancelled() and (error := life.exception()) is not None:
+                    raise error
+            each_second()
 
-        self._collector.run(each_second)
+        self._collector.run(second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
         self._collector.stop()
 
     def close(self) -> None:
-        """Unregister all ports, and hang up. Idempotent."""
+        """Unregister and close all ports. Idempotent."""
         self._collector.stop()
         if self._loop.is_closed():
             return
@@ -211,7 +214,7 @@ class Outlet:
         self._collector.close()
 
     def ports(self) -> dict[str, dict[str, Any]]:
-        """How each port is: its driver, whether it is registered, messages so far, values, and who reads."""
+        """Return the state of each port: driver, whether it is registered, messages so far, values, and readers."""
         return {
             name: {
                 "driver": served.driver,
@@ -226,64 +229,51 @@ class Outlet:
             for name, served in self._ports.items()
         }
 
-    # -- what the collector tells ----------------------------------------------------------------------------------
+    # -- a skinware.transfer.collecting.Listener ------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.transfer.collecting.Listener`."""
         self._vectors[service] = []
+        settings = self._settings
         try:
             generation = Generation(head, service)
-        except BadRecording as error:
-            self._tell_once(service, str(error))
-            return
-        if not isinstance(generation.context, Structure):
-            return  # a service, of which YARP knows nothing
-        wanted = self._wanted
-        driver_type = bytes(generation.static()["driver_type"][0]).decode()
-        try:
+            if generation.structure is None:
+                return  # not a driver
             vectors = vectors_of(
                 service,
-                generation.context,
-                driver_type,
-                type_name=wanted.type_name,
-                full_scale=wanted.full_scale,
-                regions=wanted.regions,
+                generation.structure,
+                bytes(generation.static()["driver_type"][0]).decode(),
+                type_name=settings.type_name,
+                full_scale=settings.full_scale,
+                regions=settings.regions,
             )
-        except ConfigurationError as error:
-            self._tell_once(service, str(error))
+        except (BadRecording, ConfigurationError) as error:
+            self._report(service, str(error))
             return
         for part, vector in vectors.items():
             served = self._port(part, service)
             if served.driver == service:
                 self._vectors[service].append((served, vector))
             else:
-                self._tell_once(service, f"driver {served.driver} has the port {served.port.name} already")
+                self._report(service, f"driver {served.driver} has the port {served.port.name} already")
 
     def took(self, service: str, frame: Sample) -> None:
         for served, vector in self._vectors.get(service, ()):
             served.offer(vector.of(frame.column("values"), frame.column("status")), frame.acquired_ns)
 
     def happened(self, event: dict[str, Any]) -> None:
-        """Likewise."""
+        """Ports stay when their drivers go."""
 
     def _port(self, part: str, driver: str) -> _Served:
-        name = f"{self._wanted.prefix}/{_NOT_OF_A_NAME.sub('_', part)}"
+        name = f"{self._settings.prefix}/{_NOT_IN_A_NAME.sub('_', part)}"
         if name not in self._ports:
-            served = _Served(name, driver, self._names, self._wanted, self._loop)
-            self._ports[name] = served
-            self._tell({"event": "port", "port": name, "driver": driver})
+            served = self._ports[name] = _Served(name, driver, self._names, self._settings, self._loop)
+            self._on_event({"event": "port", "port": name, "driver": driver})
             self._lives.append(asyncio.run_coroutine_threadsafe(served.live(), self._loop))
         return self._ports[name]
 
-    def _tell_trouble(self) -> None:
-        for name, served in self._ports.items():
-            self._tell_once(name, served.trouble)
-        for life in self._lives:
-            if life.done() and not life.cancelled() and (error := life.exception()) is not None:
-                raise error
-
-    def _tell_once(self, about: str, why: str) -> None:
-        if self._told.get(about, "") != why:
-            self._told[about] = why
+    def _report(self, about: str, why: str) -> None:
+        """Report trouble when it changes."""
+        if self._troubles.get(about, "") != why:
+            self._troubles[about] = why
             if why:
-                self._tell({"event": "trouble", "about": about, "why": why})
+                self._on_event({"event": "trouble", "about": about, "why": why})

@@ -18,7 +18,7 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region
 from skinware.yarp.names import NameServer
-from skinware.yarp.outlet import Outlet, Wanted
+from skinware.yarp.serving import Settings, YarpServer
 from skinware_drivers.description import assemble
 from skinware_drivers.streams.yarp import YarpDriver, YarpOptions
 from skinware_drivers.testing.driving import emulated_skin
@@ -60,9 +60,9 @@ class Skin:
 
 
 @contextmanager
-def outlet(there: Robot, /, **wanted: Any) -> Iterator[tuple[Outlet, list[dict[str, Any]]]]:
+def served(there: Robot, /, **settings: Any) -> Iterator[tuple[YarpServer, list[dict[str, Any]]]]:
     told: list[dict[str, Any]] = []
-    one = Outlet(Namespace(None), Wanted(**wanted), NameServer(LOCAL, there.server.port), told.append)
+    one = YarpServer(Namespace(None), Settings(**settings), NameServer(LOCAL, there.server.port), told.append)
     thread = threading.Thread(target=one.run)
     thread.start()
     try:
@@ -75,7 +75,7 @@ def outlet(there: Robot, /, **wanted: Any) -> Iterator[tuple[Outlet, list[dict[s
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot, version: int) -> None:
-    with contextlib.closing(Skin("hand")) as skin, outlet(yarp, yarp=version) as (there, told):
+    with contextlib.closing(Skin("hand")) as skin, served(yarp, yarp=version) as (there, told):
         wait_until(lambda: "/skinware/hand" in yarp.ports)
         assert told == [{"event": "port", "port": "/skinware/hand", "driver": "hand"}]
         carriers = [f"set /skinware/hand {key} text text_ack tcp fast_tcp".encode() for key in ("offers", "accepts")]
@@ -93,7 +93,7 @@ def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot, versio
 
 
 def test_drivers_come_and_go_and_ports_stay(namespace: object, yarp: Robot) -> None:
-    with outlet(yarp, names=("hand", "foot"), prefix="/icub/skin") as (there, _):
+    with served(yarp, names=("hand", "foot"), prefix="/icub/skin") as (there, _):
         for length in (24, 36):
             with contextlib.closing(Skin("hand", length)), contextlib.closing(Skin("other")):
                 wait_until(lambda length=length: there.ports().get("/icub/skin/hand", {}).get("driver") == "hand")  # type: ignore[misc]
@@ -106,9 +106,9 @@ def test_drivers_come_and_go_and_ports_stay(namespace: object, yarp: Robot) -> N
 def test_a_name_server_that_comes_late_or_forgets_is_told_again(
     namespace: object, yarp: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("skinware.yarp.outlet._LOOK_S", 0.05)
+    monkeypatch.setattr("skinware.yarp.serving._LOOK_S", 0.05)
     yarp.server.close()
-    with contextlib.closing(Skin("hand")), outlet(yarp) as (there, told):
+    with contextlib.closing(Skin("hand")), served(yarp) as (there, told):
         wait_until(lambda: any(event["event"] == "trouble" for event in told))
         assert not there.ports()["/skinware/hand"]["registered"]
         yarp.restart_server()
@@ -121,8 +121,8 @@ def test_a_name_server_that_comes_late_or_forgets_is_told_again(
 def test_a_name_that_another_program_takes_is_left_to_it(
     namespace: object, yarp: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("skinware.yarp.outlet._LOOK_S", 0.05)
-    with contextlib.closing(Skin("hand")), outlet(yarp) as (there, told):
+    monkeypatch.setattr("skinware.yarp.serving._LOOK_S", 0.05)
+    with contextlib.closing(Skin("hand")), served(yarp) as (there, told):
         wait_until(lambda: there.ports().get("/skinware/hand", {}).get("registered", False))
         yarp.ports["/skinware/hand"] = ("10.0.0.9", 10099, "tcp")
         wait_until(lambda: any("another program" in event.get("why", "") for event in told))
@@ -131,12 +131,12 @@ def test_a_name_that_another_program_takes_is_left_to_it(
 
 def test_a_part_whose_name_no_port_can_have_gets_another(namespace: object, yarp: Robot) -> None:
     parts = (Region("the left/hand", "pressure", patch=("values 0-23",)),)
-    with contextlib.closing(Skin("hand")), outlet(yarp, regions=parts):
+    with contextlib.closing(Skin("hand")), served(yarp, regions=parts):
         wait_until(lambda: "/skinware/the_left_hand" in yarp.ports)
 
 
 def test_two_drivers_of_ports_of_one_name_are_never_mixed(namespace: object, yarp: Robot) -> None:
-    with contextlib.closing(Skin("hand")), outlet(yarp) as (there, told):
+    with contextlib.closing(Skin("hand")), served(yarp) as (there, told):
         wait_until(lambda: bool(there.ports()))
         with contextlib.closing(Skin("other", port="hand", length=30)):
             wait_until(lambda: any("driver hand has the port" in event.get("why", "") for event in told))
@@ -144,7 +144,7 @@ def test_two_drivers_of_ports_of_one_name_are_never_mixed(namespace: object, yar
 
 
 def test_what_is_no_skin_is_left_out_with_a_word(namespace: object, yarp: Robot) -> None:
-    with contextlib.closing(Skin("hand")), outlet(yarp, type_name="force_z") as (there, told):
+    with contextlib.closing(Skin("hand")), served(yarp, type_name="force_z") as (there, told):
         wait_until(lambda: any("no sensors of the type 'force_z'" in event.get("why", "") for event in told))
         assert there.ports() == {}
 
@@ -170,11 +170,11 @@ def test_wrong_use(namespace: object) -> None:
         assert done.returncode == 2
         assert why in done.stderr
     with pytest.raises(ConfigurationError, match="prefix"):
-        Outlet(Namespace(None), Wanted(prefix="/a b"), NameServer(LOCAL, 1))
+        YarpServer(Namespace(None), Settings(prefix="/a b"), NameServer(LOCAL, 1))
 
 
 def test_a_reader_that_is_stuck_takes_nothing_from_the_others(namespace: object, yarp: Robot) -> None:
-    with contextlib.closing(Skin("hand", 2000)) as skin, outlet(yarp, yarp=4) as (there, _):
+    with contextlib.closing(Skin("hand", 2000)) as skin, served(yarp, yarp=4) as (there, _):
         wait_until(lambda: "/skinware/hand" in yarp.ports)
         host, number, _ = yarp.ports["/skinware/hand"]
         with socket.create_connection((host, number), PATIENCE_S) as stuck:

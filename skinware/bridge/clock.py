@@ -140,14 +140,10 @@ def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
 
 
 class Pinger:
-    """Asks a bridge for the time of its clock.
+    """Asks the bridge of a robot for the time of its clock.
 
-    Args:
-        link: to the other machine.
-        who: the asker, 16 letters and digits.
-        on_sample: called with the bounds of a round: in the receiving thread with its last answer, or, if some answers
-            do not come, when the next round begins.
-        guard: counts impossible answers.
+    ``on_sample`` gets the bounds of a round: in the receiving thread with the last answer, or, if some answers do not
+    come, when the next round begins.
 
     Attributes:
         asked_ns: when the last round began.

@@ -35,10 +35,9 @@ class Traffic:
     """The frames of a service that came.
 
     Attributes:
-        frames: published here since the last report.
-        lost: published by the robot, but not here, since the first one; ``lost_before``: at the last report.
-        bytes: of messages since the last report.
-        ages_ns: from the publication there to the one here, since the last report.
+        lost: frames of the robot that were not published here, since the first one; all others: since the last report.
+        bytes: of messages.
+        ages_ns: from the publication there to the one here.
     """
 
     frames: int = 0
@@ -63,7 +62,6 @@ class Pulls:
     """Questions for frames that wait for an answer.
 
     Attributes:
-        count: questions so far.
         open: by number, the time until which an answer may come.
         probe_until_ns: the same for a probe of the link.
     """
@@ -88,24 +86,11 @@ class Pulls:
             self.open = {later: until_ns for later, until_ns in self.open.items() if later > number}
         return is_open
 
-    def expire(self, time_ns: int) -> None:
-        self.open = {number: until_ns for number, until_ns in self.open.items() if time_ns <= until_ns}
-
-    def clear(self) -> None:
-        self.open.clear()
-        self.probe_until_ns = 0
-
 
 class Output:
     """Publishes the frames of a service in order.
 
-    Args:
-        name: of the service.
-        peer: the robot.
-        mirror: publishes them.
-
     Attributes:
-        traffic: frames that came.
         count: the robot's number of the newest frame, over generations; None: none so far.
         newest: position of that frame.
         is_dead: nothing was published since the robot was lost.
@@ -148,29 +133,16 @@ class Output:
         self.traffic.ages_ns.append(age_ns)
         return age_ns
 
-    def start_over(self) -> None:
-        self.newest, self.count = (0, 0), None
-
-    def lose(self) -> None:
-        """Show the service as dead, until its robot is heard again."""
-        self._mirror.happened(self._name, DEAD)
-        self.is_dead, self.newest = True, (0, 0)
-
 
 class Follower:
     """Follows a service of a robot. Callers hold the lock of the mirror.
 
     Args:
-        name: of the service.
-        service: its state there.
-        peer: the robot.
-        mirror: publishes it.
         mode: ``push`` or ``pull``; None: it follows the link.
         part: number of the wish for some of its sensors; empty: all.
 
     Attributes:
         service: its newest state there.
-        output: publishes its frames.
         is_over: the service has ended.
     """
 
@@ -212,25 +184,28 @@ class Follower:
         clock = self._peer.clock
         if not self._peer.is_connected or self._generation is None or not clock.is_known:
             return
-        self._pulls.expire(time_ns)
+        pulls = self._pulls
+        pulls.open = {number: until_ns for number, until_ns in pulls.open.items() if time_ns <= until_ns}
         if self._pacing.pulls:
             self._pull_all()
-        elif self.output.is_dead and not self._pulls.open:
+        elif self.output.is_dead and not pulls.open:
             self._pull()
-        may_probe = time_ns > self._pulls.probe_until_ns and self.output.count is not None
+        may_probe = time_ns > pulls.probe_until_ns and self.output.count is not None
         if may_probe and self._pacing.wants_probe(time_ns, clock.round_trip_ns):
             self._probe()
 
     def start_over(self) -> None:
         """The robot has other generations than before."""
         self._generation = None
-        self.output.start_over()
+        self.output.newest, self.output.count = (0, 0), None
 
     def lose(self) -> None:
         """The robot is not heard any more; all questions are asked again when it is."""
-        self.output.lose()
+        self._mirror.happened(self._name, DEAD)
+        self.output.is_dead, self.output.newest = True, (0, 0)
         self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
-        self._pulls.clear()
+        self._pulls.open.clear()
+        self._pulls.probe_until_ns = 0
 
     def take_held(self) -> None:
         """Publish the frame that waited for its generation or the robot's clock."""

@@ -21,6 +21,8 @@ _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_facto
 _FOREVER_MS = -1
 _BATCHES = 4
 """Batches of 64 KiB that may wait to be sent: a frame of 30,848 sensors takes three, and its writer does not wait."""
+_PATIENCE_US = 1000
+"""How long a frame may wait for a slow receiver before that receiver misses it."""
 _LONGEST_MESSAGE = 1 << 26
 """Bytes to which the fragments of a message may add up."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
@@ -31,9 +33,6 @@ class Question:
     """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
 
     Attributes:
-        key: under which it was asked.
-        parameters: by name.
-        payload: bytes that came with it.
         reply: sends the answer.
         fail: sends the reason why there is no answer.
     """
@@ -74,7 +73,7 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
         "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
         "transport/link/tx/lease": str(LEASE_MS),
         "transport/link/tx/queue/size/data": str(_BATCHES),
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(_PATIENCE_US),
         "adminspace/enabled": "false",
         **endpoints.security,
     }
@@ -89,18 +88,13 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
         raise BridgeError(f"{endpoints}: {reason}") from None
 
 
-def directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
+def directly(call: Callable[[Any], object], over: Callable[[], None] | None = None) -> Any:
     """Return a callback that runs in the receiving thread: handing over to another thread takes 0.1 ms."""
     return zenoh.handlers.Callback(call, over, indirect=False)
 
 
 class Sender:
-    """Sends bytes to all listeners without waiting; a receiver that is too slow misses some.
-
-    Args:
-        publisher: of zenoh.
-        close: ends it.
-    """
+    """Sends bytes to all listeners without waiting; a receiver that is too slow misses some."""
 
     def __init__(self, publisher: zenoh.Publisher, close: Callable[[], None]) -> None:
         self._publisher, self.close = publisher, close
@@ -120,9 +114,6 @@ class Sender:
 
 class Link:
     """A session of zenoh.
-
-    Args:
-        endpoints: where it listens and connects.
 
     Raises:
         BridgeError: it cannot be opened; the message says what to do.
@@ -153,11 +144,8 @@ class Link:
         Returns:
             A function that ends it.
         """
-
-        def hear(sample: zenoh.Sample) -> None:
-            heard(str(sample.key_expr), sample.payload.to_bytes())
-
-        return self._end_of(self._session.declare_subscriber(key, directly(hear)))
+        hear = directly(lambda sample: heard(str(sample.key_expr), sample.payload.to_bytes()))
+        return self._end_of(self._session.declare_subscriber(key, hear))
 
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
         """Call ``asked`` with questions under keys, in the receiving thread.
@@ -259,11 +247,9 @@ _MOST_KINDS = 256
 class Guard:
     """Counts messages that cannot be read or used.
 
-    Args:
-        report: called with (kind of message, reason) for the first message of each kind, in the thread that found it.
+    ``report`` gets (kind of message, reason) for the first message of each kind, in the thread that found it.
 
     Attributes:
-        count: messages so far.
         last: kind and reason of the last one; empty: none so far.
     """
 

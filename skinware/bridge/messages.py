@@ -217,14 +217,10 @@ ALL_SUMMARIES = f"skinware/{VERSION}/*/*/summary"
 
 
 class Keys:
-    """The keys of a robot.
-
-    Args:
-        robot: its name.
-        instance: number of the bridge that serves it; ``*``: any.
+    """The keys of a robot; ``instance``: number of the bridge that serves it, or ``*`` for any.
 
     Raises:
-        ConfigurationError: it is no name.
+        ConfigurationError: the robot's name is wrong.
     """
 
     def __init__(self, robot: str, instance: str = "*") -> None:
@@ -286,7 +282,6 @@ class FrameMessage(NamedTuple):
 
     Attributes:
         form: ``RAW`` or ``CODED``.
-        generation: its number.
         content: the slot, or the coded frame.
         keeps: the receiver is to keep the frame.
     """

@@ -22,11 +22,7 @@ _LONGEST_NS = 5 * NS_PER_S
 
 
 class MemoryBudget:
-    """Memory for the services of a robot.
-
-    Args:
-        most: bytes for all of them.
-    """
+    """Memory for the services of a robot; ``most``: bytes for all of them."""
 
     def __init__(self, most: int = LIMITS.robot_size) -> None:
         self._most = most
@@ -51,11 +47,7 @@ class MemoryBudget:
 
 
 class _Waiting(NamedTuple):
-    """An answer that waits for the frame that goes with it.
-
-    Attributes:
-        at: position of the frame, by the robot's count.
-    """
+    """An answer that waits for the frame that goes with it, at a position by the robot's count."""
 
     at: Position
     request: Request
@@ -66,17 +58,11 @@ class _Waiting(NamedTuple):
 class Mirror(Republisher):
     """Publishes frames of a robot, with their times moved to the clock of this machine.
 
-    Args:
-        namespace: where to publish.
-        ask: passes a request for a service on; ``answered`` gives the answer.
-        offset_ns: returns our clock minus the robot's, as of now.
-
-    ``answer`` holds ``lock`` while it calls back; callers of the other methods must hold it, too.
+    ``ask`` passes a request for a service on, and ``answered`` takes the answer. ``answer`` holds ``lock`` while it
+    calls back; callers of the other methods must hold it, too.
 
     Attributes:
-        lock: of the mirror.
         operations: of each service: descriptions by name.
-        budget: memory for the services.
     """
 
     def __init__(self, namespace: Namespace, ask: Callable[[str, Request], None], offset_ns: Callable[[], int]) -> None:

@@ -43,11 +43,7 @@ _FIRST_RETRY_NS, _LAST_RETRY_NS = 10 * NS_PER_S, 320 * NS_PER_S
 
 
 class _QueueTimes:
-    """Estimates from ages how long frames wait in queues.
-
-    Attributes:
-        since_ns: when the first age was added.
-    """
+    """Estimates from ages how long frames wait in queues."""
 
     def __init__(self) -> None:
         self._ages: deque[tuple[int, int]] = deque()  # (when, age), since the last look

@@ -33,12 +33,7 @@ _MOST_PARTS = 64
 
 @dataclass
 class Head:
-    """The file of a service up to its slots, packed and parsed at most once.
-
-    Attributes:
-        name: of the service.
-        raw: its bytes.
-    """
+    """The file of a service up to its slots, packed and parsed at most once."""
 
     name: str
     raw: bytes
@@ -145,12 +140,7 @@ def _structure(
 
 
 class Part:
-    """Some sensors of the drivers of a robot.
-
-    Args:
-        choice: which.
-        stream_of: makes the stream of this part of a service.
-    """
+    """Some sensors of the drivers of a robot; ``stream_of`` makes the stream of a service."""
 
     def __init__(self, choice: SensorChoice, stream_of: Callable[[str], Stream]) -> None:
         self.choice, self._stream_of = choice, stream_of
@@ -199,11 +189,7 @@ class Part:
 
 
 class Parts:
-    """All parts that peers want now.
-
-    Args:
-        stream_of: makes the stream of a part: (service, number of the wish).
-    """
+    """All parts that peers want now; ``stream_of`` makes the stream of (service, number of the wish)."""
 
     def __init__(self, stream_of: Callable[[str, str], Stream]) -> None:
         self._stream_of = stream_of

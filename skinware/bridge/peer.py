@@ -49,12 +49,7 @@ class Jobs:
         self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def add(self, job: Callable[[], object], size: int = 0) -> None:
-        """Add a job, from any thread.
-
-        Args:
-            job: what to call.
-            size: of the message that it keeps until then, bytes; with too many bytes it is left out.
-        """
+        """Add a job, from any thread; leave it out if too many jobs wait, or too many bytes of their messages."""
         with self._lock:
             if len(self._jobs) >= _MOST_JOBS or self._size + size > _MOST_BYTES:
                 self.left_out += 1
@@ -88,24 +83,17 @@ class Jobs:
 class Diagnosis:
     """Looks, in a thread of its own, for the reason why a robot is not reached.
 
-    Args:
-        why_not: returns the reason in one line, empty if there is a connection; may wait.
-        report: called with it, as a job.
-        jobs: of the robot.
+    ``why_not`` may wait; a job calls ``report`` with its result, one line, or an empty text if there is a connection.
     """
 
     def __init__(self, why_not: Callable[[], str], report: Callable[[str], None], jobs: Jobs) -> None:
         self._why_not, self._report, self._jobs = why_not, report, jobs
         self._is_running = False
-        self._next_ns = now_ns() + _PATIENCE_NS
-
-    def postpone(self) -> None:
-        """Wait as long as at the start: another bridge may serve the robot."""
-        self._next_ns = now_ns() + _PATIENCE_NS
+        self.next_ns: int = now_ns() + _PATIENCE_NS
 
     def look(self, time_ns: int) -> None:
-        if time_ns >= self._next_ns and not self._is_running:
-            self._is_running, self._next_ns = True, time_ns + _PATIENCE_NS
+        if time_ns >= self.next_ns and not self._is_running:
+            self._is_running, self.next_ns = True, time_ns + _PATIENCE_NS
             threading.Thread(target=self._run, name="skinware bridge diagnosis", daemon=True).start()
 
     def _run(self) -> None:
@@ -123,9 +111,7 @@ class Bridges:
     """The bridges of a robot that are there, and the one that is followed.
 
     Attributes:
-        instance: number of the one that is followed; empty: none so far.
-        host: name of its machine; empty: not known.
-        start: as :attr:`skinware.bridge.messages.Services.start`.
+        instance, host, start: of the one that is followed, as in :class:`Services`; empty: none so far.
         switches: how often another robot of this name took the place of the first.
         there: numbers of all that are there.
         other_robots: names of robots that other bridges serve.
@@ -145,23 +131,13 @@ class Bridges:
 
 
 class Peer:
-    """A robot to which a link may lead.
-
-    Args:
-        robot: its name.
-        link: to it.
-        jobs: messages that come in zenoh's threads are handled as these.
-        changed: called with each change.
-        why_not: as for :class:`Diagnosis`.
-        on_event: called with events, as JSON has them.
+    """A robot to which a link may lead. Messages that come in zenoh's threads are handled as ``jobs``.
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
-        clock: of the robot.
         is_connected: the robot is heard.
         since_ns: when that began.
         guard: counts its messages that cannot be read.
-        bridges: that serve it.
     """
 
     def __init__(
@@ -315,7 +291,7 @@ class Peer:
     def _lose(self, why: str) -> None:
         if self.is_connected:
             self.is_connected, self.since_ns = False, now_ns()
-            self._diagnosis.postpone()
+            self._diagnosis.next_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve the robot
             self._changed("lost")
             self.on_event({"event": "disconnected", "robot": self.keys.robot, "why": why})
 

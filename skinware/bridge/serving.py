@@ -8,7 +8,8 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -65,16 +66,16 @@ _STATES: dict[str, State] = {
     "restarted": "live",
     "found": "live",
 }
+_ErrorKind = Literal["refused", "failed", "paused", "cancelled"]
+_ERRORS: dict[type[Exception], _ErrorKind] = {
+    Paused: "paused",
+    RequestCancelled: "cancelled",
+    RequestRefused: "refused",
+}
 
 
 class _Workers:
-    """Runs jobs in threads of its own, and refuses those that are too many.
-
-    Args:
-        n_threads: number of threads.
-        most: jobs that run or wait.
-        name: of the threads.
-    """
+    """Runs jobs in threads of its own, and refuses those that are too many."""
 
     def __init__(self, n_threads: int, most: int, name: str) -> None:
         self._threads = ThreadPoolExecutor(n_threads, name)
@@ -145,9 +146,9 @@ class Server:
             (self._keys.services, self._services_asked),
             (self._keys.of("*", "generation"), self._generation_asked),
             (self._keys.of("*", "newest"), self._newest_asked),
-            (self._keys.of("*", "call/*"), self._called),
+            (self._keys.of("*", "call/*"), partial(self._call_soon, self._call)),
         ):
-            self._ends.append(link.answer(key, self._guarded(asked)))
+            self._ends.append(link.answer(key, partial(self._asked, asked)))
         link.declare_token(self._keys.token)
 
     @property
@@ -229,25 +230,21 @@ class Server:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
-    def _there(self) -> dict[str, tuple[Head, Service, Stream]]:
-        """Return all services that are not closed."""
+    def _there(self) -> dict[str, _Served]:
+        """Return copies of all services that are not closed."""
         with self._lock:
-            return {
-                name: (served.head, served.service, served.stream)
-                for name, served in self._services.items()
-                if served.service.state != "closed"
-            }
+            return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
 
     def _summarise(self) -> None:
         there = self._there()
-        self._summaries.count({name: stream.frames for name, (_, _, stream) in there.items()})
+        self._summaries.count({name: served.stream.frames for name, served in there.items()})
         if not self._summaries.is_wanted:
             return
         drivers: dict[str, tuple[State, Structure, Generation, Sample | None]] = {}
-        for name, (head, service, stream) in there.items():
-            driver = head.driver
+        for name, served in there.items():
+            driver = served.head.driver
             if driver is not None and driver.structure is not None:
-                drivers[name] = service.state, driver.structure, driver, stream.newest
+                drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
         self._summaries.send(drivers, len(there) - len(drivers), self.lost)
 
     def _answer_wish(self, question: Question) -> None:
@@ -262,15 +259,15 @@ class Server:
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:
         """Cut a part out of all drivers and add those that have any of it to ``services``; return what is missing."""
         part, structures = self._parts.wanted(wish), []
-        for name, (head, service, stream) in self._there().items():
-            driver = head.driver
+        for name, served in self._there().items():
+            driver = served.head.driver
             if driver is None or driver.structure is None:
                 continue
             structures.append(driver.structure)
             if part.fit(name, driver):
-                services[name] = service
-                if stream.newest is not None:
-                    part.take(name, stream.newest)
+                services[name] = served.service
+                if served.stream.newest is not None:
+                    part.take(name, served.stream.newest)
         if not structures:
             return ""  # drivers may come
         missing = "; ".join(part.choice.unknown(structures))
@@ -278,12 +275,9 @@ class Server:
 
     # -- questions, in zenoh's threads ----------------------------------------------------------------------------
 
-    def _guarded(self, asked: Callable[[Question], None]) -> Callable[[Question], None]:
-        def guarded(question: Question) -> None:
-            if not self.guard.run("a question", asked, question):
-                question.fail(b"the question cannot be understood")
-
-        return guarded
+    def _asked(self, answer: Callable[[Question], None], question: Question) -> None:
+        if not self.guard.run("a question", answer, question):
+            question.fail(b"the question cannot be understood")
 
     def _list_of_services(self) -> bytes:
         with self._lock:
@@ -320,23 +314,18 @@ class Server:
         if found is not None:
             self._call_soon(self._answer_generation, question, found[0])
 
-    def _called(self, question: Question) -> None:
-        self._call_soon(self._call, question)
-
     # -- calls, in threads of their own ---------------------------------------------------------------------------
 
     def _call_soon(self, work: Callable[..., None], question: Question, *arguments: object) -> None:
         if not self._calls.submit(work, question, *arguments):
             question.fail(b"too many questions at once")
 
-    def _reader(self, name: str) -> ServiceReader[Sample]:
-        return ServiceReader(name, namespace=self._namespace, announce=False)
-
     def _answer_generation(self, question: Question, head: Head) -> None:
-        operations: Mapping[str, str] = {}
-        with contextlib.suppress(SkinwareError), self._reader(head.name) as reader:
-            operations = reader.operations(timeout_s=_OPERATIONS_S)
-        question.reply(generation_message(About(dict(operations)), head.packed))
+        operations: dict[str, str] = {}
+        with contextlib.suppress(SkinwareError):
+            with ServiceReader[Sample](head.name, namespace=self._namespace, announce=False) as reader:
+                operations = dict(reader.operations(timeout_s=_OPERATIONS_S))
+        question.reply(generation_message(About(operations), head.packed))
 
     def _call(self, question: Question) -> None:
         *_, name, _, operation = question.key.split("/")
@@ -344,14 +333,15 @@ class Server:
             arguments = read_text(question.payload, dict[str, Any]) if question.payload else {}
             answer = self._result(name, operation, arguments)
         except Exception as error:  # noqa: BLE001, the caller gets it
-            result = CallResult(error=str(error)[:_LONGEST_LINE], why=_why(error))
+            other: _ErrorKind = "failed" if isinstance(error, RequestError) else "refused"
+            result = CallResult(error=str(error)[:_LONGEST_LINE], why=_ERRORS.get(type(error), other))
         else:
             result = CallResult(answer.generation, answer.sequence, msgspec.Raw(msgspec.json.encode(answer.result)))
         question.reply(msgspec.json.encode(result))
 
     def _result(self, name: str, operation: str, arguments: Mapping[str, Any]) -> Answer:
         """Call an operation and wait for its answer, but not beyond the end of this bridge."""
-        with self._reader(name) as reader:
+        with ServiceReader[Sample](name, namespace=self._namespace, announce=False) as reader:
             pending = reader.ask(operation, **arguments)
             until_ns, pause_s = now_ns() + round(_CALL_S * NS_PER_S), _SHORTEST_PAUSE_S
             while not pending.done() and now_ns() < until_ns:
@@ -360,14 +350,3 @@ class Server:
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
             return pending.result(0.0)
-
-
-def _why(error: Exception) -> Literal["refused", "failed", "paused", "cancelled"]:
-    match error:
-        case Paused():
-            return "paused"
-        case RequestCancelled():
-            return "cancelled"
-        case RequestError() if not isinstance(error, RequestRefused):
-            return "failed"
-    return "refused"

@@ -32,8 +32,6 @@ class _Form(NamedTuple):
     """Form in which the frames of a generation are sent.
 
     Attributes:
-        generation: its number.
-        columns: of their slots.
         cut: makes the frame that is sent of the frame that was taken; None: they are the same.
     """
 
@@ -54,7 +52,6 @@ class _Puller:
         sent: position of the last frame that was sent.
         kept: frames of ``generation`` that the receiver keeps, by sequence; later ones may be differences to them.
         kept_ns, since: when the newest of those was sent, and the number of frames sent after it.
-        asked_ns: when it asked last.
     """
 
     open: deque[tuple[int, Question]] = field(default_factory=deque)
@@ -67,11 +64,9 @@ class _Puller:
 
 
 class Stream:
-    """Sends the frames of a service.
+    """Sends the frames of a service: each to listeners, the newest to pullers.
 
-    Args:
-        send: to listeners.
-        soon: calls a function in the only thread that codes.
+    ``soon`` calls a function in the only thread that codes.
 
     Attributes:
         frames: number of frames so far.
@@ -93,13 +88,7 @@ class Stream:
     def begin(
         self, generation: int, columns: Sequence[CodedColumn], cut: Callable[[Sample], Sample] | None = None
     ) -> None:
-        """Begin another generation.
-
-        Args:
-            generation: its number.
-            columns: of the slots of the frames that are sent.
-            cut: makes them of the frames that are taken; None: they are the same.
-        """
+        """Begin another generation; ``cut`` makes the frames that are sent of those that are taken."""
         with self._lock:
             self._form, self.newest = _Form(generation, columns, cut), None
 

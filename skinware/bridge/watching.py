@@ -41,12 +41,7 @@ _MOST_NAMES = 4
 
 
 class Summaries:
-    """Sends the summary of a robot while there are listeners.
-
-    Args:
-        namespace: that is served.
-        send: sends it.
-    """
+    """Sends the summary of a robot while there are listeners."""
 
     def __init__(self, namespace: str, send: Sender) -> None:
         self._namespace, self._host, self._send = namespace, host_name(), send
@@ -118,12 +113,9 @@ class Seen:
     """A robot that is reached.
 
     Attributes:
-        robot: its name.
-        instance: number of the bridge that serves it.
-        version: of that bridge.
-        clock: of the robot.
+        instance, version: of the bridge that serves it.
         summary: the last one; None: none so far.
-        told_ns: when that came; 0: never.
+        heard_ns: when that came; 0: never.
         bytes: of all summaries so far.
         guard: counts its messages that cannot be read.
         pinger: asks for its clock; None: not asked yet.
@@ -134,7 +126,7 @@ class Seen:
     version: int = VERSION
     clock: PeerClock = field(default_factory=PeerClock)
     summary: Summary | None = None
-    told_ns: int = 0
+    heard_ns: int = 0
     bytes: int = 0
     guard: Guard = field(default_factory=Guard)
     pinger: Pinger | None = None
@@ -209,7 +201,7 @@ class Watcher:
             seen.guard.refuse("a summary", str(error))
         else:
             with self._lock:
-                seen.summary, seen.told_ns = summary, now_ns()
+                seen.summary, seen.heard_ns = summary, now_ns()
                 seen.bytes += len(payload)
 
     def _ask_clock(self, seen: Seen) -> None:

@@ -91,7 +91,7 @@ def caller_option(command: _Decorated) -> _Decorated:
         "callers",
         multiple=True,
         metavar="NAME",
-        help="Only holders of a certificate of this name may call operations (tare ...); may be repeated.",
+        help="Only certificates of this name may call operations (tare ...); may be repeated.",
     )(command)
 
 

@@ -1,4 +1,4 @@
-"""``skin-bridge route`` and ``skin-bridge list``: where robots meet, and the state of all of them."""
+"""``skin-bridge route`` and ``skin-bridge list``: a router for many robots, and the state of all of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _PORT = 7447
 _PRESENCE = {0: "gone", 1: "there"}
 _PATIENCE_S = 3
-"""Time for a robot to send its state; a robot without news for so long is silent."""
+"""How long to wait for the summaries of robots; a robot without one for this long is silent."""
 _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "silent patches", "problems", "clock")
 
 
@@ -33,9 +33,9 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     "route",
     context_settings=cli.CONTEXT_SETTINGS,
     epilog=cli.examples(
-        "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            where robots and their users meet",
-        "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   a robot that goes there",
-        "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            one who uses it",
+        "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            the router",
+        "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   on a robot",
+        "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            on another machine",
     ),
 )
 @click.option(
@@ -44,7 +44,9 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     metavar="ENDPOINT",
     help=f"Where others connect.  [default: tcp/127.0.0.1:{_PORT}]",
 )
-@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here too.")
+@click.option(
+    "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here, too."
+)
 @cli.tls_option
 @cli.caller_option
 @click.option(
@@ -52,10 +54,14 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     "robots",
     multiple=True,
     metavar="R",
-    help="Only holders of a certificate of this name may serve, and only robot R; may be repeated.",
+    help="Only certificates of this name may serve, and only robot R; may be repeated.",
 )
 @click.option(
-    "--router", "routers", multiple=True, metavar="NAME", help="The certificate of another router; may be repeated."
+    "--router",
+    "routers",
+    multiple=True,
+    metavar="NAME",
+    help="Certificate name of another router; may be repeated.",
 )
 @cli.insecure_option
 @cli.json_option
@@ -69,7 +75,7 @@ def route(
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Let robots and their users meet at one address. A router reads nothing by itself.
+    """Run a router: one address where robots and their users meet. It reads no frames.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -93,7 +99,7 @@ def route(
 
 
 class _Routed:
-    """Report robots that come and go."""
+    """Prints which robots come and go."""
 
     def __init__(self, watcher: Watcher, as_json: bool) -> None:
         self._watcher, self._as_json = watcher, as_json
@@ -122,11 +128,11 @@ class _Routed:
 @click.option("--watch", is_flag=True, help="Update every second.")
 @cli.json_option
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
-    """List all reachable robots and their drivers: rate, age, losses, silent patches, problems, clock error.
+    """Show the drivers of all robots that are reached: rate, age, losses, silent patches, problems, clock error.
 
-    Each robot sends one small message a second for this; no frames are read.
+    Each robot sends one small message a second for this, and no frames.
 
-    Exit status: 0 done or interrupted, 1 none is reached, 2 wrong usage.
+    Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """
     from skinware.bridge import Link, Watcher, endpoints
 
@@ -143,7 +149,7 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
 
 
 class _Listed:
-    """Print the state of all robots, once or each second."""
+    """Prints the state of all robots, each second or once."""
 
     def __init__(
         self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
@@ -166,7 +172,7 @@ class _Listed:
         found = _report(robots)
         if not robots and is_late and self._seconds % _PATIENCE_S == 0:
             why = " ".join(filter(None, (why_unreachable(at, self._tls) for at in self._places)))
-            found["problems"].append(why or "something listens there, but no robot answers; does it need --tls?")
+            found["problems"].append(why or "something listens there, but no robot answers; does it want --tls?")
             if not self._watch:
                 self.why = found["problems"][-1]
                 return
@@ -199,7 +205,7 @@ def _as_text(found: dict[str, Any]) -> list[str]:
 
 
 def _report_of(seen: Seen) -> dict[str, Any]:
-    told_s = (now_ns() - seen.told_ns) / NS_PER_S if seen.told_ns else None
+    told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
     summary, clock = seen.summary, seen.clock
     return {
         "robot": seen.robot,

@@ -88,9 +88,9 @@ def paint(
 
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
-    from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Region, put_region, read_regions
+    from skinware.views.driver_snapshots import reader_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
@@ -131,9 +131,9 @@ class _Painter:
         """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""
         import numpy as np
 
-        from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.regions import without_holes
+        from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):

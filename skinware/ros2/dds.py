@@ -117,14 +117,7 @@ class DdsNode:
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
         with self._lock:
-            reader = self._made(
-                lambda: DataReader(
-                    self._participant,
-                    Topic(self._participant, f"rq{name}Request", _type(service_type.request, with_id=True)),
-                    self._qos(service_type.request, _SERVICE_QOS),
-                ),
-                name,
-            )
+            reader = self._declare(DataReader, f"rq{name}Request", service_type.request, _SERVICE_QOS, with_id=True)
             writer = self._writer(f"rr{name}Reply", service_type.response, _SERVICE_QOS, with_id=True)
             if self._worker is None:
                 self._worker = _Worker(self._participant)
@@ -162,30 +155,33 @@ class DdsNode:
         with_id: bool = False,
         is_listed: bool = True,
     ) -> _Writer:
-        def make() -> DataWriter[Any]:
-            made = Topic(self._participant, topic, _type(message_type, with_id))
-            return DataWriter(self._participant, made, self._qos(message_type, qos))
-
         with self._lock:
-            writer = _Writer(self._made(make, topic), self._closed if is_listed else lambda _: None, qos.latched)
+            declared = self._declare(DataWriter, topic, message_type, qos, with_id=with_id)
+            writer = _Writer(declared, self._closed if is_listed else lambda _: None, qos.latched)
             if is_listed:
                 self._writers.append(writer)
             return writer
 
-    def _made(self, make: Callable[[], Any], what: str) -> Any:
-        try:
-            return make()
-        except DDSException as error:
-            raise BridgeError(f"{what}: {_reason(error)}") from None
-
-    def _qos(self, message_type: MessageType, qos: Qos) -> DdsQos:
-        return DdsQos(
+    def _declare(
+        self,
+        kind: type[DataReader[Any] | DataWriter[Any]],
+        topic: str,
+        message_type: MessageType,
+        qos: Qos,
+        *,
+        with_id: bool,
+    ) -> Any:
+        policies = DdsQos(
             Policy.Reliability.Reliable(max_blocking_time=0) if qos.reliable else Policy.Reliability.BestEffort,
             Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(qos.depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.Userdata(endpoint_data(message_type.hash, self._identity.distro)),
         )
+        try:
+            return kind(self._participant, Topic(self._participant, topic, _type(message_type, with_id)), policies)
+        except DDSException as error:
+            raise BridgeError(f"{topic}: {_reason(error)}") from None
 
     def _closed(self, writer: _Writer) -> None:
         with self._lock:
@@ -206,7 +202,7 @@ class _Writer:
         self._writer: DataWriter[Any] | None = writer
         self._ref: int = writer._ref  # noqa: SLF001, for writing bytes
         self._closed, self._is_latched = closed, is_latched
-        self._words = bytearray()
+        self._buffer = bytearray()
         self.id: bytes = writer.guid.bytes
 
     @property
@@ -232,10 +228,10 @@ class _Writer:
         size = len(message) + -len(message) % 4
         if size == len(message):
             return message
-        if len(self._words) != size:
-            self._words = bytearray(size)
-        self._words[: len(message)] = message
-        return self._words
+        if len(self._buffer) != size:
+            self._buffer = bytearray(size)
+        self._buffer[: len(message)] = message
+        return self._buffer
 
     def close(self) -> None:
         if self._writer is not None:

@@ -27,15 +27,7 @@ class Level(IntEnum):
 
 
 class Status(NamedTuple):
-    """A ``diagnostic_msgs/DiagnosticStatus``.
-
-    Attributes:
-        level: of it.
-        name: of its subject.
-        message: in words.
-        hardware: kind of hardware.
-        values: further facts, by name.
-    """
+    """A ``diagnostic_msgs/DiagnosticStatus``; ``values``: further facts, by name."""
 
     level: Level
     name: str
@@ -74,14 +66,7 @@ def endpoint_data(type_hash: str, distro: Distro) -> bytes:
 
 
 def entities(identity: Identity, participant: bytes, readers: Sequence[bytes], writers: Sequence[bytes]) -> bytes:
-    """Return a ``rmw_dds_common/ParticipantEntitiesInfo`` of a participant with one node.
-
-    Args:
-        identity: of the node.
-        participant: its id, 16 bytes.
-        readers: ids of all readers of the node.
-        writers: ids of all writers.
-    """
+    """Return a ``rmw_dds_common/ParticipantEntitiesInfo`` of a participant with one node; ids have 16 bytes."""
     size = 24 if identity.distro is Distro.HUMBLE else 16
     cdr = Cdr().numbers("B", *participant.ljust(size, b"\0")).numbers("I", 1)
     cdr.text(identity.namespace).text(identity.name)

@@ -53,6 +53,9 @@ class ZenohNode:
         router_changed: called with (is there, line for people) when the router goes or comes back, and a second after
             the start if there is none; in a thread of the node.
 
+    Attributes:
+        is_seen: there was a router at the last look; nodes that start without one do not discover this one.
+
     Raises:
         ConfigurationError: an endpoint is malformed.
         BridgeError: there cannot be such a node; the message says why.
@@ -74,7 +77,7 @@ class ZenohNode:
         self._endpoints: set[_Publisher | _Service] = set()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._answering = threading.RLock()
-        self._is_seen = True
+        self.is_seen: bool = True
         self._worker = threading.Thread(target=self._work, name=f"node {identity.name}")
         try:
             self._token = self._announce(node_token(identity, self._zid, _NODE))
@@ -82,11 +85,6 @@ class ZenohNode:
             self._close_session()
             raise
         self._worker.start()
-
-    @property
-    def is_seen(self) -> bool:
-        """Whether there was a router at the last look; nodes that start without one do not discover this one."""
-        return self._is_seen
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
         """Return a publisher of an absolute topic.
@@ -158,9 +156,9 @@ class ZenohNode:
 
     def _look(self) -> None:
         is_seen = bool(self._session.info.routers_zid())
-        if is_seen == self._is_seen:
+        if is_seen == self.is_seen:
             return
-        self._is_seen, name = is_seen, self._identity.name
+        self.is_seen, name = is_seen, self._identity.name
         if is_seen:
             line = f"the zenoh router at {self._at} is there: nodes find {name}"
         else:
@@ -211,11 +209,7 @@ class _Publisher:
 
 
 class _Service:
-    """Answers requests under a key, one at a time of all services that share a lock.
-
-    Attributes:
-        declared: things of zenoh that end with it.
-    """
+    """Answers requests under a key, one at a time of all services that share a lock."""
 
     def __init__(
         self, at: str, handler: Handler, answering: threading.RLock, closed: Callable[[_Service], None]

@@ -72,13 +72,8 @@ class Attachment:
 def key(identity: Identity, name: str, of_type: MessageType) -> str:
     """Return the key of the messages of a topic, or of the requests to a service.
 
-    Args:
-        identity: of the node.
-        name: of the topic or service, absolute.
-        of_type: of its messages.
-
     Raises:
-        BridgeError: ROS has no such name.
+        BridgeError: ``name`` is no absolute name of ROS.
     """
     if not _NAME.fullmatch(name):
         raise BridgeError(f"{name!r} is no absolute name of a topic or service in ROS 2, as /skin/arm/points is")
@@ -86,13 +81,7 @@ def key(identity: Identity, name: str, of_type: MessageType) -> str:
 
 
 def node_token(identity: Identity, session: str, node: int) -> str:
-    """Return the token of a node.
-
-    Args:
-        identity: of the node.
-        session: id of zenoh's session.
-        node: its number in the session.
-    """
+    """Return the token of a node, which has a number in a session of zenoh."""
     return "/".join((_TOKENS, str(identity.domain), session, str(node), str(node), "NN", *_of_node(identity)))
 
 
@@ -106,18 +95,7 @@ def endpoint_token(
     of_type: MessageType,
     qos: Qos,
 ) -> str:
-    """Return the token of a publisher or a service.
-
-    Args:
-        identity: of its node.
-        session: id of zenoh's session.
-        node: number of its node in the session.
-        endpoint: its own number there.
-        kind: of the endpoint.
-        name: of the topic or service, absolute.
-        of_type: of its messages.
-        qos: that it offers.
-    """
+    """Return the token of a publisher or a service, which has a number of its own in the session."""
     place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
     return "/".join((*place, _mangled(name), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 

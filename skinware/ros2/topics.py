@@ -21,17 +21,11 @@ _STALE = np.uint8(Status.STALE)
 
 
 class DriverTopics:
-    """The topics of a driver.
-
-    Args:
-        node: publishes them.
-        prefix: before all topics: empty or ``/robot_1``.
-        name: of the driver.
+    """The topics of a driver, which begin with ``base``.
 
     Attributes:
-        base: what all topics of the driver begin with.
-        messages: that were sent.
-        left_out: that were not sent, because a subscriber is too slow.
+        messages: number of those that were sent.
+        left_out: number of those that were not sent, because a subscriber is too slow.
     """
 
     def __init__(self, node: Node, prefix: str, name: str) -> None:
@@ -99,10 +93,6 @@ class Transforms:
     """Publishes a static transform from a root to each coordinate frame: at its origin, without rotation.
 
     Skinware does not know where coordinate frames are relative to each other.
-
-    Args:
-        node: publishes them.
-        root: name of the parent of all frames.
     """
 
     def __init__(self, node: Node, root: str) -> None:

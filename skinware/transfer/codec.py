@@ -88,11 +88,7 @@ class CodedColumn:
 
 
 class Encoder:
-    """Codes the frames of one generation, in order.
-
-    Args:
-        columns: of its slots.
-    """
+    """Codes the frames of one generation, in order."""
 
     def __init__(self, columns: Sequence[CodedColumn]) -> None:
         self._columns = columns
@@ -225,12 +221,7 @@ class Run:
 
 
 class Decoder:
-    """Decodes frames of one generation, each coded after one of the last two that were kept.
-
-    Args:
-        columns: of its slots.
-        stride: bytes of a slot.
-    """
+    """Decodes frames of one generation, each coded after one of the last two that were kept."""
 
     def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:
         self._columns, self._stride = columns, stride

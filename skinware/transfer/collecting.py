@@ -13,7 +13,7 @@ from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
-from skinware.service._tap import Tap
+from skinware.service._reader import Tap
 from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50
@@ -43,15 +43,6 @@ class Listener(Protocol):
 
 @dataclass
 class _Source:
-    """A service that is read.
-
-    Attributes:
-        reader: of the service.
-        generation: of the frame that was taken last; 0: none so far.
-        lost: frames that are known to be lost.
-        state: the last one that was reported.
-    """
-
     reader: Tap[Sample]
     generation: int = 0
     lost: int = 0
@@ -65,13 +56,7 @@ class _Source:
 
 
 class _Taken(NamedTuple):
-    """A frame, and the events before it.
-
-    Attributes:
-        head: of its generation, if it is the first one of that.
-        is_restarted: there was another generation before.
-        lost: frames that were lost right before it.
-    """
+    """A frame, and the events before it; ``head`` of its generation if it is the first one."""
 
     service: str
     frame: Sample

@@ -28,9 +28,8 @@ class Published:
     """A service that is published.
 
     Attributes:
-        writer: of it.
         fd: readable when requests come.
-        generation: in the recording, or on the other machine, of the newest frame.
+        generation: original one of the newest frame.
         speed: of the replay when the writer's generation began; its rate depends on it.
         was_paused: the original writer is paused.
         waiting: requests for a newer frame, each with the time at which it came.

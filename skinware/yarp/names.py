@@ -67,12 +67,7 @@ def configured_server(environment: Mapping[str, str] = os.environ) -> tuple[str,
 
 
 class NameServer:
-    """A name server. Each call is a connection of its own, and takes at most some seconds.
-
-    Args:
-        host: name or number.
-        port: of TCP.
-    """
+    """A name server. Each call is a connection of its own, and takes at most some seconds."""
 
     def __init__(self, host: str, port: int = DEFAULT_PORT) -> None:
         self.host = host
@@ -91,25 +86,14 @@ class NameServer:
         return self._ask(name, f"query {name}")
 
     def register(self, name: str, host: str, port: int) -> Contact:
-        """Register a port in place of any other of that name.
-
-        Args:
-            name: of the port.
-            host: where others reach it; ``...``: as the server sees us.
-            port: of TCP.
-        """
+        """Register a port in place of any other of that name; host ``...``: the address that the server sees."""
         contact = self._ask(name, f"register {name} tcp {host} {port}")
         if contact is None:
             raise OSError(f"{self} did not register {name}")
         return contact
 
     def describe(self, name: str, carriers: Collection[str]) -> None:
-        """Register the carriers of a port, as ports of YARP do.
-
-        Args:
-            name: of the port, which is registered.
-            carriers: that it speaks as sender and as receiver.
-        """
+        """Register the carriers that a port speaks as sender and as receiver, as ports of YARP do."""
         for key in ("offers", "accepts"):
             self._ask(name, f"set {name} {key} {' '.join(carriers)}")
 

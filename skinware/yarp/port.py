@@ -65,8 +65,6 @@ class Receiver:
     """A reader.
 
     Attributes:
-        name: that it gave, or of its port.
-        carrier: of the connection.
         sent: messages so far.
         passed_over: messages that it missed because it had not finished the one before.
     """

@@ -39,10 +39,10 @@ from skinware.status import Status
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match, Reply
-from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
@@ -211,7 +211,9 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             Module(taxels(2, first_uid=2 * at), ids[0], "tips", name) for at, (name, ids) in enumerate(TIPS.items())
         ]
         self.patches = [Patch("hand", modules)]
-        self.geometry = _places_of_tips(self.options.side)
+        hand, tip = Hand(self.options.side), Grid(1, 1)
+        places = [hand.down(part, [tip])[0] for part in ("index", "middle", "ring", "thumb")]
+        self.geometry = Geometry.joined([tip.at(place, ["pressure"], [uid]) for uid, place in enumerate(places)])
 
     def _take_pads(self) -> None:
         factor = 10 if self.options.palm == "tenfold" else 1
@@ -249,14 +251,6 @@ def _expand(
     value = sent * np.array([factor] + 7 * [1], np.uint16)
     row, channel = np.divmod(np.arange(8 * len(length)), 8)
     return row, channel, np.where(sent >= _MOST, sent + np.uint16(_ENDS), value).ravel()
-
-
-def _places_of_tips(side: Literal["right", "left"]) -> Geometry:
-    tip = Grid(1, 1)
-    parts = ("index", "middle", "ring", "thumb")
-    return Geometry.joined(
-        [tip.at(Hand(side).down(part, [tip])[0], ["pressure"], [uid]) for uid, part in enumerate(parts)]
-    )
 
 
 def _places_of_pads(side: Literal["right", "left"]) -> Geometry:

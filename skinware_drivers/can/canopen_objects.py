@@ -22,9 +22,13 @@ from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
 from skinware_drivers.link import Link, Match
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 REPLY_S = 0.2
 _COMMAND, _SEGMENT_BYTES, _FRAME_BYTES = 0xE0, 7, 8
 _MOST_BYTES = 1 << 16
+_NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
+"""Bits of a COB-ID (CiA 301): the TPDO is not in use; its identifier has 29 bits."""
 
 
 class SdoAborted(BusError):
@@ -121,11 +125,6 @@ class SdoClient:
     def _name(self, target: bytes) -> str:
         index, subindex = struct.unpack("<HB", target)
         return f"object {index:04X}:{subindex} of node {self.node}"
-
-
-log: logging.Logger = logging.getLogger("skinware.driver")
-
-_NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ class BoardSetUp:
         wiped: triangles that a special board configuration switched off, though no option does.
         period_ms: of its skin data.
         skin_type: as sent to it.
+        is_uneven: its triangles have different shifts or converter offsets.
         inertial: its inertial sensors.
     """
 
@@ -85,6 +86,7 @@ class BoardSetUp:
         self.enabled: frozenset[int] = frozenset(self._on)
         named_off = {t for module in modules if module.enabled is False for t in module.triangles}
         self.wiped: frozenset[int] = frozenset(wanted - self._on - named_off)
+        self.is_uneven: bool = len({*zip(self._shift, self._cdc_offset, strict=True)}) > 1
 
     def inertial_set_up(self) -> list[bytes]:
         mask = self._imu_mask
@@ -110,11 +112,6 @@ class BoardSetUp:
         self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
         self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
         self._no_load = self._no_load if special.no_load is None else special.no_load
-
-    @property
-    def is_uneven(self) -> bool:
-        """Whether its triangles have different shifts or converter offsets."""
-        return len({*zip(self._shift, self._cdc_offset, strict=True)}) > 1
 
     def _set_up_new(self, options: RoboskinOptions, modules: Iterable[Kind]) -> set[int]:
         """Return the triangles that were switched on at some time."""

@@ -28,7 +28,7 @@ from skinware.cli._command import (
 )
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
-from skinware_drivers.cli.driver_events import report, tell_capture, tell_patches, tell_ready
+from skinware_drivers.cli.driver_events import print_capture, print_patches, print_ready, report
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 UNIT_FILE = "skinware@.service"
 _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
-"""What stands in that file for this program."""
+"""Stands in that file for this program."""
 
 
 class DriverCommand(HardwareCommand):
@@ -64,11 +64,11 @@ class DriverCommand(HardwareCommand):
         return short_name(name), load_driver(name).Options
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse; say what to do with a word that is no option."""
+        """Parse; explain a word that is not an option."""
         ctx.allow_extra_args = True
         left = super().parse_args(ctx, args)
         if left:
-            raise click.UsageError(f"{left[0]!r} is no option: name the driver with --driver, a bus with --bus", ctx)
+            raise click.UsageError(f"{left[0]!r} is not an option; name a driver with --driver, a bus with --bus", ctx)
         return left
 
 
@@ -95,8 +95,8 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
         "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
-        "skin-driver --bus can0 --capture it.mcap   record all of it, for who helps you",
-        "skin-driver --bus replay:it.mcap           decode that again, with the driver and options of then",
+        "skin-driver --bus can0 --capture it.mcap   make a capture for a bug report",
+        "skin-driver --bus replay:it.mcap           decode it again, with the recorded driver and options",
     ),
 )
 @click.option(
@@ -152,7 +152,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "--capture",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Record all that goes over the buses, and what comes of it, into a new file for who helps you.",
+    help="Record all frames on the buses, and the decoded values, into a new file, such as for a bug report.",
 )
 @click.option(
     "--systemd",
@@ -186,16 +186,16 @@ def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) ->
     own = {name: given.pop(name) for name in names & given.keys()}
     setup = DriverSetup(DriverArguments(hardware=hardware_values(given), **own))
     runner = setup.make_runner(
-        on_ready=lambda: tell_ready(runner, as_json),
-        on_patches=lambda change: tell_patches(runner, change) if as_json else None,
+        on_ready=lambda: print_ready(runner, as_json),
+        on_patches=lambda change: print_patches(runner, change) if as_json else None,
     )
     with contextlib.ExitStack() as beside:
         if capture is not None:
             from skinware_drivers.cli.capturing import captured
 
-            done = partial(tell_capture, as_json=as_json)
+            done = partial(print_capture, as_json=as_json)
             beside.enter_context(captured(capture, setup.name, setup.namespace.name, done))
-        if setup.profile is not None:  # not that of what records
+        if setup.profile is not None:  # not for the recorder
             setup.profile.apply()
         with asyncio.Runner(loop_factory=FlowLoop) as loop:
             loop.run(_run(runner, as_json, partial(setup.read_again, runner)))
@@ -247,7 +247,7 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
 
 
 def _has_terminal() -> bool:
-    """Whether this process is attached to a terminal, wherever its input and output go."""
+    """Return whether this process is attached to a terminal, wherever its input and output go."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:

@@ -1,4 +1,4 @@
-"""What ``skin-driver`` prints while it runs: lines for people, or one JSON object per event."""
+"""Print the events of ``skin-driver``: lines for people, or one JSON object per event."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from skinware_drivers.running.runner import Runner
 
 
-def tell_ready(runner: Runner, as_json: bool) -> None:
+def print_ready(runner: Runner, as_json: bool) -> None:
     if runner.builder.generation is None:
         return
     structure = runner.builder.generation.tables.structure
@@ -33,27 +33,27 @@ def tell_ready(runner: Runner, as_json: bool) -> None:
         echo(f"{runner.identity.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
 
 
-def tell_patches(runner: Runner, change: PatchChange) -> None:
-    """Patches fell silent, or are live again: for programs. People have it in the log."""
+def print_patches(runner: Runner, change: PatchChange) -> None:
+    """Print for programs that patches fell silent, or are live again; people see it in the log."""
     if runner.ready:
         print_json({"event": "patches", "name": runner.identity.name, **change._asdict()})
 
 
-def tell_capture(capture: Capture, as_json: bool) -> None:
-    """The file with what went over the buses is complete, or is not."""
+def print_capture(capture: Capture, as_json: bool) -> None:
+    """Print that the captured file is complete, or why it is not."""
     with contextlib.suppress(BrokenPipeError):
         if as_json:
-            print_json({"event": "captured", "file": str(capture.path), **capture.told})
-        elif capture.told["problem"]:
-            echo(f"{capture.path}: ended early: {capture.told['problem']}", err=True)
+            print_json({"event": "captured", "file": str(capture.path), **capture.result})
+        elif capture.result["problem"]:
+            echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
         else:
-            lost = f", {capture.told['lost']} frames lost" if capture.told["lost"] else ""
-            size = capture.told["bytes"] / 1e6
+            lost = f", {capture.result['lost']} frames lost" if capture.result["lost"] else ""
+            size = capture.result["bytes"] / 1e6
             echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
 
 
 async def report(runner: Runner) -> None:
-    """Its state each second, for programs, until nobody reads any more."""
+    """Print its state each second, for programs, until the pipe is closed."""
     while True:
         await asyncio.sleep(1)
         if runner.ready:

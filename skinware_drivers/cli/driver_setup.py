@@ -131,12 +131,12 @@ class DriverSetup:
         await runner.change_geometry(geometry)
 
     def _named(self, texts: Sequence[str]) -> list[NamedBus]:
-        """Refuse a bus that is named twice: its boards would be set up twice, and be two skins."""
+        """Refuse a bus that is named twice: its boards would be set up twice."""
         buses: dict[BusPlace, NamedBus] = {}
         for bus in (NamedBus(text, self._driver_name) for text in texts):
             if (other := buses.setdefault(bus.name.place, bus)) is not bus:
                 also = f", also as {other.text}" if other.text != bus.text else ""
-                raise ConfigurationError(f"bus {bus.text} is named twice{also}; a driver has each of its buses once")
+                raise ConfigurationError(f"bus {bus.text} is named twice{also}; name each bus once")
         return list(buses.values())
 
     def _make_adapter(self, bus: NamedBus, file: ConfigFile) -> AnyAdapter:

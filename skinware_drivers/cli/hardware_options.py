@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 _HARDWARE_OPTIONS = "skinware.hardware_options"
 _PREFIX = "hardware_"
-"""Of parameters of hardware: the command's own have other names than their flags."""
+"""Prefix of the parameters of hardware, so that they never clash with the command's own."""
 _LONGEST_KIND = 24
-"""What is longer stands in the text, where it can be wrapped."""
+"""Longer kinds are written in the help text, where they can be wrapped."""
 
 
 class HardwareCommand(click.Command):

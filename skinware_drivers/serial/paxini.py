@@ -100,9 +100,9 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
             self._is_away,
             period_s=options.period_ms / 1e3,
             use=self.change_framing,
-            tell=self.tell,
+            report=self.tell,
         )
-        self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, tell=self.tell)
+        self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
         self._board: Board | None = None
         self._is_asking = False
 

@@ -230,7 +230,7 @@ class ConverterBoard(Board):
         else:
             log.warning("%s: sensor %d is another one now: %s", link.bus_name, sensor, version)
             del self._patches[sensor]  # logged once
-            self.tell(patch, Notice.CHANGED)
+            self.report(patch, Notice.CHANGED)
 
     def _points_of(self, sensor: int, version: str) -> int:
         known = (points for code, points in POINTS_OF_PART.items() if code in version)

@@ -176,7 +176,7 @@ class HighSpeedBoard(Board):
         """Return whether a board with the same modules answers: then it was reset, and no longer sends."""
         if await self._ask_slots(link, tries=1) == self._slots:
             return True
-        self.tell(patch, Notice.CHANGED)
+        self.report(patch, Notice.CHANGED)
         return False
 
     async def attend(self, link: Link) -> None:
@@ -190,7 +190,7 @@ class HighSpeedBoard(Board):
                 if enough and self._patch is not None:
                     log.warning("%s: the board streams other modules than before; asking which", link.bus_name)
                     times_ns, self._streams = [], False
-                    self.tell(self._patch, Notice.CHANGED)
+                    self.report(self._patch, Notice.CHANGED)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
         """Calibrate the board, which does not send meanwhile.

@@ -25,7 +25,7 @@ MOST_POINTS = 255
 _PAXINI = 0x5058
 """Number of the vendor in the ids of its own types."""
 _RANGES_N = ((-12.8, 12.7), (-12.8, 12.7), (0.0, 25.5))
-"""Of the axes x, y (within the skin) and z (along the normal); a byte each, in 0.1 N."""
+"""Ranges of the axes x, y (within the skin) and z (along the normal); a byte each, in 0.1 N."""
 _TAXEL_TYPES, _RESULTANT_TYPES = (
     tuple(
         axis.measured(scale=0.1, minimum=low, maximum=high) for axis, (low, high) in zip(axes, _RANGES_N, strict=True)
@@ -181,17 +181,19 @@ class Board(ABC):
     Args:
         period_s: time between two updates, as far as it is known.
         use: called with a framing for the line; bytes that are no whole frame yet are dropped.
-        tell: called with the notices of patches.
+        report: called with the notices of patches.
     """
 
     framing: Framing
     layout: Layout
     geometry: Geometry | None = None
 
-    def __init__(self, period_s: float, use: Callable[[Framing], None], tell: Callable[[Patch, Notice], None]) -> None:
+    def __init__(
+        self, period_s: float, use: Callable[[Framing], None], report: Callable[[Patch, Notice], None]
+    ) -> None:
         self.period_s = period_s
         self.use = use
-        self.tell = tell
+        self.report = report
 
     @property
     def polls(self) -> Sequence[Poll]:

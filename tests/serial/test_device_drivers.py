@@ -15,7 +15,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini

@@ -16,8 +16,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.flexitac import FlexiTacDriver, FlexiTacOptions
 from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.driving import emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac, EmulatedFlexiTacOptions
 from tests.sdk.driving import driving_lines, read_until

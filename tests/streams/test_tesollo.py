@@ -15,8 +15,7 @@ from skinware.status import PatchState
 from skinware_drivers.link import Link, Reply
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.tesollo import _TIPS, TesolloDriver, TesolloOptions, _Hand
-from skinware_drivers.testing.carrying import emulated_on
-from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.driving import emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from tests.commands import run

@@ -195,12 +195,12 @@ class Follower:
             self._probe()
 
     def start_over(self) -> None:
-        """The robot has other generations than before."""
+        """Forget the generation: the robot begins new ones."""
         self._generation = None
         self.output.newest, self.output.count = (0, 0), None
 
     def lose(self) -> None:
-        """The robot is not heard any more; all questions are asked again when it is."""
+        """Show the service as dead, and forget all open questions."""
         self._mirror.happened(self._name, DEAD)
         self.output.is_dead, self.output.newest = True, (0, 0)
         self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
@@ -273,7 +273,7 @@ class Follower:
             self._end_listening = self._peer.listen(self._peer.keys.frame(self._name, self._part), self._pushed)
 
     def _pushed(self, key: str, message: bytes) -> None:
-        """In the receiving thread, so that a frame waits for no other one."""
+        """Take a frame in the receiving thread: handing over would cost time."""
         with self._mirror.lock:
             if key == self._peer.keys.frame(self._name, self._part):  # not from a bridge that was followed before
                 self._take_frame(message)

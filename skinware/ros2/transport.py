@@ -1,4 +1,4 @@
-"""The node of a ROS 2 graph that Skinware needs, whatever carries it. Messages are bytes (CDR), types only names.
+"""The node of a ROS 2 graph, independent of its carrier. Messages are bytes (CDR), and types only names.
 
 A carrier (DDS, zenoh) is a module with one class that is a :class:`Node`, made of an :class:`Identity`.
 """

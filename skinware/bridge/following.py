@@ -31,7 +31,7 @@ _EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
 @dataclass
-class Traffic:
+class LinkTraffic:
     """The frames of a service that came.
 
     Attributes:
@@ -87,7 +87,7 @@ class Pulls:
         return is_open
 
 
-class Output:
+class FrameOutput:
     """Publishes the frames of a service in order.
 
     Attributes:
@@ -98,7 +98,7 @@ class Output:
 
     def __init__(self, name: str, peer: Peer, mirror: Mirror) -> None:
         self._name, self._peer, self._mirror = name, peer, mirror
-        self.traffic = Traffic()
+        self.traffic = LinkTraffic()
         self.count: int | None = None
         self.newest = (0, 0)
         self.is_dead = False
@@ -134,7 +134,7 @@ class Output:
         return age_ns
 
 
-class Follower:
+class ServiceFollower:
     """Follows a service of a robot. Callers hold the lock of the mirror.
 
     Args:
@@ -151,7 +151,7 @@ class Follower:
     ) -> None:
         self._name, self._peer, self._mirror, self._part = name, peer, mirror, part
         self.service = service
-        self.output = Output(name, peer, mirror)
+        self.output = FrameOutput(name, peer, mirror)
         self.is_over = False
         self._pacing = Pacing(0, mode)
         self._pulls = Pulls()

@@ -1,14 +1,18 @@
-"""How a service and a skin are doing, from what its reader sees: the judgements that several commands share."""
+"""Judge services, drivers, buses and patches from what their readers see.
+
+This is the one model of a driver that commands, the terminal, the page and ROS 2 show.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusReason, BusState, PatchState, Status, is_fresh
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, BusReason, BusState, PatchState, Status, is_fresh
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -20,7 +24,7 @@ if TYPE_CHECKING:
 
 LIVE, SILENT, PAUSED, STARTING, DEAD = "live", "silent", "paused", "starting", "dead"
 WITHOUT_NEWS = (SILENT, PAUSED, DEAD)
-"""Lives in which the newest frame is the last word for now: nothing in it is fresh."""
+"""States of a driver in which nothing in its newest snapshot is fresh."""
 
 _LEAST_SILENCE_NS = NS_PER_S
 _SILENT_PERIODS = 5
@@ -29,17 +33,175 @@ _BUS_STATES = {int(state): state.name.lower() for state in BusState}
 _BUS_REASONS = {int(reason): reason.name.lower() for reason in BusReason}
 
 
+@dataclass(frozen=True)
+class BusReport:
+    """One bus of a driver.
+
+    Attributes:
+        name: of the bus.
+        state: name of a :class:`skinware.status.BusState`.
+        reason: name of a :class:`skinware.status.BusReason`; None without one.
+        load: part of the time that the bus is in use, 0 to 1; None where it is not known.
+        counters: all counters of the driver for this bus, by name.
+    """
+
+    name: str
+    state: str
+    reason: str | None
+    load: float | None
+    counters: dict[str, int]
+
+
+@dataclass(frozen=True)
+class PatchReport:
+    """One patch of a driver.
+
+    Attributes:
+        name: of the patch.
+        bus: index of its bus.
+        state: name of a :class:`skinware.status.PatchState`.
+        sensors, fresh, untouched: number of all its sensors, of the fresh ones, and of those that were only 0 so far.
+        age_ns: age of its newest data; None if it never sent any.
+        rate_hz: updates per second of its modules; None where that is not known.
+        counters: all counters of the driver for this patch, by name.
+    """
+
+    name: str
+    bus: int
+    state: str
+    sensors: int
+    fresh: int
+    untouched: int
+    age_ns: int | None
+    rate_hz: float | None
+    counters: dict[str, int]
+
+
+@dataclass(frozen=True)
+class DriverReport:
+    """One driver with its buses and patches.
+
+    Attributes:
+        name: of the driver.
+        life: what it is doing, see :func:`life_of`.
+        rate_hz: snapshots per second now; None where that is not known yet.
+        age_ns: age of its newest data; None before the first snapshot.
+        sensors: number of its sensors.
+        statuses: number of sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``
+            counts those of modules that sent only 0 so far; they are fresh all the same.
+        buses, patches: in the order of the structure; empty before the first snapshot and while the structure changes.
+    """
+
+    name: str
+    life: str
+    rate_hz: float | None
+    age_ns: int | None
+    sensors: int
+    statuses: dict[str, int]
+    buses: tuple[BusReport, ...] = ()
+    patches: tuple[PatchReport, ...] = ()
+
+    @property
+    def fresh(self) -> int:
+        return self.statuses.get("fresh", 0)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Sums of the counters of all buses and patches, by name."""
+        sums: dict[str, int] = {}
+        for counters in [bus.counters for bus in self.buses] + [patch.counters for patch in self.patches]:
+            for name, count in counters.items():
+                sums[name] = sums.get(name, 0) + count
+        return sums
+
+    @property
+    def patch_states(self) -> dict[str, int]:
+        """Number of patches by state, as :meth:`last` names it."""
+        states = sorted(self.last(patch.state) for patch in self.patches)
+        return {state: states.count(state) for state in dict.fromkeys(states)}
+
+    def last(self, state: str) -> str:
+        """Return the state of a bus or patch; ``was live`` where it is only the last one that is known."""
+        return f"was {state}" if self.life in WITHOUT_NEWS else state
+
+
+def report_of(
+    reader: DriverReader,
+    frame: DriverSnapshot | None,
+    measured_hz: float | None = None,
+    patch_rates_hz: Sequence[float | None] = (),
+    *,
+    life: str | None = None,
+    status: npt.NDArray[np.uint8] | None = None,
+) -> DriverReport:
+    """Return the report of a driver.
+
+    Args:
+        reader: its reader.
+        frame: its newest snapshot.
+        measured_hz: its rate as measured.
+        patch_rates_hz: updates per second of each patch as measured; ignored unless there is one for each patch.
+        life: what it is doing; default: what :func:`life_of` returns.
+        status: (n_sensors,) uint8, status of its sensors now; default: what :func:`status_now` returns.
+    """
+    life = life_of(reader, frame) if life is None else life
+    rate_hz = rate_now_hz(life, measured_hz)
+    if frame is None:
+        return DriverReport(reader.name, life, rate_hz, None, reader.structure.n_sensors, {})
+    status = status_now(life, frame) if status is None else status
+    structure, is_untouched = frame.structure, untouched(frame)
+    statuses = count_statuses(status) | {"untouched": int(np.count_nonzero(is_untouched))}
+    report = DriverReport(reader.name, life, rate_hz, frame.age_ns, structure.n_sensors, statuses)
+    if structure is not reader.structure and structure != reader.structure:
+        return report
+    buses = tuple(
+        BusReport(
+            structure.buses[bus],
+            bus_state_name(int(frame.bus_state[bus])),
+            bus_reason_name(int(frame.bus_reason[bus])),
+            None if load in (LOAD_UNKNOWN, LOAD_FILTERED) else load / 1000,
+            counters,
+        )
+        for bus, (load, counters) in enumerate(zip(frame.bus_load.tolist(), reader.bus_counters(frame), strict=True))
+    )
+    sensors, fresh, dark = (
+        np.bincount(patches, minlength=structure.n_patches).tolist()
+        for patches in (
+            structure.sensor_patch,
+            structure.sensor_patch[status == 0],
+            structure.sensor_patch[is_untouched],
+        )
+    )
+    rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
+    ages_ns, patch_buses = patch_ages_ns(frame), structure.patch_bus.tolist()
+    patches = tuple(
+        PatchReport(
+            name=structure.patch_names[patch],
+            bus=patch_buses[patch],
+            state=patch_state_name(int(frame.patch_state[patch])),
+            sensors=sensors[patch],
+            fresh=fresh[patch],
+            untouched=dark[patch],
+            age_ns=ages_ns[patch],
+            rate_hz=None if rates[patch] is None else rate_now_hz(life, rates[patch]),
+            counters=counters,
+        )
+        for patch, counters in enumerate(reader.patch_counters(frame))
+    )
+    return replace(report, buses=buses, patches=patches)
+
+
 def life_of(service: ServiceReader[Any], newest: Sample | None) -> str:
-    """What a service is doing.
+    """Return what a service is doing.
 
     Args:
         service: its reader.
-        newest: its newest frame.
+        newest: its newest sample.
 
     Returns:
-        ``live``; ``silent``: its process is there but has published nothing for a second and five of its periods (hung
-        or stopped); ``paused``: it said so; ``starting``: it has published nothing so far; ``dead``: its process is
-        gone.
+        ``live``; ``silent``: its process runs but has published nothing for a second and for five of its periods (it
+        hangs or was stopped); ``paused``: it announced that; ``starting``: it has published nothing so far; ``dead``:
+        its process is gone.
     """
     if not service.alive:
         return DEAD
@@ -53,68 +215,12 @@ def life_of(service: ServiceReader[Any], newest: Sample | None) -> str:
 
 
 def rate_now_hz(life: str, measured_hz: float | None) -> float | None:
-    """The rate at which frames come now: none come from who is not live, whatever was measured before."""
+    """Return the rate at which samples arrive now: 0 from a service that is not live, whatever was measured before."""
     return measured_hz if life == LIVE else 0.0
 
 
-@dataclass(frozen=True)
-class SkinHealth:
-    """One driver in a few figures.
-
-    Attributes:
-        name: the driver.
-        life: see :func:`life_of`.
-        rate_hz: frames per second now; None where not known yet.
-        age_ns: how old its newest data is; None before the first frame.
-        sensors: how many it has.
-        statuses: sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``: those of
-            modules that have sent nothing but 0 so far, which are fresh all the same.
-        patches: patches by state (``was live``: by their last state, where nothing newer comes).
-        counters: sums over all buses and patches of the counters that the driver publishes, by name.
-    """
-
-    name: str
-    life: str
-    rate_hz: float | None
-    age_ns: int | None
-    sensors: int
-    statuses: dict[str, int]
-    patches: dict[str, int]
-    counters: dict[str, int]
-
-
-def health_of(reader: DriverReader, frame: DriverSnapshot | None, measured_hz: float | None) -> SkinHealth:
-    """Sum up a driver.
-
-    Args:
-        reader: its reader.
-        frame: its newest frame.
-        measured_hz: its rate as measured.
-    """
-    life = life_of(reader, frame)
-    rate_hz = rate_now_hz(life, measured_hz)
-    if frame is None:
-        return SkinHealth(reader.name, life, rate_hz, None, reader.structure.n_sensors, {}, {}, {})
-    was = "was " if life in WITHOUT_NEWS else ""
-    states = [was + patch_state_name(state) for state in frame.patch_state.tolist()]
-    counters: dict[str, int] = {}
-    for row in (*reader.bus_counters(frame), *reader.patch_counters(frame)):
-        for name, count in row.items():
-            counters[name] = counters.get(name, 0) + count
-    return SkinHealth(
-        reader.name,
-        life,
-        rate_hz,
-        frame.age_ns,
-        frame.structure.n_sensors,
-        count_statuses(status_now(life, frame)) | {"untouched": int(np.count_nonzero(untouched(frame)))},
-        {state: states.count(state) for state in dict.fromkeys(sorted(states))},
-        counters,
-    )
-
-
 def status_now(life: str, frame: DriverSnapshot) -> npt.NDArray[np.uint8]:
-    """(n_sensors,) uint8: the status of a frame's sensors now: what has become too old since, is stale."""
+    """Return (n_sensors,) uint8, the status of a snapshot's sensors now: values that became too old are stale."""
     status, stale = frame.status, np.uint8(Status.STALE)
     if life in WITHOUT_NEWS:
         return status | stale
@@ -129,12 +235,12 @@ def status_now(life: str, frame: DriverSnapshot) -> npt.NDArray[np.uint8]:
 
 
 def untouched(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
-    """(n_sensors,) bool: sensors of modules that have sent nothing but 0 so far; they are fresh all the same."""
+    """Return (n_sensors,) bool: sensors of modules that sent only 0 so far; they are fresh all the same."""
     return frame.module_untouched[frame.structure.sensor_module]
 
 
 def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
-    """How many sensors are fresh, and how many have each of the other statuses (``stale``, ``never_seen`` ...)."""
+    """Return how many sensors are fresh, and how many have each other status (``stale``, ``never_seen`` ...)."""
     counts = {"fresh": int(np.count_nonzero(status == 0))}
     for bit in (Status.STALE, *(bit for bit in Status if bit != Status.STALE)):
         counts[str(bit.name).lower()] = int(np.count_nonzero(status & np.uint8(bit)))
@@ -142,7 +248,7 @@ def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
 
 
 def patch_ages_ns(frame: DriverSnapshot) -> list[int | None]:
-    """How old the newest data of every patch is; None for one that was never heard."""
+    """Return the age of the newest data of each patch; None for one that never sent any."""
     newest_ns = np.zeros(frame.structure.n_patches, np.int64)
     np.maximum.at(newest_ns, frame.structure.group_patch, frame.group_time_ns)
     time_ns = now_ns()
@@ -150,15 +256,15 @@ def patch_ages_ns(frame: DriverSnapshot) -> list[int | None]:
 
 
 def patch_state_name(state: int) -> str:
-    """Name of a :class:`PatchState`; a number that this version does not know stays a number."""
+    """Return the name of a :class:`PatchState`; a number that this version does not know stays a number."""
     return _PATCH_STATES.get(state, str(state))
 
 
 def bus_state_name(state: int) -> str:
-    """Name of a :class:`BusState`; a number that this version does not know stays a number."""
+    """Return the name of a :class:`BusState`; a number that this version does not know stays a number."""
     return _BUS_STATES.get(state, str(state))
 
 
 def bus_reason_name(reason: int) -> str | None:
-    """Name of a :class:`BusReason`, None for ``NONE``; a number that this version does not know stays a number."""
+    """Return the name of a :class:`BusReason`, None for ``NONE``; an unknown number stays a number."""
     return _BUS_REASONS.get(reason, str(reason)) if reason else None

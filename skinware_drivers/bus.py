@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +47,11 @@ _MEDIA = {
 """What the buses of a medium are called, and how they are written."""
 
 
+CHOOSE = "__skinware_choose_class__"
+"""The attribute that :func:`chosen_by` sets."""
+
 _WayT = TypeVar("_WayT")
+_MakeT = TypeVar("_MakeT", bound=Callable[..., Any])
 
 
 def identifier_text(identifier: int) -> str:
@@ -223,12 +227,13 @@ class Bus(ABC):
         self.wire_bits: float = 0.0
         self.fullest: float = 0.0
 
-    def fits(self, medium: str) -> bool:
-        """Whether drivers of devices on this medium can use it."""
-        return self.medium in (None, medium)
+    @classmethod
+    def fits(cls, medium: str) -> bool:
+        """Return whether drivers of devices on this medium can use such a bus."""
+        return cls.medium in (None, medium)
 
     def instead(self, medium: str) -> str:
-        """What to give instead to a driver that it does not fit, for people: the end of a sentence."""
+        """Return what fits a driver of this medium instead, as the end of a sentence for people."""
         return _MEDIA[medium][1] if medium in _MEDIA else ""
 
     @property
@@ -324,3 +329,17 @@ class Bus(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.channel}>"
+
+
+def chosen_by(choose: Callable[[str, dict[str, str]], type[Bus]]) -> Callable[[_MakeT], _MakeT]:
+    """Mark a function that makes buses of several classes.
+
+    Args:
+        choose: returns the class for a channel and its options, and raises ``ConfigurationError`` for a wrong channel.
+    """
+
+    def mark(make: _MakeT) -> _MakeT:
+        setattr(make, CHOOSE, choose)
+        return make
+
+    return mark

@@ -1,9 +1,8 @@
-"""Names of buses, ``[interface:]channel[?key=value&...]``: taken apart, and which bus they mean."""
+"""Names of buses: ``[interface:]channel[?key=value&...]``, parsed once."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
@@ -15,78 +14,83 @@ _PLACING: dict[str, dict[str, str]] = {
     "udp_multicast": {"port": "43113"},
     "socketcand": {"host": "", "port": ""},
 }
-"""By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
+"""By interface: the options that tell one bus from another beside the channel, with their defaults."""
 NETWORKS = ("tcp", "udp", "websocket", "yarp")
 """Interfaces of serial devices that are reached over a network."""
 
 
+class BusPlace(NamedTuple):
+    """The parts of a bus name that tell one bus from another; ``options`` always come in the same order."""
+
+    interface: str
+    channel: str
+    options: tuple[tuple[str, str], ...]
+
+
 class BusName(NamedTuple):
-    """A bus' name taken apart."""
+    """A bus name in its parts.
+
+    ``vcan0`` is ``socketcan:vcan0``; ``virtual`` is an emulated skin in this process. A path, which has a slash in it
+    (``/dev/ttyUSB0``, ``./port``), is a serial port; ``tcp://HOST:PORT`` and ``udp://HOST:PORT`` are streams over a
+    network; ``yarp://HOST:PORT/NAME`` is a port of a robot that runs YARP. URLs of pyserial (``rfc2217://host:port``)
+    are serial ports, too. ``can+virtual:`` and ``can+serial:`` are the interfaces of python-can whose names are taken.
+    """
 
     interface: str
     channel: str
     options: dict[str, str]
 
+    @classmethod
+    def of(cls, text: str) -> BusName:
+        """Return the parts of any text, also of one that names no bus; :func:`parse_bus_name` refuses mistakes."""
+        address, _, query = text.partition("?")
+        return cls(*_split(address), dict(parse_qsl(query, keep_blank_values=True)))
 
-class BusPlace(NamedTuple):
-    """What of a bus' name says which bus it is."""
+    @property
+    def is_only_asked(self) -> bool:
+        """Whether such a bus is silent until the driver connects to a device, or asks it."""
+        return self.interface in (*NETWORKS, "modbus")
 
-    interface: str
-    channel: str
-    options: tuple[tuple[str, str], ...]
-    """Those that place it, always in the same order."""
+    @property
+    def place(self) -> BusPlace:
+        """The place of the bus: two names of one bus have the same place, whatever other options they have.
+
+        Links are followed. Emulated buses differ if any of their options differs. A USB device that is named by its
+        serial number or kind has the place that its name says, wherever it is plugged in.
+        """
+        usual = dict.fromkeys(sorted(self.options), "") if self.interface == "virtual" else {}
+        usual = _PLACING.get(self.interface, usual)
+        options = tuple((key, self.options.get(key, value)) for key, value in usual.items())
+        channel = os.path.realpath(self.channel) if self.channel.startswith("/") else self.channel
+        return BusPlace(self.interface, channel, options)
 
 
-def parse_bus_name(name: str) -> BusName:
-    """Take a bus' name apart.
-
-    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
-    (``/dev/ttyUSB0``, ``./port``), is a serial port; ``tcp://HOST:PORT`` and ``udp://HOST:PORT`` are streams over a
-    network, ``yarp://HOST:PORT/NAME`` is a port of a robot that runs YARP. pyserial's URLs (``rfc2217://host:port``)
-    are serial, too.
-    python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
+def parse_bus_name(text: str) -> BusName:
+    """Return the parts of a bus name.
 
     Raises:
-        ConfigurationError: empty, options that are not ``key=value``, or neither a connection nor a port for Modbus.
+        ConfigurationError: it is empty, its options are not ``key=value``, or it names neither a connection nor a port
+            for Modbus.
     """
-    address, _, query = name.partition("?")
+    address, _, query = text.partition("?")
     if "=" in address and "/" not in address:
-        raise ConfigurationError(f"bus {name!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
+        raise ConfigurationError(f"bus {text!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
     if not address:
         raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
     try:
-        options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if query else {}
+        parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
     except ValueError:
-        raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
-    interface, channel = _split(address)
-    if interface == "modbus":
-        _check_modbus(channel, options)
-    return BusName(interface, channel, options)
+        raise ConfigurationError(f"bus {text!r}: write options as ?key=value&key=value") from None
+    name = BusName.of(text)
+    if name.interface == "modbus":
+        _check_modbus(name)
+    return name
 
 
-def is_only_asked(name: str) -> bool:
-    """Whether nothing is to be heard on a bus of this name unless a device is called, or asked."""
-    return _split(name.partition("?")[0])[0] in (*NETWORKS, "modbus")
-
-
-def place_of_bus(name: str) -> BusPlace:
-    """Which bus a name means: two names of one bus have the same place, whatever options stand in them beside that.
-
-    Links are followed. Emulated buses are told apart by all of their options. A USB device that is named by what it is
-    has the place that its name says, wherever it is plugged in. Any text has a place, also one that is no bus' name.
-    """
-    address, _, query = name.partition("?")
-    interface, channel = _split(address)
-    given = dict(parse_qsl(query, keep_blank_values=True))
-    usual = dict.fromkeys(sorted(given), "") if interface == "virtual" else _PLACING.get(interface, {})
-    options = tuple((key, given.get(key, value)) for key, value in usual.items())
-    return BusPlace(interface, os.path.realpath(channel) if channel.startswith("/") else channel, options)
-
-
-def _check_modbus(channel: str, options: Mapping[str, str]) -> None:
-    """Refuse what looks like a device over TCP, or like nothing."""
-    is_by_what_it_is = not channel and options.keys() & {"serial_number", "vid_pid"}
-    if is_by_what_it_is or ("/" in channel and not channel.startswith("tcp:")) or channel.startswith("tcp://"):
+def _check_modbus(name: BusName) -> None:
+    channel = name.channel
+    is_usb_device = not channel and name.options.keys() & {"serial_number", "vid_pid"}
+    if is_usb_device or ("/" in channel and not channel.startswith("tcp:")) or channel.startswith("tcp://"):
         return
     host = channel.removeprefix("tcp:").strip("/") or "HOST"
     raise ConfigurationError(
@@ -99,7 +103,7 @@ def _split(address: str) -> tuple[str, str]:
     interface, colon, channel = address.partition(":")
     if interface in NETWORKS and channel.startswith("//"):
         return interface, channel[2:]
-    if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
+    if "/" in interface or channel.startswith("//"):  # a path, or a URL of pyserial
         return "serial", address
     if colon:
         return interface, channel

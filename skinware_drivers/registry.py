@@ -1,11 +1,14 @@
-"""Names to things: a bus and a driver for what the command line says."""
+"""Find the bus and the driver that a command line names."""
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
-from skinware_drivers.bus import Bus
-from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.bus import CHOOSE, Bus, chosen_by
+from skinware_drivers.bus_names import BusName, parse_bus_name
 from skinware_drivers.loading import Kind, load, registered
 from skinware_drivers.options import nearest_name
 
@@ -16,6 +19,67 @@ DEFAULT_DRIVER = "roboskin"
 _DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
+class NamedBus:
+    """A bus that is named and not made yet.
+
+    Args:
+        text: ``[interface:]channel[?key=value&...]``.
+        driver: the driver whose devices the bus ``virtual`` emulates, if ``text`` names none; registered, or a file.
+
+    Attributes:
+        text: as given.
+        name: the same in its parts.
+
+    Raises:
+        ConfigurationError: the name has a mistake, or there is no such interface.
+    """
+
+    def __init__(self, text: str, driver: str = DEFAULT_DRIVER) -> None:
+        self.text = text
+        self.name: BusName = parse_bus_name(text)
+        interface, channel, _ = self.name
+        self._channel = channel or driver if interface == "virtual" else channel
+        self._transport = _transport(text, self.name)
+
+    @property
+    def bus_class(self) -> type[Bus]:
+        """The class of the bus. Where the channel determines it, that is looked at: an emulator, a recording.
+
+        Raises:
+            ConfigurationError: there is no such channel.
+        """
+        choose = getattr(self._transport, CHOOSE, None)
+        found: type[Bus] = choose(self._channel, self.name.options) if choose else self._transport
+        return found
+
+    def choose(self, driver: type[AnyAdapter]) -> type[AnyAdapter]:
+        """Return the class of a driver that fits the bus: some devices can be attached to several kinds of bus.
+
+        Raises:
+            ConfigurationError: as ``bus_class``.
+        """
+        if not driver.elsewhere:
+            return driver
+        return next((one for one in (driver, *driver.elsewhere) if self.bus_class.fits(one.medium)), driver)
+
+    def make(self, *, payload_size: int = 8, listen_only: bool = False, for_devices: bool = False) -> Bus:
+        """Return the bus, not opened yet.
+
+        Args:
+            payload_size: longest payload that the layout knows.
+            listen_only: refuse to send.
+            for_devices: the end to which emulated devices are attached, where that is another.
+
+        Raises:
+            ConfigurationError: an option is unknown or has a bad value.
+        """
+        make = self._transport
+        if for_devices:
+            make = getattr(make, "device_end", None) or make
+        bus: Bus = make(self._channel, self.name.options, payload_size=payload_size, listen_only=listen_only)
+        return bus
+
+
 def make_bus(
     name: str,
     *,
@@ -24,42 +88,17 @@ def make_bus(
     driver: str = DEFAULT_DRIVER,
     for_devices: bool = False,
 ) -> Bus:
-    """The bus of a name, not opened yet.
-
-    Args:
-        name: ``[interface:]channel[?key=value&...]``.
-        payload_size: longest payload that the layout knows.
-        listen_only: refuse to send.
-        driver: whose devices the bus ``virtual`` emulates, if its name does not say; registered, or a file.
-        for_devices: the end at which emulated devices are, where that is another.
+    """Return the bus of a name, not opened yet; the arguments are those of :class:`NamedBus` and its ``make``.
 
     Raises:
-        ConfigurationError: no such interface, or a bad option.
+        ConfigurationError: the name has a mistake, there is no such interface, or an option is wrong.
     """
-    interface, channel, options = parse_bus_name(name)
-    if interface == "virtual":
-        channel = channel or driver
-    transports = registered(TRANSPORTS)
-    if interface in transports:
-        bus_class = transports[interface].load()
-        if for_devices:
-            bus_class = getattr(bus_class, "device_end", None) or bus_class
-        bus: Bus = bus_class(channel, options, payload_size=payload_size, listen_only=listen_only)
-        return bus
-    import can
-
-    python_can = interface.removeprefix("can+")
-    if python_can not in can.VALID_INTERFACES:
-        known = sorted({*transports, *can.VALID_INTERFACES})
-        host = f"; of a device behind a network, tcp://{name}" if channel.partition("?")[0].isdecimal() else ""
-        raise ConfigurationError(f"bus {name!r}: no interface {interface!r}{nearest_name(interface, known)}{host}")
-    from skinware_drivers.can.pythoncan import PythonCanBus
-
-    return PythonCanBus(python_can, channel, options, payload_size=payload_size, listen_only=listen_only)
+    bus = NamedBus(name, driver)
+    return bus.make(payload_size=payload_size, listen_only=listen_only, for_devices=for_devices)
 
 
 def load_driver(name: str) -> type[AnyAdapter]:
-    """The driver class of a name; see :func:`skinware_drivers.loading.load`.
+    """Return the driver class of a name; see :func:`skinware_drivers.loading.load`.
 
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
@@ -67,18 +106,21 @@ def load_driver(name: str) -> type[AnyAdapter]:
     return load(_DRIVER, name)
 
 
-def class_for(driver: type[AnyAdapter], bus_name: str, driver_name: str) -> type[AnyAdapter]:
-    """The class of a driver for a bus: of devices that are attached to several kinds of bus, that for this kind.
+def _transport(text: str, name: BusName) -> Any:
+    """Return what makes the bus: its class, or a function that is marked with ``chosen_by``."""
+    transports = registered(TRANSPORTS)
+    if name.interface in transports:
+        return transports[name.interface].load()
+    import can
 
-    Args:
-        driver: as :func:`load_driver` gives it.
-        bus_name: of the bus, as for :func:`make_bus`.
-        driver_name: of the driver.
+    python_can = name.interface.removeprefix("can+")
+    if python_can not in can.VALID_INTERFACES:
+        known = sorted({*transports, *can.VALID_INTERFACES})
+        host = name.channel.partition("?")[0].isdecimal()
+        network = f"; of a device behind a network, tcp://{text}" if host else ""
+        raise ConfigurationError(
+            f"bus {text!r}: no interface {name.interface!r}{nearest_name(name.interface, known)}{network}"
+        )
+    from skinware_drivers.can.pythoncan import PythonCanBus
 
-    Raises:
-        ConfigurationError: no such bus.
-    """
-    if not driver.elsewhere:
-        return driver
-    bus = make_bus(bus_name, driver=driver_name)
-    return next((one for one in (driver, *driver.elsewhere) if bus.fits(one.medium)), driver)
+    return chosen_by(lambda *_: PythonCanBus)(partial(PythonCanBus, python_can))

@@ -32,7 +32,7 @@ from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import make_bus
-from skinware_drivers.running.guard import failure
+from skinware_drivers.running.guard import hook
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.sdk.driving import Chatter
 
@@ -77,7 +77,9 @@ def StructureError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def DriverError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    raise failure("probe", "bus can0", KeyError("board"), only="can0")
+    with hook("probe", "can0"):
+        exec(compile(f"{37 * chr(10)}raise KeyError('board')", "my_skin.py", "exec"))
+    return None
 
 
 @produces

@@ -1,4 +1,4 @@
-"""Measure the clock of a peer by questions and answers."""
+"""Measure the clock of a peer: each answer bounds the difference of the clocks from below and above."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -18,23 +19,29 @@ from skinware.realtime import NS_PER_S, now_ns
 _KEPT_NS = 30 * NS_PER_S
 _AT_ONCE_NS = 20_000_000
 _HORIZON_NS = 3 * NS_PER_S // 2
-"""Until the next answers, what is told must hold."""
+"""An estimate must hold until the answers to the next questions come."""
 _MOST_DRIFT = 500e-6
-"""Of two clocks, the worst that is corrected without a jump."""
+"""The largest drift between two clocks that is corrected without a jump."""
 _WANDER = 0.2e-6
-"""By how much a drift may change within the time that is looked at."""
+"""Largest change of a drift within ``_KEPT_NS``."""
 _FAST_ROUNDS, _FAST_NS, _SLOW_NS = 16, NS_PER_S // 8, NS_PER_S // 2
+QUESTIONS = 16
+"""Questions of a round, one after the other."""
+_PING = struct.Struct("<16sq")
+_PONG = struct.Struct("<qqq")
+_LATEST_NS = 1 << 61
+"""More than any clock shows."""
 
 _Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """What questions told at one moment.
+    """Bounds of our clock minus the other one, from a question and its answer.
 
     Attributes:
         at_ns: the moment, by our clock.
-        low_ns, high_ns: our clock minus the other is not less, and not more.
+        low_ns, high_ns: the bounds.
         round_trip_ns: without the time that the other end took.
     """
 
@@ -45,12 +52,15 @@ class Exchange:
 
     @staticmethod
     def of(asked_ns: int, heard_ns: int, answered_ns: int, returned_ns: int) -> Exchange:
-        """Of our times ``asked_ns`` and ``returned_ns`` and the other end's, ``heard_ns`` and ``answered_ns``."""
+        """Return the bounds; we asked at ``asked_ns`` and got the answer at ``returned_ns``.
+
+        The other two are times of the other clock.
+        """
         low_ns, high_ns = asked_ns - heard_ns, returned_ns - answered_ns
         return Exchange((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
 
-    def with_(self, other: Exchange) -> Exchange:
-        """What both told, at the moment of this one; only the other where the clock jumped between them."""
+    def narrowed(self, other: Exchange) -> Exchange:
+        """Return the bounds that both give at the moment of this one; only ``other`` if a clock jumped in between."""
         drift_ns = round(_MOST_DRIFT * abs(other.at_ns - self.at_ns))
         low_ns, high_ns = max(self.low_ns, other.low_ns - drift_ns), min(self.high_ns, other.high_ns + drift_ns)
         if low_ns > high_ns:
@@ -59,10 +69,10 @@ class Exchange:
 
 
 class PeerClock:
-    """Moves times of another machine to ours.
+    """Estimates the difference between our clock and that of another machine.
 
     Attributes:
-        error_ns: what ``offset_ns`` may be wrong by, until the next questions are answered.
+        error_ns: the largest error of ``offset_ns`` until the next questions are answered.
     """
 
     def __init__(self) -> None:
@@ -78,21 +88,21 @@ class PeerClock:
 
     @property
     def round_trip_ns(self) -> int:
-        """The shortest that is known of, 0 if none is."""
+        """The shortest of the last half minute; 0: none is known."""
         return min((sample.round_trip_ns for sample in self._samples), default=0)
 
     def pause_ns(self) -> int:
-        """How long to wait before the next questions."""
+        """Return how long to wait before the next questions."""
         return _FAST_NS if self._rounds < _FAST_ROUNDS else _SLOW_NS
 
     def offset_ns(self, at_ns: int) -> int:
-        """Our clock minus the other, at one of our moments."""
+        """Return our clock minus the other at a time of ours."""
         return round(self._offset_ns + self._slope * (at_ns - self._at_ns))
 
     def add(self, sample: Exchange) -> None:
         samples = self._samples
         if samples and abs(sample.at_ns - samples[-1].at_ns) < _AT_ONCE_NS:
-            samples[-1] = samples[-1].with_(sample)
+            samples[-1] = samples[-1].narrowed(sample)
         else:
             self._rounds += 1
             samples.append(sample)
@@ -102,7 +112,7 @@ class PeerClock:
             samples.popleft()
 
     def _fit(self) -> bool:
-        """Find what all lines through the bounds have in common; False if there are none."""
+        """Estimate from all lines that fit between the bounds; return False if there is none."""
         newest = self._samples[-1]
         at = np.array([sample.at_ns - newest.at_ns for sample in self._samples], np.float64)
         slack = _WANDER * -at
@@ -114,18 +124,12 @@ class PeerClock:
         now, then = (most + least) / 2
         self._at_ns = newest.at_ns
         self._offset_ns, self._slope = newest.low_ns + float(now), float(then - now) / _HORIZON_NS
-        self.error_ns = int(np.ceil((most - least).max() / 2)) + 1  # it is rounded, too
+        self.error_ns = int(np.ceil((most - least).max() / 2)) + 1  # the offset is rounded, too
         return True
 
 
 def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
-    """(2,) where the highest line between bounds is at time 0, and at the horizon.
-
-    Args:
-        at: (n,) times, growing, none above 0.
-        low: (n,) bounds at these times.
-        high: likewise.
-    """
+    """Return (2,) the highest value, at time 0 and the horizon, of a line between bounds at (n,) ascending times."""
     later = at[None, :] - at[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         steep = np.where(later > 0, (high[None, :] - low[:, None]) / later, _MOST_DRIFT)
@@ -135,56 +139,53 @@ def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
     return highest
 
 
-QUESTIONS = 16
-_PING = struct.Struct("<16sq")
-_PONG = struct.Struct("<qqq")
-_LATEST_NS = 1 << 61
-"""No clock has counted so far."""
-
-
 class Pinger:
-    """Asks for the time.
+    """Asks the bridge of a robot for the time of its clock.
 
-    Args:
-        link: to the other machine.
-        who: asks, 16 letters.
-        told: gets the sample of all of them, in the thread that receives the last answer; where some are not answered,
-            when the next ones are asked.
-        guard: counts answers that cannot be.
+    ``on_sample`` gets the bounds of a round: in the receiving thread with the last answer, or, if some answers do not
+    come, when the next round begins.
+
+    Attributes:
+        asked_ns: when the last round began.
     """
 
-    def __init__(self, link: Link, who: str, told: Callable[[Exchange], None], guard: Guard) -> None:
-        self._link, self._who, self._told, self._guard = link, who, told, guard
+    def __init__(self, link: Link, who: str, on_sample: Callable[[Exchange], None], guard: Guard) -> None:
+        self._link, self.who, self._on_sample, self._guard = link, who, on_sample, guard
         self._ping = ""
-        self._silence: Callable[[], None] = lambda: None
-        self._asked_ns = self._left = self._since_ns = 0
-        self._known: Exchange | None = None
+        self._end_listening: Callable[[], None] = lambda: None
+        self._question_ns = self._left = self._since_ns = 0
+        self._bounds: Exchange | None = None
+        self.asked_ns: int = 0
 
     def follow(self, keys: Keys) -> None:
-        self._silence()
+        """Ask the bridge that has these keys from now on."""
+        self._end_listening()
         self._ping, self._since_ns = keys.ping, now_ns()
-        self._silence = self._link.listen(keys.pong(self._who), self._guard.of_messages("a clock", self._answered))
+        self._end_listening = self._link.listen(
+            keys.pong(self.who), partial(self._guard.run, "a clock", self._answered)
+        )
 
     def close(self) -> None:
         self._ping = ""
-        self._silence()
+        self._end_listening()
 
     def ask(self) -> None:
-        """Begin to ask, if it is known whom; what was asked before is over."""
+        """Begin a round, if a bridge is followed; the round before is over."""
+        self.asked_ns = now_ns()
         if self._ping:
-            self._tell()
+            self._report()
             self._left = QUESTIONS
-            self._ask()
+            self._ask_once()
 
-    def _tell(self) -> None:
-        known, self._known = self._known, None
-        if known is not None:
-            self._told(known)
-
-    def _ask(self) -> None:
+    def _ask_once(self) -> None:
         self._left -= 1
-        self._asked_ns = asked_ns = now_ns()
-        self._link.tell(self._ping, _PING.pack(self._who.encode(), asked_ns), Priority.CLOCK)
+        self._question_ns = now_ns()
+        self._link.put(self._ping, _PING.pack(self.who.encode(), self._question_ns), Priority.CLOCK)
+
+    def _report(self) -> None:
+        bounds, self._bounds = self._bounds, None
+        if bounds is not None:
+            self._on_sample(bounds)
 
     def _answered(self, _key: str, message: bytes) -> None:
         returned_ns = now_ns()
@@ -192,21 +193,25 @@ class Pinger:
             return
         asked_ns, heard_ns, answered_ns = _PONG.unpack(message)
         if not self._since_ns <= asked_ns <= returned_ns:
-            return  # of another bridge, whose clock may be another
+            return  # from another bridge, which may have another clock
         took_ns = answered_ns - heard_ns
         if not 0 <= heard_ns < _LATEST_NS or not 0 <= took_ns <= returned_ns - asked_ns:
             raise BridgeError(f"a clock that shows {heard_ns} ns, and {took_ns} ns later, cannot be")
-        is_newest, is_last = asked_ns == self._asked_ns, self._left == 0
+        is_newest, is_last = asked_ns == self._question_ns, self._left == 0
         if is_newest and not is_last:
-            self._ask()  # before all else, while threads are awake
+            self._ask_once()  # first, while threads are awake
         sample = Exchange.of(asked_ns, heard_ns, answered_ns, returned_ns)
-        self._known = sample if self._known is None else self._known.with_(sample)
+        self._bounds = sample if self._bounds is None else self._bounds.narrowed(sample)
         if is_newest and is_last:
-            self._tell()
+            self._report()
 
 
-def answering(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Callable[[], None]:
-    """Answer who asks for the time of a clock; what ends it."""
+def answer_pings(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Callable[[], None]:
+    """Answer questions for the time of a clock.
+
+    Returns:
+        A function that ends it.
+    """
 
     def asked(_key: str, message: bytes) -> None:
         heard_ns = clock()
@@ -214,7 +219,6 @@ def answering(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Call
             return
         who, asked_ns = _PING.unpack(message)
         if who.isalnum():
-            pong = keys.pong(who.decode("ascii"))
-            link.tell(pong, _PONG.pack(asked_ns, heard_ns, clock()), Priority.CLOCK)
+            link.put(keys.pong(who.decode("ascii")), _PONG.pack(asked_ns, heard_ns, clock()), Priority.CLOCK)
 
     return link.listen(keys.ping, asked)

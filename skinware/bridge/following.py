@@ -1,4 +1,4 @@
-"""One service of a robot, followed: its generations, and its frames, pushed or pulled."""
+"""Follow one service of a robot: ask for its generations and frames, and publish them here."""
 
 from __future__ import annotations
 
@@ -9,19 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.bridge.link import Priority
-from skinware.bridge.messages import (
-    MOST_FRAMES,
-    RAW,
-    Service,
-    coded_part,
-    form_of,
-    generation_of,
-    slot_of,
-    split_generation,
-)
+from skinware.bridge.messages import MOST_FRAMES, RAW, FrameMessage, Service, split_frame, split_generation
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.pacing import Pacing
 from skinware.bridge.peer import ANSWER_S, Peer
+from skinware.bridge_state import ServiceState
 from skinware.errors import BadRecording, BridgeError, SkinwareError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
@@ -29,23 +21,21 @@ from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
 from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
-Slot = npt.NDArray[np.uint8]
 _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
-"""A large structure takes its time on a slow link: each time that none comes, it gets twice as long."""
+"""Patience for a generation; it doubles after each question without an answer, since a slow link needs long."""
 _AGAIN_NS = NS_PER_S // 4
-"""Until a service that could not be published is tried again."""
+"""Pause after a frame that could not be published."""
 _LATEST_NS = 1 << 61
-"""No clock has counted so far."""
-_STATES = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
+"""More than any clock shows."""
+_EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
 @dataclass
 class Traffic:
-    """What came of a service since it was looked at last.
+    """The frames of a service that came.
 
     Attributes:
-        frames: that were published here.
-        lost: of the robot's, that were not, since the first one; ``lost_before``: when it was looked at last.
+        lost: frames of the robot that were not published here, since the first one; all others: since the last report.
         bytes: of messages.
         ages_ns: from the publication there to the one here.
     """
@@ -56,107 +46,177 @@ class Traffic:
     bytes: int = 0
     ages_ns: list[int] = field(default_factory=list)
 
+    def report(self, state: str, mode: str) -> ServiceState:
+        """Return the state of the service, with the rates since the last report."""
+        ages_ns = sorted(self.ages_ns)
+        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
+        new = self.lost - self.lost_before
+        report = ServiceState(state, mode, self.frames, self.lost, self.bytes, median, oldest, new)
+        self.frames, self.bytes, self.lost_before = 0, 0, self.lost
+        self.ages_ns.clear()
+        return report
 
-class Follower:
-    """Publishes a service of a robot. All of it is called with the lock of the mirror held.
 
-    Args:
-        name: of the service.
-        told: how it is there.
-        peer: the robot.
-        mirror: publishes it.
-        mode: ``push`` or ``pull``; None: it finds out.
-        part: number of the wish for some of its sensors; empty: all of it.
+@dataclass
+class Pulls:
+    """Questions for frames that wait for an answer.
 
     Attributes:
-        state: of the service there.
-        traffic: what came.
-        is_over: nothing that comes is taken any more.
+        open: by number, the time until which an answer may come.
+        probe_until_ns: the same for a probe of the link.
+    """
+
+    count: int = 0
+    open: dict[int, int] = field(default_factory=dict)
+    probe_until_ns: int = 0
+
+    def begin(self, timeout_s: float) -> int:
+        """Return the number of a new question."""
+        self.count += 1
+        self.open[self.count] = now_ns() + round(timeout_s * NS_PER_S)
+        return self.count
+
+    def end(self, number: int, is_answered: bool) -> bool:
+        """Close a question; return whether it was open.
+
+        Answers come in order: an answer also closes earlier questions, which the link has dropped.
+        """
+        is_open = self.open.pop(number, None) is not None
+        if is_answered:
+            self.open = {later: until_ns for later, until_ns in self.open.items() if later > number}
+        return is_open
+
+
+class Output:
+    """Publishes the frames of a service in order.
+
+    Attributes:
+        count: the robot's number of the newest frame, over generations; None: none so far.
+        newest: position of that frame.
+        is_dead: nothing was published since the robot was lost.
+    """
+
+    def __init__(self, name: str, peer: Peer, mirror: Mirror) -> None:
+        self._name, self._peer, self._mirror = name, peer, mirror
+        self.traffic = Traffic()
+        self.count: int | None = None
+        self.newest = (0, 0)
+        self.is_dead = False
+        self._again_ns = 0
+
+    def publish(self, frame: RecordedSample, generation: Generation) -> int | None:
+        """Publish a frame, unless it is not newer.
+
+        Returns:
+            The time since its publication on the robot, ns; None: it was not published.
+
+        Raises:
+            BadRecording: its times are impossible.
+        """
+        if frame.position <= self.newest or now_ns() < self._again_ns:
+            return None
+        published_ns = frame.published_ns + self._peer.clock.offset_ns(now_ns())
+        age_ns = now_ns() - published_ns
+        if published_ns < 0 or frame.published_ns - frame.acquired_ns > published_ns:
+            raise BadRecording("it is from before this machine was started")
+        try:
+            self._mirror.publish(self._name, frame, generation)
+        except SkinwareError as error:
+            self._again_ns = now_ns() + _AGAIN_NS
+            self._peer.report_once(self._name, f"service {self._name!r} cannot appear here: {error}")
+            return None
+        count = generation.published_before + frame.sequence
+        if self.count is not None:
+            self.traffic.lost += max(0, count - self.count - 1)
+        self.count, self.newest, self.is_dead = count, frame.position, False
+        self.traffic.frames += 1
+        self.traffic.ages_ns.append(age_ns)
+        return age_ns
+
+
+class Follower:
+    """Follows a service of a robot. Callers hold the lock of the mirror.
+
+    Args:
+        mode: ``push`` or ``pull``; None: it follows the link.
+        part: number of the wish for some of its sensors; empty: all.
+
+    Attributes:
+        service: its newest state there.
+        is_over: the service has ended.
     """
 
     def __init__(
-        self, name: str, told: Service, peer: Peer, mirror: Mirror, *, mode: str | None = None, part: str = ""
+        self, name: str, service: Service, peer: Peer, mirror: Mirror, *, mode: str | None = None, part: str = ""
     ) -> None:
-        self._name, self._peer, self._mirror, self._mode, self._part = name, peer, mirror, mode, part
-        self._pacing = Pacing(0, mode)
-        self.state: str = told.state
-        self.traffic = Traffic()
+        self._name, self._peer, self._mirror, self._part = name, peer, mirror, part
+        self.service = service
+        self.output = Output(name, peer, mirror)
         self.is_over = False
-        self._generation: Generation | None = None  # of which frames can be read
+        self._pacing = Pacing(0, mode)
+        self._pulls = Pulls()
+        self._generation: Generation | None = None
         self._decoder: Decoder | None = None
-        self._held = b""  # the newest frame, where its generation or the robot's clock is not known yet
-        self._asked = (0, 0)  # number of the generation that was asked for, and until when its answer may come
+        self._held = b""  # the newest frame, while its generation or the robot's clock is not known
+        self._asked = (0, 0)  # the generation that was asked for, and until when its answer may come
         self._patience_s = _FIRST_GENERATION_S
-        self._count: int | None = None  # the robot's number of the frame published last, over generations
-        self._newest = (0, 0)  # position of that frame
-        self._last_word = (0, 0)  # of the frame after which it became as it is there
-        self._again_ns = 0  # when it may be tried to publish again
-        self._is_gone = False  # from here, since the robot was not heard
-        self._silence: Callable[[], None] | None = None  # ends the subscription to frames
-        self._pulls = 0  # how often the newest frame was asked for
-        self._open: dict[int, int] = {}  # until when an answer to a question for it may come, by its number
-        self._probe_until_ns = 0  # likewise, to one for a frame as it would be pushed
+        self._end_listening: Callable[[], None] = lambda: None
 
-    @property
-    def mode(self) -> str:
-        return self._pacing.mode
+    def report(self) -> ServiceState:
+        """Return how the service comes, since the last call."""
+        state = self.service.state if self._peer.is_connected else "unheard"
+        return self.output.traffic.report(state, self._pacing.mode)
 
-    @property
-    def _of_part(self) -> dict[str, object]:
-        return {"part": self._part} if self._part else {}
-
-    @property
-    def _of_frame(self) -> str:
-        return f"a frame of service {self._name!r}"
-
-    @property
-    def _frame_key(self) -> str:
-        return self._peer.keys.frame(self._name, self._part)
-
-    def take(self, told: Service) -> None:
-        before, self.state = self.state, told.state
-        self._last_word = told.generation, told.sequence
-        if told.generation and (self._generation is None or self._generation.generation != told.generation):
-            self._ask_generation(told.generation)
-        if told.state != before or told.state in ("closed", "dead"):
-            self._mirror.happened(self._name, _STATES[told.state])
-        if told.state == "closed":
+    def take(self, service: Service) -> None:
+        """Take a new state of the service."""
+        before, self.service = self.service, service
+        if service.generation and (self._generation is None or self._generation.generation != service.generation):
+            self._ask_generation(service.generation)
+        if service.state != before.state or service.state in ("closed", "dead"):
+            self._mirror.happened(self._name, _EVENTS[service.state])
+        if service.state == "closed":
             self.is_over = True
-            self._unsubscribe()
-            self._peer.room.give_back(self._name)
+            self._end_listening()
+            self._mirror.budget.release(self._name)
 
     def look(self, time_ns: int) -> None:
-        if not self._peer.is_connected or self._generation is None or not self._peer.clock.is_known:
+        """Ask for what is due."""
+        clock = self._peer.clock
+        if not self._peer.is_connected or self._generation is None or not clock.is_known:
             return
-        self._open = {pull: until_ns for pull, until_ns in self._open.items() if time_ns <= until_ns}
+        pulls = self._pulls
+        pulls.open = {number: until_ns for number, until_ns in pulls.open.items() if time_ns <= until_ns}
         if self._pacing.pulls:
             self._pull_all()
-        elif self._is_gone and not self._open:
+        elif self.output.is_dead and not pulls.open:
             self._pull()
-        round_trip_ns = self._peer.clock.round_trip_ns
-        if (
-            self._pacing.wants_probe(time_ns, round_trip_ns)
-            and time_ns > self._probe_until_ns
-            and self._count is not None
-        ):
+        may_probe = time_ns > pulls.probe_until_ns and self.output.count is not None
+        if may_probe and self._pacing.wants_probe(time_ns, clock.round_trip_ns):
             self._probe()
 
     def start_over(self) -> None:
-        self._generation, self._newest, self._count = None, (0, 0), None
+        """The robot has other generations than before."""
+        self._generation = None
+        self.output.newest, self.output.count = (0, 0), None
 
-    def lost(self) -> None:
-        """The robot is not heard any more; whatever was asked is asked again when it is."""
+    def lose(self) -> None:
+        """The robot is not heard any more; all questions are asked again when it is."""
         self._mirror.happened(self._name, DEAD)
-        self._is_gone, self._newest = True, (0, 0)
+        self.output.is_dead, self.output.newest = True, (0, 0)
         self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
-        self._open.clear()
-        self._probe_until_ns = 0
+        self._pulls.open.clear()
+        self._pulls.probe_until_ns = 0
 
-    def clock_told(self) -> None:
+    def take_held(self) -> None:
+        """Publish the frame that waited for its generation or the robot's clock."""
         if self._held and self._generation is not None:
-            self._take_held()
+            held, self._held = self._held, b""
+            self._take_frame(held)
 
     # -- generations ----------------------------------------------------------------------------------------------
+
+    def _parameters(self, **parameters: object) -> dict[str, object]:
+        return {**parameters, "part": self._part} if self._part else parameters
 
     def _ask_generation(self, number: int) -> None:
         time_ns = now_ns()
@@ -168,7 +228,7 @@ class Follower:
             lambda payload, _: self._take_generation(asked, payload),
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
-            parameters={"number": number} | self._of_part,
+            parameters=self._parameters(number=number),
             is_large=True,
         )
 
@@ -185,215 +245,169 @@ class Follower:
         try:
             about, head = split_generation(payload)
             generation = Generation(head, self._name)
-            _check(generation)
-            ring = generation.slot_count * generation.slot_stride
-            self._peer.room.take(self._name, len(head) + ring)
+            _check_generation(generation)
+            self._mirror.budget.reserve(self._name, len(head) + generation.ring_size)
         except (BridgeError, BadRecording) as error:
-            self._refuse(f"service {self._name!r}", error)
+            self._peer.guard.refuse(f"service {self._name!r}", str(error))
             return
         before = self._generation
         if before is not None and generation.generation < before.generation:
             return
         self._generation, self._decoder = generation, None
         if before is None or before.period_ns != generation.period_ns:
-            self._pacing = Pacing(generation.period_ns, self._mode, generation.slot_stride)
+            self._pacing = Pacing(generation.period_ns, self._pacing.fixed, generation.slot_stride)
             self.subscribe()
         self._mirror.operations[self._name] = about.operations
         if self._held:
-            self._take_held()
+            self.take_held()
         elif not self._pacing.pulls:
-            self._pull()  # the newest one that there is, should no other come for long
+            self._pull()  # the newest frame, in case no other comes for long
 
-    # -- how frames come ------------------------------------------------------------------------------------------
+    # -- questions for frames -------------------------------------------------------------------------------------
 
     def subscribe(self) -> None:
-        self._unsubscribe()
-        self._open.clear()
+        """Listen to frames if they are pushed; frames that were asked for before do not count."""
+        self._end_listening()
+        self._pulls.open.clear()
         if self._generation is not None and not self._pacing.pulls:
-            self._silence = self._peer.listen(self._frame_key, self._frame_came)
+            self._end_listening = self._peer.listen(self._peer.keys.frame(self._name, self._part), self._pushed)
 
-    def _unsubscribe(self) -> None:
-        if self._silence is not None:
-            self._silence()
-            self._silence = None
-
-    def _frame_came(self, key: str, message: bytes) -> None:
-        """In the thread that receives: a frame waits for no other thread."""
+    def _pushed(self, key: str, message: bytes) -> None:
+        """In the receiving thread, so that a frame waits for no other one."""
         with self._mirror.lock:
-            if key == self._frame_key:  # and not of a bridge that is not followed any more
+            if key == self._peer.keys.frame(self._name, self._part):  # not from a bridge that was followed before
                 self._take_frame(message)
 
     def _pull_all(self, here: RecordedSample | None = None) -> None:
-        while len(self._open) < self._pacing.open:
+        while len(self._pulls.open) < self._pacing.open:
             self._pull(here)
 
     def _pull(self, here: RecordedSample | None = None) -> None:
-        """Ask for a frame that is newer than all that are here; ``here`` is one that is not published yet."""
-        self._pulls += 1
-        pull, others = self._pulls, len(self._open)
+        """Ask for a frame that is newer than all that came; ``here`` is one that is not published yet."""
+        others = len(self._pulls.open)
         timeout_s = 2 * (ANSWER_S + self._peer.clock.round_trip_ns / NS_PER_S)
-        self._open[pull] = now_ns() + round(timeout_s * NS_PER_S)
-        number, sequence = self._newest if here is None else max(self._newest, here.position)
+        pull = self._pulls.begin(timeout_s)
+        number, sequence = self.output.newest if here is None else max(self.output.newest, here.position)
         self._peer.ask(
             self._peer.keys.of(self._name, "newest"),
-            lambda payload, _: self._take_pulled(pull, payload),
+            lambda payload, _: self._pulled(pull, payload),
             timeout_s=timeout_s,
             priority=Priority.PULLED,
-            parameters={
-                "who": self._peer.who,
-                "generation": number,
-                "sequence": sequence,
-                "base": 0 if self._decoder is None else self._decoder.sequence,
-                "others": others,
-                **self._of_part,
-            },
+            parameters=self._parameters(
+                who=self._peer.who,
+                generation=number,
+                sequence=sequence,
+                base=0 if self._decoder is None else self._decoder.sequence,
+                others=others,
+            ),
         )
 
-    def _take_pulled(self, pull: int, message: bytes | None) -> None:
+    def _pulled(self, pull: int, message: bytes | None) -> None:
         if self.is_over:
             return
-        frame = self._frame_of(message) if message else None
-        is_open = self._open.pop(pull, None) is not None  # a late answer begins no second round
-        if message is not None:  # answers come in order: those to earlier questions were left out on the link
-            self._open = {later: until_ns for later, until_ns in self._open.items() if later > pull}
+        frame = self._read(message) if message else None
+        is_open = self._pulls.end(pull, message is not None)  # a late answer begins no second round
         if is_open and self._pacing.pulls and message is not None and self._peer.is_connected:
             self._pull_all(frame)  # the next ones are on their way while this one is published
         if frame is not None:
             self._publish(frame)
 
     def _probe(self) -> None:
-        """Ask for a frame as it would be pushed, and look how long it is on its way."""
         asked_ns = now_ns()
-        self._probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
+        self._pulls.probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
         self._peer.ask(
             self._peer.keys.of(self._name, "newest"),
-            lambda payload, returned_ns: self._take_probe(returned_ns - asked_ns, payload),
+            lambda payload, returned_ns: self._probed(returned_ns - asked_ns, payload),
             timeout_s=2 * ANSWER_S,
             priority=Priority.PULLED,
-            parameters={"form": RAW} | self._of_part,
+            parameters=self._parameters(form=RAW),
         )
 
-    def _take_probe(self, took_ns: int, message: bytes | None) -> None:
+    def _probed(self, took_ns: int, message: bytes | None) -> None:
         if self.is_over:
             return
-        self._probe_until_ns = 0
+        self._pulls.probe_until_ns = 0
         if message is not None:
             self._peer.heard()
         if self._pacing.probed(now_ns(), took_ns - self._peer.clock.round_trip_ns):
-            self._changed_mode()
+            self._change_mode()
 
-    def _changed_mode(self) -> None:
-        self._peer.tell({"event": "mode", "service": self._name, "mode": self._pacing.mode})
+    def _change_mode(self) -> None:
+        self._peer.on_event({"event": "mode", "service": self._name, "mode": self._pacing.mode})
         self.subscribe()
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def _take_held(self) -> None:
-        held, self._held = self._held, b""
-        self._take_frame(held)
-
     def _take_frame(self, message: bytes) -> None:
-        frame = self._frame_of(message)
+        frame = self._read(message)
         if frame is not None:
             self._publish(frame)
 
-    def _frame_of(self, message: bytes) -> RecordedSample | None:
-        """The frame of a message; None if it cannot be read, or not yet."""
+    def _refuse_frame(self, error: SkinwareError) -> None:
+        self._peer.guard.refuse(f"a frame of service {self._name!r}", str(error))
+
+    def _read(self, message: bytes) -> RecordedSample | None:
+        """Return the frame of a message; None if it cannot be read, or not yet."""
         if self.is_over:
             return None
         self._peer.heard()
-        self.traffic.bytes += len(message)
+        self.output.traffic.bytes += len(message)
         try:
-            form, number = form_of(message), generation_of(message)
-        except BridgeError as error:
-            self._refuse(self._of_frame, error)
-            return None
-        generation = self._generation
-        if generation is None or generation.generation != number:
-            if generation is None or number > generation.generation:
+            parts = split_frame(message)
+            generation = self._generation
+            if generation is None or generation.generation != parts.generation:
+                if generation is None or parts.generation > generation.generation:
+                    self._held = message
+                    self._ask_generation(parts.generation)
+                return None
+            if not self._peer.clock.is_known:
                 self._held = message
-                self._ask_generation(number)
+                return None
+            frame = frame_of(generation, self._slot(parts, generation))
+            count = generation.published_before + frame.sequence
+            if not (0 < frame.sequence <= count <= MOST_FRAMES):
+                raise BadRecording(f"it has number {count}")
+            if max(frame.acquired_ns, frame.published_ns) > _LATEST_NS:
+                raise BadRecording("its times are of no clock")
+        except (BridgeError, BadRecording) as error:
+            self._refuse_frame(error)
             return None
-        if not self._peer.clock.is_known:
-            self._held = message
-            return None
-        try:
-            return _checked(frame_of(generation, self._slot(form, message, generation)), generation)
-        except BadRecording as error:
-            self._refuse(self._of_frame, error)
-            return None
+        return frame
 
-    def _slot(self, form: int, message: bytes, generation: Generation) -> Slot:
-        if form == RAW:
-            slot = slot_of(message)
-            if len(slot) != generation.slot_stride:
-                raise BadRecording(f"a frame of {len(slot)} bytes, not {generation.slot_stride}")
-            return slot
+    def _slot(self, parts: FrameMessage, generation: Generation) -> npt.NDArray[np.uint8]:
+        if parts.form == RAW:
+            if len(parts.content) != generation.slot_stride:
+                raise BadRecording(f"a frame of {len(parts.content)} bytes, not {generation.slot_stride}")
+            return np.frombuffer(parts.content, np.uint8)
         if self._decoder is None:
             self._decoder = Decoder(generation.coded, generation.slot_stride)
-        coded, keeps = coded_part(message)
-        return self._decoder.decode(coded, keeps=keeps)
+        return self._decoder.decode(parts.content, keeps=parts.keeps)
 
     def _publish(self, frame: RecordedSample) -> None:
-        generation = self._generation
-        if generation is None or frame.position <= self._newest or now_ns() < self._again_ns:
-            return
-        count = generation.published_before + frame.sequence
-        published_ns = frame.published_ns + self._peer.clock.offset_ns(now_ns())
-        age_ns = now_ns() - published_ns
-        if published_ns < 0 or frame.published_ns - frame.acquired_ns > published_ns:
-            self._refuse(self._of_frame, BadRecording("it is from before this machine was started"))
+        if self._generation is None:
             return
         try:
-            self._mirror.publish(self._name, frame, generation)
-        except SkinwareError as error:
-            self._again_ns = now_ns() + _AGAIN_NS
-            self._trouble(error, " cannot appear here")
+            age_ns = self.output.publish(frame, self._generation)
+        except BadRecording as error:
+            self._refuse_frame(error)
             return
-        if self._count is not None:
-            self.traffic.lost += max(0, count - self._count - 1)
-        self._count, self._newest, self._is_gone = count, frame.position, False
-        if self.state != "live" and frame.position <= self._last_word:  # it came late, and is of before
-            self._mirror.happened(self._name, _STATES[self.state])
-        self.traffic.frames += 1
-        self.traffic.ages_ns.append(age_ns)
-        if self._pacing.saw(now_ns(), age_ns, self._peer.clock.round_trip_ns):
-            self._changed_mode()
-
-    def _trouble(self, error: SkinwareError, what: str = "") -> None:
-        self._peer.say_once(self._name, f"service {self._name!r}{what}: {error}")
-
-    def _refuse(self, kind: str, error: SkinwareError) -> None:
-        self._peer.guard.refuse(kind, str(error))
+        if age_ns is None:
+            return
+        service = self.service
+        if service.state != "live" and frame.position <= (service.generation, service.sequence):
+            self._mirror.happened(self._name, _EVENTS[service.state])  # the frame is older than the state
+        if self._pacing.arrived(now_ns(), age_ns, self._peer.clock.round_trip_ns):
+            self._change_mode()
 
 
-def _check(generation: Generation) -> None:
-    """Look whether there can be such a generation.
-
-    Raises:
-        BadRecording: there cannot.
-    """
+def _check_generation(generation: Generation) -> None:
+    """Raise BadRecording if there can be no such generation, or if it is too large."""
     if generation.published_before > MOST_FRAMES or generation.period_ns < 0:
         raise BadRecording(
             f"a generation after {generation.published_before} frames with a period of {generation.period_ns} ns"
         )
-    ring = generation.slot_count * generation.slot_stride
-    if generation.slot_stride > LIMITS.slot_size or ring > LIMITS.ring_size:
+    if generation.slot_stride > LIMITS.slot_size or generation.ring_size > LIMITS.ring_size:
         raise BadRecording(
             f"{generation.slot_count} slots of {generation.slot_stride} bytes; at most {LIMITS.slot_size} each, and"
             f" {LIMITS.ring_size} together"
         )
-
-
-def _checked(frame: RecordedSample, generation: Generation) -> RecordedSample:
-    """The frame, if it can be one.
-
-    Raises:
-        BadRecording: its number or its times are of no frame.
-    """
-    count = generation.published_before + frame.sequence
-    if not (0 < frame.sequence <= count <= MOST_FRAMES):
-        raise BadRecording(f"it has number {count}")
-    if max(frame.acquired_ns, frame.published_ns) > _LATEST_NS:
-        raise BadRecording("its times are of no clock")
-    return frame

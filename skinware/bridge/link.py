@@ -1,4 +1,4 @@
-"""Carry bytes under keys, questions and answers over zenoh; count what is malformed and never end for it."""
+"""Carry bytes under keys, and questions with their answers, over zenoh; count messages that cannot be read."""
 
 from __future__ import annotations
 
@@ -8,64 +8,44 @@ import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
 from skinware.bridge.endpoints import Endpoints
 from skinware.errors import BridgeError, SkinwareError
-from skinware.limits import LIMITS
 
 LEASE_MS = 2000
-"""A peer that says nothing for so long is gone."""
+"""A peer that is silent for this long is gone."""
 _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _FOREVER_MS = -1
 _BATCHES = 4
-"""Of 64 KiB, that may wait to be sent: a frame of 30,848 sensors takes three, and who puts it waits for none."""
+"""Batches of 64 KiB that may wait to be sent: a frame of 30,848 sensors takes three, and its writer does not wait."""
+_PATIENCE_US = 1000
+"""How long a frame may wait for a slow receiver before that receiver misses it."""
 _LONGEST_MESSAGE = 1 << 26
-"""Bytes that are put together of the parts of a message of somebody else."""
+"""Bytes to which the fragments of a message may add up."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
-
-Payload = bytes
-
-
-class Question(Protocol):
-    """What somebody asks; exactly one of the answers is given, from any thread."""
-
-    @property
-    def key(self) -> str:
-        """Under which it was asked."""
-
-    @property
-    def parameters(self) -> Mapping[str, str]:
-        """Of it."""
-
-    @property
-    def payload(self) -> Payload:
-        """What came with it."""
-
-    def reply(self, payload: Payload) -> None:
-        """The answer."""
-
-    def fail(self, error: Payload) -> None:
-        """It cannot be answered."""
 
 
 @dataclass(frozen=True)
-class Reply:
-    """What came back of a question.
+class Question:
+    """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
 
     Attributes:
-        payload: the answer; None if there is none.
-        error: what the other end says went wrong.
+        reply: sends the answer.
+        fail: sends the reason why there is no answer.
     """
 
-    payload: Payload | None
-    error: Payload | None = None
+    key: str
+    parameters: Mapping[str, str]
+    payload: bytes
+    reply: Callable[[bytes], None]
+    fail: Callable[[bytes], None]
 
 
 class Priority:
-    """What goes before what on a link that is full."""
+    """Order of messages on a link that is full, the most urgent first."""
 
     CLOCK = zenoh.Priority.REAL_TIME
     CALLS = zenoh.Priority.INTERACTIVE_HIGH
@@ -73,58 +53,53 @@ class Priority:
     PULLED = zenoh.Priority.DATA_LOW
 
 
-class _Question:
-    def __init__(self, query: zenoh.Query) -> None:
-        self._query = query
-        self.key = str(query.key_expr)
-        self.payload = query.payload.to_bytes() if query.payload is not None else b""
-
-    @property
-    def parameters(self) -> Mapping[str, str]:
-        text = str(self._query.parameters)
-        return dict(part.partition("=")[::2] for part in text.split(";")) if text else {}
-
-    def reply(self, payload: Payload) -> None:
-        with contextlib.suppress(zenoh.ZError), self._query:
-            self._query.reply(self.key, payload)
-
-    def fail(self, error: Payload) -> None:
-        with contextlib.suppress(zenoh.ZError), self._query:
-            self._query.reply_err(error)
-
-
 def open_session(endpoints: Endpoints) -> zenoh.Session:
-    """A session that shares nothing but what it is told to; it connects again for ever.
+    """Open a session that shares only what it declares, and that always connects again.
 
     Raises:
         BridgeError: it cannot be opened; the message says why.
     """
+    settings: dict[str, object] = {
+        "mode": json.dumps(endpoints.mode),
+        "connect/endpoints": json.dumps(endpoints.connect),
+        "connect/timeout_ms": json.dumps(_FOREVER_MS),
+        "connect/exit_on_failure": "false",
+        "connect/retry": json.dumps(_RETRY_MS),
+        "listen/endpoints": json.dumps(endpoints.listen),
+        "listen/exit_on_failure": "true",
+        "scouting/multicast/enabled": "false",
+        "scouting/gossip/enabled": "false",
+        "transport/shared_memory/enabled": "false",
+        "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
+        "transport/link/tx/lease": str(LEASE_MS),
+        "transport/link/tx/queue/size/data": str(_BATCHES),
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(_PATIENCE_US),
+        "adminspace/enabled": "false",
+        **endpoints.security,
+    }
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, str(value))
     try:
-        return zenoh.open(_configuration(endpoints))
+        return zenoh.open(config)
     except zenoh.ZError as error:
-        raise BridgeError(f"{endpoints}: {_reason(error)}") from None
+        of_system = _OS_ERROR.search(str(error))  # without the place in zenoh's sources
+        reason = of_system[1] if of_system else str(error).partition(" at ")[0].partition(" - ")[0]
+        raise BridgeError(f"{endpoints}: {reason}") from None
 
 
 def directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
-    """A callback in the thread that receives: every hand-over to another thread takes 0.1 ms."""
+    """Return a callback that runs in the receiving thread: handing over to another thread takes 0.1 ms."""
     return zenoh.handlers.Callback(call, over, indirect=False)
 
 
 class Sender:
-    """Sends bytes to all who listen, and waits for nobody: a receiver that is too slow loses some.
-
-    Args:
-        publisher: of zenoh.
-        close: ends it.
-
-    Attributes:
-        close: ends it.
-    """
+    """Sends bytes to all listeners without waiting; a receiver that is too slow misses some."""
 
     def __init__(self, publisher: zenoh.Publisher, close: Callable[[], None]) -> None:
         self._publisher, self.close = publisher, close
 
-    def __call__(self, payload: Payload) -> None:
+    def __call__(self, payload: bytes) -> None:
         with contextlib.suppress(zenoh.ZError):  # closed
             self._publisher.put(payload)
 
@@ -140,9 +115,6 @@ class Sender:
 class Link:
     """A session of zenoh.
 
-    Args:
-        endpoints: where it listens and connects.
-
     Raises:
         BridgeError: it cannot be opened; the message says what to do.
     """
@@ -152,60 +124,81 @@ class Link:
         self._declared: list[Any] = []
 
     def sender(self, key: str) -> Sender:
-        """What sends bytes to all who listen to a key."""
+        """Declare that frames are sent under a key, and return the sender."""
         publisher = self._session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
             priority=Priority.FRAMES,
             express=True,
         )
-        return Sender(publisher, self._undeclaring(publisher))
+        return Sender(publisher, self._end_of(publisher))
 
-    def tell(self, key: str, payload: Payload, priority: zenoh.Priority = Priority.CALLS) -> None:
-        """Send something small, before any frames."""
+    def put(self, key: str, payload: bytes, priority: zenoh.Priority = Priority.CALLS) -> None:
+        """Send a small message before any frames."""
         with contextlib.suppress(zenoh.ZError):
             self._session.put(key, payload, priority=priority, express=True)
 
-    def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
-        """Have (key, bytes) of what is sent under keys, in the thread that receives; what ends it."""
+    def listen(self, key: str, heard: Callable[[str, bytes], object]) -> Callable[[], None]:
+        """Call ``heard(key, bytes)`` with messages under keys, in the receiving thread.
+
+        Returns:
+            A function that ends it.
+        """
 
         def hear(sample: zenoh.Sample) -> None:
             heard(str(sample.key_expr), sample.payload.to_bytes())
 
-        return self._undeclaring(self._session.declare_subscriber(key, directly(hear)))
+        return self._end_of(self._session.declare_subscriber(key, directly(hear)))
 
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
-        """Have the questions under keys; what ends it."""
-        return self._undeclaring(self._session.declare_queryable(key, directly(lambda query: asked(_Question(query)))))
+        """Call ``asked`` with questions under keys, in the receiving thread.
+
+        Returns:
+            A function that ends it.
+        """
+
+        def ask(query: zenoh.Query) -> None:
+            def reply(payload: bytes) -> None:
+                with contextlib.suppress(zenoh.ZError), query:
+                    query.reply(key, payload)
+
+            def fail(error: bytes) -> None:
+                with contextlib.suppress(zenoh.ZError), query:
+                    query.reply_err(error)
+
+            key, text = str(query.key_expr), str(query.parameters)
+            parameters = dict(part.partition("=")[::2] for part in text.split(";")) if text else {}
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            asked(Question(key, parameters, payload, reply, fail))
+
+        return self._end_of(self._session.declare_queryable(key, directly(ask)))
 
     def ask(
         self,
         key: str,
-        answered: Callable[[Reply], None],
+        answered: Callable[[bytes | None], None],
         *,
         timeout_s: float,
         priority: zenoh.Priority,
         parameters: Mapping[str, object] | None = None,
-        payload: Payload = b"",
+        payload: bytes = b"",
         is_large: bool = False,
     ) -> None:
-        """Ask whoever answers under a key; ``answered`` is called for each answer, and once with none if none came.
+        """Ask under a key; ``answered`` is called with each answer, or once with None if there is none.
 
-        What does not fit on a slow link soon is left out, unless the answer is known to be large.
+        A slow link drops an answer that does not fit soon, unless ``is_large`` is set.
         """
         text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
-        got: list[bool] = []
+        is_answered = False
 
         def hear(reply: zenoh.Reply) -> None:
-            got.append(True)
-            if reply.ok is not None:
-                answered(Reply(reply.ok.payload.to_bytes()))
-            elif reply.err is not None:
-                answered(Reply(None, reply.err.payload.to_bytes()))
+            nonlocal is_answered
+            is_answered = True
+            answered(None if reply.ok is None else reply.ok.payload.to_bytes())
 
         def over() -> None:
-            if not got:
-                answered(Reply(None))
+            if not is_answered:
+                answered(None)
 
         try:
             self._session.get(
@@ -219,14 +212,14 @@ class Link:
                 payload=payload or None,
             )
         except zenoh.ZError:
-            answered(Reply(None))
+            answered(None)
 
-    def be_there(self, key: str) -> None:
-        """Others see a key for as long as this is open."""
+    def declare_token(self, key: str) -> None:
+        """Show a key to all who watch it, for as long as the link is open."""
         self._declared.append(self._session.liveliness().declare_token(key))
 
-    def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
-        """Have (key, whether somebody is there) of all who are, come and go."""
+    def watch_tokens(self, key: str, changed: Callable[[str, bool], object]) -> None:
+        """Call ``changed(key, is_there)`` for all tokens under keys, and when they come and go."""
         self._declared.append(
             self._session.liveliness().declare_subscriber(
                 key, lambda sample: changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT), history=True
@@ -238,60 +231,28 @@ class Link:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def _undeclaring(self, declared: Any) -> Callable[[], None]:
+    def _end_of(self, declared: Any) -> Callable[[], None]:
         self._declared.append(declared)
 
-        def undeclare() -> None:
+        def end() -> None:
             if declared in self._declared:
                 self._declared.remove(declared)
                 with contextlib.suppress(zenoh.ZError):
                     declared.undeclare()
 
-        return undeclare
+        return end
 
 
-def _configuration(endpoints: Endpoints) -> zenoh.Config:
-    config: dict[str, object] = {
-        "mode": json.dumps(endpoints.mode),
-        "connect/endpoints": json.dumps(endpoints.connect),
-        "connect/timeout_ms": json.dumps(_FOREVER_MS),
-        "connect/exit_on_failure": "false",
-        "connect/retry": json.dumps(_RETRY_MS),
-        "listen/endpoints": json.dumps(endpoints.listen),
-        "listen/exit_on_failure": "true",
-        "scouting/multicast/enabled": "false",
-        "scouting/gossip/enabled": "false",
-        "transport/shared_memory/enabled": "false",
-        "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
-        "transport/link/tx/lease": str(LEASE_MS),
-        "transport/link/tx/queue/size/data": str(_BATCHES),
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),
-        "adminspace/enabled": "false",
-    }
-    made = zenoh.Config()
-    for path, value in {**config, **endpoints.security}.items():
-        made.insert_json5(path, str(value))
-    return made
-
-
-def _reason(error: Exception) -> str:
-    """What zenoh says: the system's own words if it has them, and not where in its sources."""
-    of_system = _OS_ERROR.search(str(error))
-    return of_system[1] if of_system else str(error).partition(" at ")[0].partition(" - ")[0]
-
-
-_LONGEST = 160
+_LONGEST_REASON = 160
 _MOST_KINDS = 256
 
 
 class Guard:
-    """Counts messages that cannot be taken.
+    """Counts messages that cannot be read or used.
 
-    Args:
-        report: gets (kind of message, why) of the first of each kind, in the thread that found it.
+    ``report`` gets (kind of message, reason) for the first message of each kind, in the thread that found it.
 
     Attributes:
-        count: messages that could not be taken so far.
         last: kind and reason of the last one; empty: none so far.
     """
 
@@ -305,7 +266,7 @@ class Guard:
     def refuse(self, kind: str, why: str) -> None:
         with self._lock:
             self.count += 1
-            self.last = f"{kind}: {why}"[:_LONGEST]
+            self.last = f"{kind}: {why}"[:_LONGEST_REASON]
             is_new = kind not in self._reported and len(self._reported) < _MOST_KINDS
             if is_new:
                 self._reported.add(kind)
@@ -313,64 +274,17 @@ class Guard:
             self._report(kind, why)
 
     def run(self, kind: str, work: Callable[..., object], *arguments: object) -> bool:
-        """Do what a message asks for; one that cannot be taken is counted.
+        """Do what a message asks for, and count the message if that fails.
 
         Returns:
             Whether it was done.
         """
         try:
             work(*arguments)
-        except Exception as error:  # noqa: BLE001, whatever others send ends nothing here
-            self.refuse(kind, _text(error))
+        except SkinwareError as error:
+            self.refuse(kind, str(error))
+            return False
+        except Exception as error:  # noqa: BLE001, no message of a peer may end this program
+            self.refuse(kind, f"{type(error).__name__}: {error}")
             return False
         return True
-
-    def of_messages(self, kind: str, heard: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        def guarded(key: str, payload: bytes) -> None:
-            self.run(kind, heard, key, payload)
-
-        return guarded
-
-    def of_questions(self, kind: str, asked: Callable[[Question], None]) -> Callable[[Question], None]:
-        """What answers questions, guarded: one that cannot be taken is answered with that."""
-
-        def guarded(question: Question) -> None:
-            if not self.run(kind, asked, question):
-                question.fail(b"the question cannot be understood")
-
-        return guarded
-
-
-class Room:
-    """Memory for what a robot has, shared by its services.
-
-    Args:
-        most: bytes for all of them.
-    """
-
-    def __init__(self, most: int = LIMITS.robot_size) -> None:
-        self._most = most
-        self._taken: dict[str, int] = {}
-
-    def take(self, name: str, size: int) -> None:
-        """Have ``size`` bytes for a service, in the place of what it had.
-
-        Raises:
-            BridgeError: that is more than the robot may have; nothing has changed.
-        """
-        others = sum(taken for one, taken in self._taken.items() if one != name)
-        if others + size > self._most:
-            raise BridgeError(
-                f"it needs {size / 1e6:.1f} MB of memory, beside {others / 1e6:.1f} MB of other services; a robot may"
-                f" have {self._most / 1e6:.0f} MB"
-            )
-        self._taken[name] = size
-
-    def give_back(self, name: str) -> None:
-        self._taken.pop(name, None)
-
-
-def _text(error: Exception) -> str:
-    if isinstance(error, SkinwareError):
-        return str(error)
-    return f"{type(error).__name__}: {error}"

@@ -1,34 +1,33 @@
-"""What goes over a bridge, byte by byte, and under which keys.
+"""The messages of a bridge, byte by byte, and their keys.
 
-Keys of robot R: ``skinware/1/R/INSTANCE/``..., INSTANCE being the number of the bridge that serves it: two that serve
-robots of one name are never taken for each other.
+Keys of robot R begin with ``skinware/1/R/INSTANCE/``. INSTANCE is the number of the bridge that serves R, so that two
+bridges of one name are never mixed up.
 
 ======================  ===============================================================================================
-``ping``                who asks (16 letters), i64 when, by his clock; answered with ``pong/WHO``: that time, and when
-                        it came and was answered, i64 CLOCK_MONOTONIC ns each
-``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes.
-                        Asked with :class:`Wish` as JSON: answered for those sensors, and asked again once a second
+``ping``                who asks (16 letters), i64 time of its clock; answered under ``pong/WHO`` with that time, and
+                        the times at which it came and was answered, i64 CLOCK_MONOTONIC ns each
+``services``            question; answer: :class:`Services` as JSON. Also sent without a question after each change. A
+                        question may carry :class:`Wish` as JSON, to get only those sensors; it is repeated each second
                         for as long as they are wanted
 ``summary``             :class:`Summary` as JSON, once a second
 ``S/generation``        question with ``number``; answer: u4 size of JSON, :class:`About` as JSON, the service's file in
                         shared memory up to its slots, packed (zlib)
-``S/frame``             every frame: ``RAW`` below
-``S/frame/PART``        likewise, some sensors of it: those of the wish of that number
-``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``:
-                        sequence of the newest frame that the asker keeps, else 0, ``others``: questions of this kind
-                        that are open. Each is answered with a frame of its own, the newest as soon as there is one that
-                        was not sent for an open question, with nothing after half a second: ``CODED`` below, ``RAW``
-                        with ``form=0``
-``S/call/OPERATION``    question with arguments as JSON; answer: :class:`Answered` as JSON
+``S/frame``             every frame of service S: ``RAW`` below
+``S/frame/PART``        every frame of S, cut to the sensors of the wish of that number
+``S/newest``            question for a newer frame, with ``generation`` and ``sequence`` of the last one, ``who`` asks,
+                        ``base``: sequence of the newest frame that the asker keeps, else 0, ``others``: number of such
+                        questions that are open. Each is answered with another frame, as soon as there is one, and with
+                        nothing after half a second: ``CODED`` below, or ``RAW`` with ``form=0``
+``S/call/OPERATION``    question with arguments as JSON; answer: :class:`CallResult` as JSON
 ======================  ===============================================================================================
 
 Questions for ``generation`` and ``newest`` may have ``part``: the number of a wish.
 
-``skinware/live/R/1/INSTANCE`` is a token of who serves the robot.
+``skinware/live/R/1/INSTANCE`` is a token of the bridge that serves the robot.
 
-A frame begins with a byte for its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
-``CODED``: a message of :mod:`skinware.transfer.codec`; the second byte is 1 where the receiver keeps the frame, since
-later ones may be the difference to it. It keeps the last two of those.
+A frame begins with one byte for its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
+``CODED``: a message of :mod:`skinware.transfer.codec`; the second byte is 1 if the receiver keeps the frame, since
+later ones may be differences to it. The receiver keeps the last two of those.
 """
 
 from __future__ import annotations
@@ -37,13 +36,9 @@ import hashlib
 import re
 import socket
 import struct
-import threading
-import zlib
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.limits import LIMITS, read_json, unpack
@@ -54,11 +49,11 @@ from skinware.tactile.regions import Region, Regions
 VERSION = 1
 RAW, CODED = 0, 1
 
-_HEAD = struct.Struct("<B7xQ")
+_RAW_HEAD = struct.Struct("<B7xQ")
 _CODED_HEAD = struct.Struct("<BB6x")
 _SIZE = struct.Struct("<I")
 MOST_FRAMES = 1 << 53
-"""More frames than any robot ever published: a number above it is wrong."""
+"""More frames than any robot publishes: a larger number is wrong."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
 _INSTANCE = re.compile(r"[0-9a-f]{16}")
 
@@ -73,12 +68,12 @@ _Kind = TypeVar("_Kind")
 
 
 class Service(msgspec.Struct, frozen=True):
-    """How a service is.
+    """State of a service.
 
     Attributes:
         generation: its number; 0: not known yet.
         state: ``live``, ``paused``, ``closed`` or ``dead``.
-        sequence: of its newest frame when it became so: those up to it may be on their way still.
+        sequence: of the newest frame when the state began: frames up to it may still be on their way.
     """
 
     generation: _Count = 0
@@ -91,11 +86,10 @@ class Services(msgspec.Struct, frozen=True):
 
     Attributes:
         instance: number of the bridge that serves them.
-        start: which start of the machine times count from, and which namespace is served; another one has another clock
-            and other generations.
-        callers: who may call, by the names in their certificates; empty: whoever is let in.
+        start: boot of the machine, and namespace; another one has another clock and other generations.
+        callers: names of the certificates that may call; empty: all.
         services: by name.
-        missing: what of a wish is not there, a line for people; empty if nothing is missing.
+        missing: parts of a wish that do not exist, in one line; empty: none.
         host: name of the machine, for people.
     """
 
@@ -108,12 +102,12 @@ class Services(msgspec.Struct, frozen=True):
 
 
 class Wish(msgspec.Struct, frozen=True):
-    """Some sensors that are wanted: those of which all of it is true.
+    """The sensors that a peer wants: those that meet all conditions.
 
     Attributes:
         patches: names; empty: all.
         in_regions: names of regions; empty: all.
-        regions: what they are, and those that they refer to.
+        regions: definitions of these regions, and of those that they refer to.
     """
 
     patches: tuple[str, ...] = ()
@@ -122,11 +116,11 @@ class Wish(msgspec.Struct, frozen=True):
 
     @property
     def number(self) -> str:
-        """The same for the same wish."""
+        """Equal for equal wishes."""
         return hashlib.blake2b(msgspec.json.encode(self), digest_size=8).hexdigest()
 
     def choice(self) -> SensorChoice:
-        """The wish as others know it.
+        """Return the wish in the form that the rest of Skinware uses.
 
         Raises:
             ConfigurationError: the regions contradict each other.
@@ -135,18 +129,18 @@ class Wish(msgspec.Struct, frozen=True):
 
 
 class DriverSummary(msgspec.Struct, frozen=True):
-    """How a driver is.
+    """Summary of a driver.
 
     Attributes:
         state: ``live``, ``paused``, ``closed`` or ``dead``.
         rate_hz: frames in the last second.
-        age_ms: of the newest data in its newest frame, on the robot; None before the first.
+        age_ms: age of the newest data in its newest frame, on the robot; None before the first.
         lost: frames lost on its buses since it started.
-        sensors, fresh: how many it has, and of how many the value is good and new.
-        patches: how many it has.
-        silent: names of patches that do not send, the first of them.
-        n_silent: how many those are.
-        problems: what is not in order: the driver, or each of its buses and patches.
+        sensors, fresh: number of sensors, and of those whose value is good and new.
+        patches: number of patches.
+        silent: names of the first patches that do not send.
+        n_silent: number of patches that do not send.
+        problems: 1 if the driver is not live, else the number of its buses and patches that are not.
     """
 
     state: State
@@ -162,13 +156,13 @@ class DriverSummary(msgspec.Struct, frozen=True):
 
 
 class Summary(msgspec.Struct, frozen=True):
-    """How a robot is.
+    """Summary of a robot.
 
     Attributes:
         namespace: that is served.
         drivers: by name.
-        services: how many others there are.
-        lost: frames that the bridge could not take from their rings.
+        services: number of services that are no drivers.
+        lost: frames that the bridge missed in their rings.
         host: name of the machine, for people.
     """
 
@@ -180,7 +174,7 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 class About(msgspec.Struct, frozen=True):
-    """What a generation's file does not tell.
+    """Facts about a generation that its file does not have.
 
     Attributes:
         operations: of the service: descriptions by name.
@@ -189,13 +183,13 @@ class About(msgspec.Struct, frozen=True):
     operations: Annotated[dict[_Word, _Line], msgspec.Meta(max_length=256)] = {}
 
 
-class Answered(msgspec.Struct, frozen=True):
-    """How a call ended.
+class CallResult(msgspec.Struct, frozen=True):
+    """Result of a call.
 
     Attributes:
-        generation, sequence: a frame that was published after it was carried out, by the robot's count; 0: none.
-        result: what the operation returned.
-        error: what went wrong; None if nothing did.
+        generation, sequence: a frame that was published after the operation, by the robot's count; 0: none.
+        result: the value that the operation returned.
+        error: in words; None: the call succeeded.
         why: kind of error: ``refused``, ``failed``, ``paused``, ``cancelled``.
     """
 
@@ -207,10 +201,10 @@ class Answered(msgspec.Struct, frozen=True):
 
 
 def read_text(message: bytes, kind: type[_Kind]) -> _Kind:
-    """The content of a JSON message of somebody else.
+    """Return the content of a JSON message of a peer.
 
     Raises:
-        BridgeError: it is longer, deeper or otherwise than such a message can be; says what is wrong.
+        BridgeError: it is longer or deeper than allowed, or no such message; the error says which.
     """
     try:
         return read_json(message, kind)
@@ -223,14 +217,10 @@ ALL_SUMMARIES = f"skinware/{VERSION}/*/*/summary"
 
 
 class Keys:
-    """The keys of a robot.
-
-    Args:
-        robot: its name.
-        instance: number of the bridge that serves it; ``*``: of whichever does.
+    """The keys of a robot; ``instance``: number of the bridge that serves it, or ``*`` for any.
 
     Raises:
-        ConfigurationError: it is no name.
+        ConfigurationError: the robot's name is wrong.
     """
 
     def __init__(self, robot: str, instance: str = "*") -> None:
@@ -238,43 +228,24 @@ class Keys:
             raise ConfigurationError(
                 f"robot {robot!r}: give 1 to 47 letters, digits, '_' or '-', the first a letter or digit"
             )
-        self.robot, self._instance = robot, instance
-        self._root = f"skinware/{VERSION}/{robot}/{instance}"
-        self.ping, self.services = f"{self._root}/ping", f"{self._root}/services"
-        self.summary = f"{self._root}/summary"
+        self.robot, self.instance = robot, instance
+        self.root = f"skinware/{VERSION}/{robot}/{instance}"
+        self.ping, self.services, self.summary = (f"{self.root}/{key}" for key in ("ping", "services", "summary"))
+        self.token = f"skinware/live/{robot}/{VERSION}/{instance}"
 
     def pong(self, who: str) -> str:
-        return f"{self._root}/pong/{who}"
-
-    @property
-    def token(self) -> str:
-        return f"skinware/live/{self.robot}/{VERSION}/{self._instance}"
+        return f"{self.root}/pong/{who}"
 
     def of(self, service: str, what: str) -> str:
-        """Of something of a service; either may be ``*``."""
-        return f"{self._root}/{service}/{what}"
+        """Return a key of a service; either argument may be ``*``."""
+        return f"{self.root}/{service}/{what}"
 
     def frame(self, service: str, part: str = "") -> str:
         return self.of(service, f"frame/{part}" if part else "frame")
 
-    def call(self, service: str, operation: str) -> str:
-        """Of an operation; likewise."""
-        return f"{self._root}/{service}/call/{operation}"
-
-
-def parts_of(key: str) -> tuple[str, str]:
-    """(service, operation or what else) of a key of a service."""
-    parts = key.split("/")
-    return parts[4], parts[-1]
-
-
-def bridge_of(key: str) -> tuple[str, str]:
-    robot, instance = key.split("/")[2:4]
-    return robot, instance
-
 
 def token_parts(key: str) -> tuple[str, int, str]:
-    """(robot, version, instance) of a token; version 0: not to be understood.
+    """Return (robot, version, instance) of a token; version 0: not known here.
 
     Raises:
         BridgeError: it is no token.
@@ -289,7 +260,7 @@ def token_parts(key: str) -> tuple[str, int, str]:
 
 
 def number_in(text: str) -> int:
-    """A number from 0 to 2**64 - 1 that is written in digits; 0 if it is none."""
+    """Return a number from 0 to 2**64 - 1 that is written in digits; 0 for any other text."""
     return min(int(text), (1 << 64) - 1) if text.isascii() and text.isdecimal() and len(text) <= 20 else 0
 
 
@@ -298,68 +269,50 @@ def host_name() -> str:
 
 
 def raw_message(frame: Sample) -> bytes:
-    return b"".join((_HEAD.pack(RAW, frame.generation), frame.slot))
+    return b"".join((_RAW_HEAD.pack(RAW, frame.generation), frame.slot))
 
 
 def coded_message(coded: bytes, keeps: bool) -> bytes:
-    """A message of :mod:`skinware.transfer.codec`, for the link; ``keeps``: the receiver keeps the frame."""
+    """Return the message of a coded frame; ``keeps``: the receiver is to keep the frame."""
     return _CODED_HEAD.pack(CODED, keeps) + coded
 
 
-def form_of(message: bytes) -> int:
-    """Whether a frame is raw or coded.
-
-    Raises:
-        BridgeError: neither.
-    """
-    if len(message) < _HEAD.size or message[0] not in (RAW, CODED):
-        raise BridgeError("a frame of no known form")
-    return message[0]
-
-
-def generation_of(message: bytes) -> int:
-    """The generation of a frame; it stands at the same place in both forms."""
-    number: int = _HEAD.unpack_from(message)[1]
-    return number
-
-
-def slot_of(message: bytes) -> npt.NDArray[np.uint8]:
-    return np.frombuffer(message, np.uint8, offset=_HEAD.size)
-
-
-def coded_part(message: bytes) -> tuple[memoryview, bool]:
-    """What was coded, of a coded frame, and whether the receiver keeps the frame."""
-    return memoryview(message)[_CODED_HEAD.size :], bool(message[1])
-
-
-class Head:
-    """A service's file up to its slots, packed once for all who ask; for any thread.
-
-    Args:
-        raw: its bytes.
+class FrameMessage(NamedTuple):
+    """The parts of a frame's message.
 
     Attributes:
-        raw: the same bytes.
+        form: ``RAW`` or ``CODED``.
+        content: the slot, or the coded frame.
+        keeps: the receiver is to keep the frame.
     """
 
-    def __init__(self, raw: bytes) -> None:
-        self.raw = raw
-        self._lock, self._packed = threading.Lock(), b""
-
-    def packed(self) -> bytes:
-        """It, for the link; the first time takes milliseconds."""
-        with self._lock:
-            self._packed = self._packed or zlib.compress(self.raw)
-            return self._packed
+    form: int
+    generation: int
+    content: memoryview
+    keeps: bool
 
 
-def generation_message(about: About, head: Head) -> bytes:
+def split_frame(message: bytes) -> FrameMessage:
+    """Return the parts of a frame's message.
+
+    Raises:
+        BridgeError: its form is not known.
+    """
+    if len(message) < _RAW_HEAD.size or message[0] not in (RAW, CODED):
+        raise BridgeError("a frame of no known form")
+    form, generation = _RAW_HEAD.unpack_from(message)  # the generation has the same place in both forms
+    size = _RAW_HEAD.size if form == RAW else _CODED_HEAD.size
+    return FrameMessage(form, generation, memoryview(message)[size:], bool(message[1]))
+
+
+def generation_message(about: About, packed: bytes) -> bytes:
+    """Return the answer to a question for a generation; ``packed``: the service's file up to its slots, by zlib."""
     text = msgspec.json.encode(about)
-    return _SIZE.pack(len(text)) + text + head.packed()
+    return _SIZE.pack(len(text)) + text + packed
 
 
 def split_generation(message: bytes) -> tuple[About, bytes]:
-    """(what its file does not tell, its file up to the slots).
+    """Return the parts of a generation's message; the second is the service's file up to its slots.
 
     Raises:
         BridgeError: it is no such message.

@@ -1,14 +1,15 @@
-"""The services of another machine, published here; what is asked of them is passed on."""
+"""Publish the services of a robot here, and pass requests for them on."""
 
 from __future__ import annotations
 
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from skinware.bridge.messages import Answered
+from skinware.bridge.messages import CallResult
+from skinware.errors import BridgeError
+from skinware.limits import LIMITS
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
@@ -20,13 +21,33 @@ _LONGEST_NS = 5 * NS_PER_S
 """How long an answer waits for the frame that goes with it."""
 
 
-@dataclass(frozen=True)
-class _Waiting:
-    """An answer that goes with a frame that is still to come.
+class MemoryBudget:
+    """Memory for the services of a robot; ``most``: bytes for all of them."""
 
-    Attributes:
-        at: (generation, sequence) of it, by the robot's count.
-    """
+    def __init__(self, most: int = LIMITS.robot_size) -> None:
+        self._most = most
+        self._taken: dict[str, int] = {}
+
+    def reserve(self, name: str, size: int) -> None:
+        """Reserve ``size`` bytes for a service in place of its former ones.
+
+        Raises:
+            BridgeError: the robot would have too much; nothing has changed.
+        """
+        others = sum(taken for one, taken in self._taken.items() if one != name)
+        if others + size > self._most:
+            raise BridgeError(
+                f"it needs {size / 1e6:.1f} MB of memory, beside {others / 1e6:.1f} MB of other services; a robot may"
+                f" have {self._most / 1e6:.0f} MB"
+            )
+        self._taken[name] = size
+
+    def release(self, name: str) -> None:
+        self._taken.pop(name, None)
+
+
+class _Waiting(NamedTuple):
+    """An answer that waits for the frame that goes with it, at a position by the robot's count."""
 
     at: Position
     request: Request
@@ -35,31 +56,25 @@ class _Waiting:
 
 
 class Mirror(Republisher):
-    """Publishes frames of another machine, their times moved to the clock of this one.
+    """Publishes frames of a robot, with their times moved to the clock of this machine.
 
-    Args:
-        namespace: where to publish.
-        ask: passes a request for a service on; it is answered with ``answered``.
-        offset_ns: our clock minus the other, as of now.
-
-    What is called back by ``answer`` is called with ``lock`` held; so must be whoever calls anything else.
+    ``ask`` passes a request for a service on, and ``answered`` takes the answer. ``answer`` holds ``lock`` while it
+    calls back; callers of the other methods must hold it, too.
 
     Attributes:
-        lock: of all of it.
-        operations: what each service offers: descriptions by name.
+        operations: of each service: descriptions by name.
     """
 
     def __init__(self, namespace: Namespace, ask: Callable[[str, Request], None], offset_ns: Callable[[], int]) -> None:
         super().__init__(namespace, {}, keeps_counts=True)
         self.lock = threading.RLock()
+        self.operations: dict[str, Mapping[str, str]] = {}
+        self.budget = MemoryBudget()
         self._ask, self._offset_ns = ask, offset_ns
         self._answers: defaultdict[str, list[_Waiting]] = defaultdict(list)
         self._newest: dict[str, Position] = {}
-        self.operations: dict[str, Mapping[str, str]] = {}
 
     def watch(self, fd: int, call: Callable[[], object]) -> None:
-        """See :class:`skinware.transfer.republishing.Republisher`."""
-
         def locked() -> None:
             with self.lock:
                 call()
@@ -70,21 +85,20 @@ class Mirror(Republisher):
         return self._offset_ns()
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:
-        return {operation: _named(text) for operation, text in self.operations.get(name, {}).items()}
+        return {operation: _described(text) for operation, text in self.operations.get(name, {}).items()}
 
     def take_requests(self, name: str, service: Published) -> None:
-        """Likewise: they are passed on."""
         for request in service.writer.requests():
             self._ask(name, request)
 
     def publish(self, name: str, frame: RecordedSample, generation: Generation, *, follows: bool = True) -> None:
-        """Likewise. Answers that waited for this frame are given."""
         super().publish(name, frame, generation, follows=follows)
         self._newest[name] = frame.position
         if self._answers[name]:
             self._give(name, frame.position)
 
-    def answered(self, name: str, request: Request, answer: Answered, result: Any) -> None:
+    def answered(self, name: str, request: Request, answer: CallResult, result: Any) -> None:
+        """Answer a request that was passed on, together with the frame that goes with the answer."""
         if request.cancelled or name not in self._services:
             return
         if answer.error is not None:
@@ -97,7 +111,6 @@ class Mirror(Republisher):
             self._give(name, self._newest.get(name, (0, 0)))
 
     def tidy(self) -> None:
-        """See :class:`skinware.transfer.republishing.Republisher`."""
         super().tidy()
         for answers in self._answers.values():
             for late in [waiting for waiting in answers if now_ns() > waiting.until_ns]:
@@ -106,14 +119,13 @@ class Mirror(Republisher):
 
     def _give(self, name: str, position: Position) -> None:
         service = self._services[name]
-        here = [waiting for waiting in self._answers[name] if waiting.at <= position]
-        for waiting in here:
+        for waiting in [waiting for waiting in self._answers[name] if waiting.at <= position]:
             self._answers[name].remove(waiting)
             waiting.request.reply(waiting.result, service.writer.position)
 
 
-def _named(description: str) -> Callable[..., object]:
-    """An operation that has a description; it is passed on and never called here."""
+def _described(description: str) -> Callable[..., object]:
+    """Return an operation that has a description; it is passed on and never called here."""
 
     def passed_on(**_arguments: object) -> None:
         raise NotImplementedError

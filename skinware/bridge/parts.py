@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 import threading
+import zlib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import Index, as_index, texts
-from skinware.bridge.giving import Stream
-from skinware.bridge.messages import Head, Wish
-from skinware.errors import BridgeError, StructureError
+from skinware.bridge.messages import Wish
+from skinware.bridge.streaming import Stream
+from skinware.errors import BadRecording, BridgeError, StructureError
 from skinware.memory.file_layout import SLOT
 from skinware.memory.ring import Sample
 from skinware.memory.schema import Schema
@@ -23,17 +26,35 @@ from skinware.structure import Structure
 from skinware.tactile.choosing import SensorChoice
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
-_OF_SENSORS = ("values", "status")
-_OF_MODULES = ("module_time_ns", "module_untouched")
-_OF_GROUPS = ("group_time_ns",)
-_OF_PATCHES = ("patch_state", "patch_counters", "patch_interval_counts", "patch_age_counts")
-_OF_BUSES = (
-    "bus_state", "bus_reason", "bus_since_ns", "bus_load", "bus_samples", "bus_counters", "bus_data_path",
-)  # fmt: skip
+_KEPT_NS = 10 * NS_PER_S
+"""How long a part is kept after the last question for it."""
+_MOST_PARTS = 64
+
+
+@dataclass
+class Head:
+    """The file of a service up to its slots, packed and parsed at most once."""
+
+    name: str
+    raw: bytes
+
+    @cached_property
+    def packed(self) -> bytes:
+        """Its bytes for the link; the first time takes milliseconds."""
+        return zlib.compress(self.raw)
+
+    @cached_property
+    def driver(self) -> Generation | None:
+        """The generation, if it is one of a driver that can be read."""
+        try:
+            generation = Generation(self.raw, self.name)
+        except BadRecording:
+            return None
+        return generation if generation.is_driver else None
 
 
 class Cut:
-    """A part of a generation of a driver: some sensors, with their modules, patches and buses.
+    """Some sensors of a generation of a driver, with their modules, patches and buses.
 
     Args:
         whole: the generation.
@@ -41,31 +62,34 @@ class Cut:
 
     Attributes:
         generation: of the same number, with what stays.
-        head: its file up to its slots.
+        head: its file.
 
     Raises:
         StructureError: it is not a driver, or no sensor stays.
     """
 
     def __init__(self, whole: Generation, positions: npt.NDArray[np.int64]) -> None:
-        if not isinstance(whole.context, Structure):
+        structure = whole.structure
+        if structure is None:
             raise StructureError(f"service {whole.name!r} is not a driver: it has no sensors")
-        structure = whole.context
         modules = np.unique(structure.sensor_module[positions])
         groups = np.unique(structure.sensor_group[positions])
         patches = np.unique(structure.module_patch[modules])
         buses = np.unique(structure.patch_bus[patches])
-        rows_of = (
-            (_OF_SENSORS, structure.n_sensors, positions),
-            (_OF_MODULES, structure.n_modules, modules),
-            (_OF_GROUPS, structure.n_groups, groups),
-            (_OF_PATCHES, structure.n_patches, patches),
-            (_OF_BUSES, len(structure.buses), buses),
-        )
+        rows_of: dict[str, tuple[int, npt.NDArray[Any]]] = {
+            "values status": (structure.n_sensors, positions),
+            "module_time_ns module_untouched": (structure.n_modules, modules),
+            "group_time_ns": (structure.n_groups, groups),
+            "patch_state patch_counters patch_interval_counts patch_age_counts": (structure.n_patches, patches),
+            "bus_state bus_reason bus_since_ns bus_load bus_samples bus_counters bus_data_path": (
+                len(structure.buses),
+                buses,
+            ),
+        }
         columns = dict(whole.schema.columns)
-        self._stay: list[tuple[str, int, int, Index]] = []  # of a column: rows there were, rows that stay, and which
-        for names, count, rows in rows_of:
-            for name in names:
+        self._stay: list[tuple[str, int, int, Index]] = []  # of each column: name, rows, rows that stay, and which
+        for names, (count, rows) in rows_of.items():
+            for name in names.split():
                 size = math.prod(columns[name].shape) if name in columns else 0
                 if size:
                     columns[name] = replace(columns[name], shape=(size // count * len(rows),))
@@ -73,7 +97,7 @@ class Cut:
         others = columns.keys() - {name for name, *_ in self._stay}
         self._stay += [(name, 1, 1, slice(0, 1)) for name in others if math.prod(columns[name].shape)]
         cut = _structure(structure, positions, groups, modules, patches, buses)
-        self.head = Head(whole.head_with(cut, Schema(columns, whole.schema.description)))
+        self.head = Head(whole.name, whole.head_with(cut, Schema(columns, whole.schema.description)))
         self.generation: Generation = Generation(self.head.raw, whole.name)
 
     def frame(self, frame: Sample) -> RecordedDriverSnapshot:
@@ -93,12 +117,12 @@ def _structure(
     patches: npt.NDArray[np.uint32],
     buses: npt.NDArray[np.uint32],
 ) -> Structure:
-    """The structure of what stays; modules that had no name of their own keep the one that they were known by."""
+    """Return the structure of what stays; modules without a name of their own keep the one that readers showed."""
     own = texts(whole.module_name), texts(whole.module_kind), whole.module_patch.tolist()
     module_names = _names.names_in_patches(*own)
-    there = set(whole.sensor_type[sensors].tolist())
+    types = set(whole.sensor_type[sensors].tolist())
     return whole.replace(
-        types=[each for each in whole.types if each.id in there],
+        types=[each for each in whole.types if each.id in types],
         buses=[whole.buses[bus] for bus in buses.tolist()],
         patch_name=whole.patch_name[patches],
         patch_bus=np.searchsorted(buses, whole.patch_bus[patches]),
@@ -115,77 +139,57 @@ def _structure(
     )
 
 
-_KEPT_NS = 10 * NS_PER_S
-"""How long a part is kept that nobody asks for."""
-_MOST = 64
-
-
 class Part:
-    """Some sensors of the drivers of a robot.
-
-    Args:
-        choice: which.
-        stream_of: makes what gives the frames of this part of a service.
-    """
+    """Some sensors of the drivers of a robot; ``stream_of`` makes the stream of a service."""
 
     def __init__(self, choice: SensorChoice, stream_of: Callable[[str], Stream]) -> None:
         self.choice, self._stream_of = choice, stream_of
         self._lock = threading.Lock()
-        self._wholes: dict[str, Generation] = {}
-        self._cuts: dict[str, Cut] = {}
+        self._cuts: dict[str, tuple[Generation, Cut | None]] = {}  # by service, each with the whole generation
         self._streams: dict[str, Stream] = {}
 
     def fit(self, name: str, whole: Generation) -> bool:
-        """Go over to a generation of a driver; whether it has any of the sensors."""
+        """Follow a driver to a generation; return whether that has any of the sensors."""
         with self._lock:
-            if self._wholes.get(name) is not whole:
-                self._wholes[name] = whole
-                self._cuts.pop(name, None)
-                assert isinstance(whole.context, Structure)  # noqa: S101 - it is a driver
-                wanted = np.flatnonzero(self.choice.of(name, whole.context))
+            known, cut = self._cuts.get(name, (None, None))
+            if known is not whole:
+                cut = None
+                structure = whole.structure
+                nothing = np.zeros(0, np.int64)
+                wanted = nothing if structure is None else np.flatnonzero(self.choice.of(name, structure))
                 if len(wanted):
-                    self._begin(name, Cut(whole, wanted))
-            return name in self._cuts
+                    cut = Cut(whole, wanted)
+                    stream = self._streams.get(name) or self._stream_of(name)
+                    stream.begin(cut.generation.generation, cut.generation.coded, cut.frame)
+                    self._streams[name] = stream
+                self._cuts[name] = whole, cut
+            return cut is not None
 
     def take(self, name: str, frame: Sample) -> None:
-        """Give what is of this part of a driver's frame, if it is of the generation that is known."""
-        cut = self._cuts.get(name)
+        """Send the sensors of this part of a driver's frame, if the frame is of the known generation."""
+        _, cut = self._cuts.get(name, (None, None))
         if cut is not None and cut.generation.generation == frame.generation:
             self._streams[name].take(frame)
 
-    def cut(self, name: str) -> Cut | None:
-        """What there is of a driver."""
-        return self._cuts.get(name)
+    def find(self, name: str) -> tuple[Head, Stream] | None:
+        """Return the file and stream of this part of a driver."""
+        _, cut = self._cuts.get(name, (None, None))
+        return None if cut is None else (cut.head, self._streams[name])
 
-    def stream(self, name: str) -> Stream | None:
-        """What gives its frames."""
-        return self._streams[name] if name in self._cuts else None
-
-    def let_go(self) -> None:
-        """Of questions that no frame comes for."""
+    def expire(self) -> None:
+        """Answer questions that waited too long."""
         for stream in list(self._streams.values()):
-            stream.let_go()
+            stream.expire()
 
     def close(self) -> None:
-        """Nothing is given any more."""
         with self._lock:
             self._cuts.clear()
             for stream in self._streams.values():
                 stream.close()
 
-    def _begin(self, name: str, cut: Cut) -> None:
-        if name not in self._streams:
-            self._streams[name] = self._stream_of(name)
-        self._streams[name].begin(cut.generation.generation, cut.generation.coded, cut.frame)
-        self._cuts[name] = cut
-
 
 class Parts:
-    """All parts that are wanted now.
-
-    Args:
-        stream_of: makes what gives the frames of a part: (service, number of the wish).
-    """
+    """All parts that peers want now; ``stream_of`` makes the stream of (service, number of the wish)."""
 
     def __init__(self, stream_of: Callable[[str, str], Stream]) -> None:
         self._stream_of = stream_of
@@ -194,33 +198,35 @@ class Parts:
         self._asked_ns: dict[str, int] = {}
 
     def wanted(self, wish: Wish) -> Part:
-        """The part of a wish, which is asked for now.
+        """Return the part of a wish that came now.
 
         Raises:
-            BridgeError: there are too many others.
+            BridgeError: there are too many other parts.
             ConfigurationError: the wish contradicts itself.
         """
         number = wish.number
         with self._lock:
             part = self._parts.get(number)
             if part is None:
-                if len(self._parts) >= _MOST:
-                    raise BridgeError(f"{_MOST} other parts of it are wanted already")
+                if len(self._parts) >= _MOST_PARTS:
+                    raise BridgeError(f"{_MOST_PARTS} other parts of it are wanted already")
                 part = Part(wish.choice(), lambda service: self._stream_of(service, number))
                 self._parts[number] = part
             self._asked_ns[number] = now_ns()
             return part
 
-    def find(self, number: str) -> Part | None:
-        return self._parts.get(number)
+    def find(self, number: str, name: str) -> tuple[Head, Stream] | None:
+        """Return the file and stream of a driver's part."""
+        part = self._parts.get(number)
+        return None if part is None else part.find(name)
 
     def take(self, name: str, frame: Sample) -> None:
-        """Give what is of each part of a driver's frame."""
+        """Send the sensors of each part of a driver's frame."""
         for part in list(self._parts.values()):
             part.take(name, frame)
 
-    def let_go(self) -> None:
-        """Of parts that nobody wants any more, and of questions that no frame comes for."""
+    def expire(self) -> None:
+        """End parts for which no question came lately; answer questions that waited too long."""
         time_ns = now_ns()
         with self._lock:
             over = [number for number, asked_ns in self._asked_ns.items() if time_ns - asked_ns > _KEPT_NS]
@@ -228,4 +234,4 @@ class Parts:
                 del self._asked_ns[number]
                 self._parts.pop(number).close()
         for part in list(self._parts.values()):
-            part.let_go()
+            part.expire()

@@ -1,25 +1,24 @@
-"""A robot's end of a bridge: the services of a namespace, for whoever listens, and as fast as each can."""
+"""A robot's end of a bridge: it offers the services of a namespace to all peers, to each as fast as its link takes."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
 
 import msgspec
 
-from skinware.bridge.calling import Calls
-from skinware.bridge.clock import answering
-from skinware.bridge.giving import Stream, Summaries, Summarised
+from skinware.bridge.clock import answer_pings
 from skinware.bridge.link import Guard, Link, Question
 from skinware.bridge.messages import (
     About,
-    Head,
+    CallResult,
     Keys,
     Service,
     Services,
@@ -27,24 +26,38 @@ from skinware.bridge.messages import (
     Wish,
     generation_message,
     host_name,
-    parts_of,
     read_text,
 )
-from skinware.bridge.parts import Parts
-from skinware.errors import BadRecording, BridgeError, ConfigurationError
+from skinware.bridge.parts import Head, Parts
+from skinware.bridge.streaming import Stream
+from skinware.bridge.watching import Summaries
+from skinware.errors import (
+    BridgeError,
+    ConfigurationError,
+    Paused,
+    RequestCancelled,
+    RequestError,
+    RequestRefused,
+    SkinwareError,
+)
 from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
-from skinware.realtime import boot
+from skinware.realtime import NS_PER_S, boot, now_ns
+from skinware.service import ServiceReader
+from skinware.service.messages import Answer
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
 from skinware.transfer.generation import Generation
 
 _LONGEST_LINE = 4096
-_MOST_WAITING = 1024
-"""Questions that wait to be answered by the thread that codes."""
+_MOST_FRAMES = 1024
+"""Frames that wait to be coded."""
+_CALLS_AT_ONCE, _MOST_CALLS, _CALL_S = 4, 64, 30.0
+_OPERATIONS_S = 1.0
+_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 _STATES: dict[str, State] = {
     "live": "live",
     "paused": "paused",
@@ -53,54 +66,53 @@ _STATES: dict[str, State] = {
     "restarted": "live",
     "found": "live",
 }
+_ErrorKind = Literal["refused", "failed", "paused", "cancelled"]
+_ERRORS: dict[type[Exception], _ErrorKind] = {
+    Paused: "paused",
+    RequestCancelled: "cancelled",
+    RequestRefused: "refused",
+}
 
 
-@dataclass
-class _Whole:
-    """A generation of a service.
+class _Workers:
+    """Runs jobs in threads of its own, and refuses those that are too many."""
 
-    Attributes:
-        name: of the service.
-        head: its file up to its slots.
-    """
+    def __init__(self, n_threads: int, most: int, name: str) -> None:
+        self._threads = ThreadPoolExecutor(n_threads, name)
+        self._room = threading.BoundedSemaphore(most)
 
-    name: str
-    head: Head
-
-    @cached_property
-    def of_driver(self) -> Generation | None:
-        """It, if it is one of a driver that can be read; this takes its time."""
+    def submit(self, job: Callable[..., object], *arguments: object) -> bool:
+        """Run ``job(*arguments)`` soon; return False if it is refused."""
+        if not self._room.acquire(blocking=False):
+            return False
         try:
-            generation = Generation(self.head.raw, self.name)
-        except BadRecording:
-            return None
-        return generation if generation.is_driver else None
+            self._threads.submit(job, *arguments).add_done_callback(lambda _: self._room.release())
+        except RuntimeError:  # closed
+            self._room.release()
+        return True
+
+    def close(self) -> None:
+        self._threads.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass
 class _Served:
-    """A service.
-
-    Attributes:
-        stream: gives its frames.
-        whole: its present generation.
-        told: how it is.
-    """
+    """A service, its present generation, and its state."""
 
     stream: Stream
-    whole: _Whole
-    told: Service
+    head: Head
+    service: Service
 
 
 class Server:
-    """Serves the services of a namespace as those of a robot, until it is stopped.
+    """Serves the services of a namespace as those of a robot.
 
     Args:
         robot: its name.
-        link: to whoever joins.
+        link: to the peers.
         namespace: whose services.
-        names: of them; None: all there are and come.
-        callers: who may call, told to all.
+        names: of services; None: all, also later ones.
+        callers: names of the certificates that may call, for people.
 
     Attributes:
         guard: counts questions that cannot be understood.
@@ -115,217 +127,226 @@ class Server:
         *,
         callers: Collection[str] = (),
     ) -> None:
-        self._instance, self._callers = os.urandom(8).hex(), tuple(callers)
-        self._keys, self._link = Keys(robot, self._instance), link
-        self._start = f"{boot()}/{namespace.name}"
+        instance = os.urandom(8).hex()
+        self._identity = Services(instance, f"{boot()}/{namespace.name}", tuple(callers), host=host_name())
+        self._keys, self._link, self._namespace = Keys(robot, instance), link, namespace
         self._services: dict[str, _Served] = {}
-        self._states: dict[str, Service] = {}
+        self._states: dict[str, State] = {}
         self._lock = threading.Lock()
+        self._is_ending = False
         self.guard = Guard()
-        self._calls = Calls(namespace)
-        self._waiting = 0  # for the thread that codes
-        self._coding = ThreadPoolExecutor(1, "skinware bridge coding")
+        self._calls = _Workers(_CALLS_AT_ONCE, _MOST_CALLS, "skinware bridge call")
+        self._coding = _Workers(1, _MOST_FRAMES, "skinware bridge coding")
         self._parts = Parts(self._stream)
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
         self._collector = Collector(namespace, names, self)
-        self._collector.take()  # who asks is told of all that there is
-        self._answering = [
-            answering(link, self._keys),
-            *(
-                link.answer(key, self.guard.of_questions("a question", asked))
-                for key, asked in (
-                    (self._keys.services, self._services_asked),
-                    (self._keys.of("*", "generation"), self._generation_asked),
-                    (self._keys.of("*", "newest"), self._newest_asked),
-                    (self._keys.call("*", "*"), self._called),
-                )
-            ),
-        ]
-        link.be_there(self._keys.token)
+        self._collector.take()  # the first answers have all services
+        self._ends = [answer_pings(link, self._keys)]
+        for key, asked in (
+            (self._keys.services, self._services_asked),
+            (self._keys.of("*", "generation"), self._generation_asked),
+            (self._keys.of("*", "newest"), self._newest_asked),
+            (self._keys.of("*", "call/*"), partial(self._call_soon, self._call)),
+        ):
+            self._ends.append(link.answer(key, partial(self._asked, asked)))
+        link.declare_token(self._keys.token)
 
     @property
     def lost(self) -> int:
-        """Frames that could not be taken from their rings."""
+        """Frames that were missed in their rings."""
         return self._collector.lost
 
-    def run(self, tell: Callable[[], object] = lambda: None) -> None:
-        """Until ``stop``; ``tell`` is called once a second."""
+    def run(self, each_second: Callable[[], object] = lambda: None) -> None:
+        """Run until ``stop``; call ``each_second`` once a second."""
 
-        def each_second() -> None:
-            self._let_go()
-            self._soon(self._summarise)
-            tell()
+        def second() -> None:
+            for served in self._services.values():
+                served.stream.expire()
+            self._parts.expire()
+            self._code_soon(self._summarise)
+            each_second()
 
-        self._collector.run(each_second)
+        self._collector.run(second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
         self._collector.stop()
-        self._calls.end()
+        self._is_ending = True
 
     def close(self) -> None:
-        """Let go of all services; calls that are still open are cancelled."""
+        """Release all services; open calls are cancelled."""
         self.stop()
-        for end in self._answering:
+        for end in self._ends:
             end()
         self._calls.close()
-        self._coding.shutdown(wait=True, cancel_futures=True)
+        self._coding.close()
         self._collector.close()
 
     def frames(self) -> Mapping[str, tuple[str, int, int]]:
-        """(state, frames so far, who pull) of every service."""
+        """Return (state, frames so far, number of pullers) of every service."""
         with self._lock:
             return {
-                name: (served.told.state, served.stream.frames, served.stream.n_pullers)
+                name: (served.service.state, served.stream.frames, served.stream.n_pullers)
                 for name, served in self._services.items()
             }
 
-    # -- what the collector tells ---------------------------------------------------------------------------------
+    # -- a skinware.transfer.collecting.Listener ------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.transfer.collecting.Listener`."""
         segment = segments.recorded(head, service)
-        told = Service(segment.generation, self._states.get(service, Service()).state)
-        whole = _Whole(service, Head(head))
+        state = Service(segment.generation, self._states.get(service, "live"))
         with self._lock:
             served = self._services.get(service)
             if served is None:
-                served = self._services[service] = _Served(self._stream(service), whole, told)
+                served = self._services[service] = _Served(self._stream(service), Head(service, head), state)
             else:
-                served.whole, served.told = whole, told
+                served.head, served.service = Head(service, head), state
             served.stream.begin(segment.generation, [CodedColumn.of(column) for column in segment.layout.slot])
-        self._states[service] = told
-        self._link.tell(self._keys.services, self._told())
+        self._link.put(self._keys.services, self._list_of_services())
 
     def took(self, service: str, frame: Sample) -> None:
-        """Likewise."""
         self._services[service].stream.take(frame)
         self._parts.take(service, frame)
 
     def happened(self, event: dict[str, Any]) -> None:
-        """Likewise."""
         name, state = event["service"], _STATES.get(event["event"])
         if not name or state is None:
             return
-        known = self._states.get(name, Service())
-        self._states[name] = Service(known.generation, state)
+        self._states[name] = state
         with self._lock:
             served = self._services.get(name)
             if served is not None:
                 newest = served.stream.newest
                 sequence = newest.sequence if newest is not None else 0
-                served.told = Service(served.told.generation, state, sequence)
-        self._link.tell(self._keys.services, self._told())
+                served.service = Service(served.service.generation, state, sequence)
+        self._link.put(self._keys.services, self._list_of_services())
+
+    # -- coding, in a thread of its own ---------------------------------------------------------------------------
 
     def _stream(self, service: str, part: str = "") -> Stream:
-        return Stream(self._link.sender(self._keys.frame(service, part)), self._soon)
+        return Stream(self._link.sender(self._keys.frame(service, part)), self._code_soon)
+
+    def _code_soon(self, work: Callable[..., object], *arguments: object) -> None:
+        if not self._coding.submit(self.guard.run, "a question", work, *arguments):
+            self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
+
+    def _there(self) -> dict[str, _Served]:
+        """Return copies of all services that are not closed."""
+        with self._lock:
+            return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
 
     def _summarise(self) -> None:
         there = self._there()
-        self._summaries.count({whole.name: stream.frames for whole, _, stream in there})
+        self._summaries.count({name: served.stream.frames for name, served in there.items()})
         if not self._summaries.is_wanted:
             return
-        drivers = [
-            Summarised(whole.name, told.state, generation, stream)
-            for whole, told, stream in there
-            if (generation := whole.of_driver) is not None
-        ]
+        drivers: dict[str, tuple[State, Structure, Generation, Sample | None]] = {}
+        for name, served in there.items():
+            driver = served.head.driver
+            if driver is not None and driver.structure is not None:
+                drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
         self._summaries.send(drivers, len(there) - len(drivers), self.lost)
 
-    def _there(self) -> list[tuple[_Whole, Service, Stream]]:
-        with self._lock:
-            services = [(served.whole, served.told, served.stream) for served in self._services.values()]
-        return [service for service in services if service[1].state != "closed"]
-
-    def _soon(self, work: Callable[..., None], *arguments: object) -> None:
-        """Have frames coded, or cut, after what waits for that already; what is too much is counted, and left out."""
-        with self._lock:
-            if self._waiting >= _MOST_WAITING:
-                self.guard.refuse("a question", f"{_MOST_WAITING} others wait")
-                return
-            self._waiting += 1
-        with contextlib.suppress(RuntimeError):  # it is closed
-            self._coding.submit(self._code, work, *arguments)
-
-    def _code(self, work: Callable[..., None], *arguments: object) -> None:
-        with self._lock:
-            self._waiting -= 1
-        self.guard.run("a question", work, *arguments)
-
-    def _let_go(self) -> None:
-        for served in self._services.values():
-            served.stream.let_go()
-        self._parts.let_go()
-
-    # -- questions, in zenoh's threads ----------------------------------------------------------------------------
-
-    def _services_asked(self, question: Question) -> None:
-        if question.payload:
-            self._soon(self._tell_part, question)
-        else:
-            question.reply(self._told())
-
-    def _told(self) -> bytes:
-        with self._lock:
-            services = {name: served.told for name, served in list(self._services.items())[: LIMITS.services]}
-            left_out = len(self._services) - len(services)
-        if left_out:
-            self.guard.refuse("a service", f"{left_out} are left out: a robot may have {LIMITS.services}")
-        return msgspec.json.encode(Services(self._instance, self._start, self._callers, services, host=host_name()))
-
-    def _tell_part(self, question: Question) -> None:
+    def _answer_wish(self, question: Question) -> None:
         services: dict[str, Service] = {}
         try:
             missing = self._fit(read_text(question.payload, Wish), services)
         except (BridgeError, ConfigurationError) as error:
             missing = str(error)
-        told = Services(self._instance, self._start, self._callers, services, missing[:_LONGEST_LINE], host_name())
-        question.reply(msgspec.json.encode(told))
+        answer = msgspec.structs.replace(self._identity, services=services, missing=missing[:_LONGEST_LINE])
+        question.reply(msgspec.json.encode(answer))
 
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:
-        """Cut a part out of all drivers, and note those that have any of it; what is not there, a line for people."""
+        """Cut a part out of all drivers and add those that have any of it to ``services``; return what is missing."""
         part, structures = self._parts.wanted(wish), []
-        for whole, told, stream in self._there():
-            driver = whole.of_driver
-            if driver is None or not isinstance(driver.context, Structure):
+        for name, served in self._there().items():
+            driver = served.head.driver
+            if driver is None or driver.structure is None:
                 continue
-            structures.append(driver.context)
-            if part.fit(whole.name, driver):
-                services[whole.name] = told
-                if stream.newest is not None:
-                    part.take(whole.name, stream.newest)
+            structures.append(driver.structure)
+            if part.fit(name, driver):
+                services[name] = served.service
+                if served.stream.newest is not None:
+                    part.take(name, served.stream.newest)
         if not structures:
             return ""  # drivers may come
         missing = "; ".join(part.choice.unknown(structures))
-        return missing or ("" if services else "no sensor there is of what was asked for")
+        return missing or ("" if services else "no sensor meets all conditions")
 
-    def _generation_asked(self, question: Question) -> None:
-        name, number = parts_of(question.key)[0], question.parameters.get("part")
-        served = self._services.get(name)
-        head = None if served is None else served.whole.head
-        if number:
-            part = self._parts.find(number)
-            cut = None if part is None else part.cut(name)
-            head = None if cut is None else cut.head
-        if head is None:
-            question.fail(b"no such service")
+    # -- questions, in zenoh's threads ----------------------------------------------------------------------------
+
+    def _asked(self, answer: Callable[[Question], None], question: Question) -> None:
+        if not self.guard.run("a question", answer, question):
+            question.fail(b"the question cannot be understood")
+
+    def _list_of_services(self) -> bytes:
+        with self._lock:
+            services = {name: served.service for name, served in list(self._services.items())[: LIMITS.services]}
+            left_out = len(self._services) - len(services)
+        if left_out:
+            self.guard.refuse("a service", f"{left_out} are left out: a robot may have {LIMITS.services}")
+        return msgspec.json.encode(msgspec.structs.replace(self._identity, services=services))
+
+    def _services_asked(self, question: Question) -> None:
+        if question.payload:
+            self._code_soon(self._answer_wish, question)
         else:
-            self._calls.submit(question, self._tell_generation, name, head)
+            question.reply(self._list_of_services())
 
-    def _tell_generation(self, question: Question, name: str, head: Head) -> None:
-        question.reply(generation_message(About(dict(self._calls.operations(name))), head))
+    def _find(self, question: Question) -> tuple[Head, Stream] | None:
+        """Return the file and stream of a service that a question is for; answer the question if there is none."""
+        name, part = question.key.split("/")[4], question.parameters.get("part")
+        served = self._services.get(name)
+        found = None if served is None else (served.head, served.stream)
+        if part:
+            found = self._parts.find(part, name)
+        if found is None:
+            question.fail(b"no such service")
+        return found
 
     def _newest_asked(self, question: Question) -> None:
-        name, number = parts_of(question.key)[0], question.parameters.get("part")
-        served = self._services.get(name)
-        stream = None if served is None else served.stream
-        if number:
-            part = self._parts.find(number)
-            stream = None if part is None else part.stream(name)
-        if stream is None:
-            question.fail(b"no such service")
-        else:
-            stream.asked(question)
+        found = self._find(question)
+        if found is not None:
+            found[1].asked(question)
 
-    def _called(self, question: Question) -> None:
-        self._calls.submit(question, self._calls.carry_out, *parts_of(question.key))
+    def _generation_asked(self, question: Question) -> None:
+        found = self._find(question)
+        if found is not None:
+            self._call_soon(self._answer_generation, question, found[0])
+
+    # -- calls, in threads of their own ---------------------------------------------------------------------------
+
+    def _call_soon(self, work: Callable[..., None], question: Question, *arguments: object) -> None:
+        if not self._calls.submit(work, question, *arguments):
+            question.fail(b"too many questions at once")
+
+    def _answer_generation(self, question: Question, head: Head) -> None:
+        operations: dict[str, str] = {}
+        with contextlib.suppress(SkinwareError):
+            with ServiceReader[Sample](head.name, namespace=self._namespace, announce=False) as reader:
+                operations = dict(reader.operations(timeout_s=_OPERATIONS_S))
+        question.reply(generation_message(About(operations), head.packed))
+
+    def _call(self, question: Question) -> None:
+        *_, name, _, operation = question.key.split("/")
+        try:
+            arguments = read_text(question.payload, dict[str, Any]) if question.payload else {}
+            answer = self._result(name, operation, arguments)
+        except Exception as error:  # noqa: BLE001, the caller gets it
+            other: _ErrorKind = "failed" if isinstance(error, RequestError) else "refused"
+            result = CallResult(error=str(error)[:_LONGEST_LINE], why=_ERRORS.get(type(error), other))
+        else:
+            result = CallResult(answer.generation, answer.sequence, msgspec.Raw(msgspec.json.encode(answer.result)))
+        question.reply(msgspec.json.encode(result))
+
+    def _result(self, name: str, operation: str, arguments: Mapping[str, Any]) -> Answer:
+        """Call an operation and wait for its answer, but not beyond the end of this bridge."""
+        with ServiceReader[Sample](name, namespace=self._namespace, announce=False) as reader:
+            pending = reader.ask(operation, **arguments)
+            until_ns, pause_s = now_ns() + round(_CALL_S * NS_PER_S), _SHORTEST_PAUSE_S
+            while not pending.done() and now_ns() < until_ns:
+                if self._is_ending:
+                    pending.cancel()
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            return pending.result(0.0)

@@ -1,33 +1,111 @@
-"""All robots that are reached, by the small message that each sends once a second."""
+"""Summaries of robots: each robot sends one a second, and a watcher collects those of all that it reaches."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+
+import msgspec
+import numpy as np
 
 from skinware.bridge.clock import Exchange, PeerClock, Pinger
-from skinware.bridge.link import Guard, Link
+from skinware.bridge.link import Guard, Link, Sender
 from skinware.bridge.messages import (
     ALL_SUMMARIES,
     ALL_TOKENS,
     VERSION,
+    DriverSummary,
     Keys,
+    State,
     Summary,
-    bridge_of,
+    host_name,
     read_text,
     token_parts,
 )
+from skinware.driver_service import counters_of
 from skinware.errors import BridgeError
 from skinware.limits import LIMITS
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import BusState, PatchState, is_fresh
+from skinware.structure import Structure
+from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _TICK_S = 0.05
+_MOST_NAMES = 4
+"""Names of silent patches in a summary; all are counted."""
 
-Bridge = tuple[str, str]
-"""(robot, number of the bridge that serves it)."""
+
+class Summaries:
+    """Sends the summary of a robot while there are listeners."""
+
+    def __init__(self, namespace: str, send: Sender) -> None:
+        self._namespace, self._host, self._send = namespace, host_name(), send
+        self._frames: Mapping[str, int] = {}
+        self._counted_ns = now_ns()
+        self._rates_hz: dict[str, float] = {}
+
+    @property
+    def is_wanted(self) -> bool:
+        return self._send.is_heard
+
+    def count(self, frames: Mapping[str, int]) -> None:
+        """Take the number of frames of each service so far, about once a second."""
+        time_ns = now_ns()
+        seconds = (time_ns - self._counted_ns) / NS_PER_S
+        new = {name: count - self._frames.get(name, 0) for name, count in frames.items()}
+        self._rates_hz = {name: round(count / seconds, 1) for name, count in new.items()}
+        self._frames, self._counted_ns = frames, time_ns
+
+    def send(
+        self, drivers: Mapping[str, tuple[State, Structure, Generation, Sample | None]], services: int, lost: int
+    ) -> None:
+        """Send it.
+
+        Args:
+            drivers: by name: state, present generation with its structure, and newest frame.
+            services: number of other services.
+            lost: frames that the bridge missed in their rings.
+        """
+        summaries = {name: _summary(self._rates_hz.get(name, 0.0), *driver) for name, driver in drivers.items()}
+        self._send(msgspec.json.encode(Summary(self._namespace, summaries, services, lost, self._host)))
+
+
+def _summary(
+    rate_hz: float, state: State, structure: Structure, generation: Generation, newest: Sample | None
+) -> DriverSummary:
+    is_live = state == "live"
+    age_ms, lost, fresh, problems = None, 0, 0, int(not is_live)
+    silent: list[str] = []
+    if newest is not None and newest.generation == generation.generation:
+        frame = RecordedDriverSnapshot(generation, newest.slot)
+        time_ns = now_ns()
+        age_ms = round((time_ns - frame.acquired_ns) / 1e6, 3)
+        limits_ns = structure.age_limits_ns(frame.period_ns)
+        flags = is_fresh(frame.status, frame.sensor_time_ns, at_ns=time_ns, max_age_ns=limits_ns, alive=is_live)
+        fresh = int(np.count_nonzero(flags))
+        names, counts = counters_of(frame, generation.static(), "bus", len(structure.buses))
+        lost = int(counts[:, names.index("lost")].sum()) if "lost" in names else 0
+        if is_live:
+            rows = np.flatnonzero(frame.patch_state != PatchState.LIVE).tolist()
+            silent = [structure.patch_names[row] for row in rows]
+            problems += len(silent) + int(np.count_nonzero(frame.bus_state != BusState.LIVE))
+    return DriverSummary(
+        state,
+        rate_hz,
+        age_ms,
+        lost,
+        structure.n_sensors,
+        fresh,
+        structure.n_patches,
+        tuple(silent[:_MOST_NAMES]),
+        len(silent),
+        problems,
+    )
 
 
 @dataclass
@@ -35,16 +113,12 @@ class Seen:
     """A robot that is reached.
 
     Attributes:
-        robot: its name.
-        instance: number of the bridge that serves it.
-        version: of that bridge.
-        clock: of the robot.
-        summary: what it told last; None: nothing yet.
-        told_ns: when that was, 0 if it was never.
-        bytes: of all that it told so far.
-        guard: counts its messages that cannot be taken.
-        next_clock_ns: when its clock is to be asked next.
-        pinger: asks for it; None: nobody wants to know.
+        instance, version: of the bridge that serves it.
+        summary: the last one; None: none so far.
+        heard_ns: when that came; 0: never.
+        bytes: of all summaries so far.
+        guard: counts its messages that cannot be read.
+        pinger: asks for its clock; None: not asked yet.
     """
 
     robot: str
@@ -52,58 +126,55 @@ class Seen:
     version: int = VERSION
     clock: PeerClock = field(default_factory=PeerClock)
     summary: Summary | None = None
-    told_ns: int = 0
+    heard_ns: int = 0
     bytes: int = 0
     guard: Guard = field(default_factory=Guard)
-    next_clock_ns: int = 0
     pinger: Pinger | None = None
 
 
 class Watcher:
-    """Knows how all robots are that a link leads to; reads none of their frames.
+    """Follows all robots that a link leads to, without reading their frames.
 
     Args:
         link: to them.
-        asks: have them tell how they are; otherwise only who is there.
+        asks: collect their summaries; otherwise only their names.
 
     Attributes:
-        guard: counts messages that cannot be taken, and are of no robot that is known.
+        guard: counts messages that cannot be read and belong to no known robot.
     """
 
     def __init__(self, link: Link, *, asks: bool = True) -> None:
         self._link, self._asks, self._who = link, asks, os.urandom(8).hex()
         self._lock = threading.Lock()
-        self._seen: dict[Bridge, Seen] = {}
+        self._seen: dict[tuple[str, str], Seen] = {}  # by robot and instance
         self._stopping = False
         self.guard = Guard()
-        link.watch(ALL_TOKENS, self._token_changed)
+        link.watch_tokens(ALL_TOKENS, partial(self.guard.run, "a token", self._token))
         if asks:
-            link.listen(ALL_SUMMARIES, self.guard.of_messages("a summary", self._told))
+            link.listen(ALL_SUMMARIES, partial(self.guard.run, "a summary", self._take_summary))
 
     def robots(self) -> list[Seen]:
-        """All that are reached now, by name; two of one name are two."""
+        """Return all that are reached now, by name; two bridges of one name are two."""
         with self._lock:
             return sorted(self._seen.values(), key=lambda seen: (seen.robot, seen.instance))
 
-    def run(self, tell: Callable[[], object] = lambda: None) -> None:
-        """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
+    def run(self, each_second: Callable[[], object] = lambda: None) -> None:
+        """Run until ``stop``; call ``each_second`` once a second."""
+        second_ns = now_ns() + NS_PER_S
         while not self._stopping:
             time.sleep(_TICK_S)
             time_ns = now_ns()
-            for seen in self.robots():
-                if self._asks and seen.version == VERSION and time_ns >= seen.next_clock_ns:
+            for seen in self.robots() if self._asks else ():
+                is_due = seen.pinger is None or time_ns >= seen.pinger.asked_ns + seen.clock.pause_ns()
+                if seen.version == VERSION and is_due:
                     self._ask_clock(seen)
-            if time_ns >= tell_ns:
-                tell_ns = max(tell_ns + NS_PER_S, time_ns)
-                tell()
+            if time_ns >= second_ns:
+                second_ns = max(second_ns + NS_PER_S, time_ns)
+                each_second()
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
         self._stopping = True
-
-    def _token_changed(self, key: str, there: bool) -> None:
-        self.guard.run("a token", self._token, key, there)
 
     def _token(self, key: str, there: bool) -> None:
         robot, version, instance = token_parts(key)
@@ -118,9 +189,10 @@ class Watcher:
         if gone is not None and gone.pinger is not None:
             gone.pinger.close()
 
-    def _told(self, key: str, payload: bytes) -> None:
+    def _take_summary(self, key: str, payload: bytes) -> None:
+        robot, instance = key.split("/")[2:4]
         with self._lock:
-            seen = self._seen.get(bridge_of(key))
+            seen = self._seen.get((robot, instance))
         if seen is None:
             return
         try:
@@ -129,18 +201,17 @@ class Watcher:
             seen.guard.refuse("a summary", str(error))
         else:
             with self._lock:
-                seen.summary, seen.told_ns = summary, now_ns()
+                seen.summary, seen.heard_ns = summary, now_ns()
                 seen.bytes += len(payload)
 
     def _ask_clock(self, seen: Seen) -> None:
-        def told(sample: Exchange) -> None:
+        def add(sample: Exchange) -> None:
             with self._lock:
                 seen.clock.add(sample)
 
-        seen.next_clock_ns = now_ns() + seen.clock.pause_ns()
         pinger = seen.pinger
         if pinger is None:
-            pinger = Pinger(self._link, self._who, told, seen.guard)
+            pinger = Pinger(self._link, self._who, add, seen.guard)
             pinger.follow(Keys(seen.robot, seen.instance))
             with self._lock:
                 if self._seen.get((seen.robot, seen.instance)) is seen:

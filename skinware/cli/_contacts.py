@@ -11,7 +11,7 @@ from skinware.cli._heat_map import Arrangement, Label
 from skinware.realtime import NS_PER_S
 from skinware.tactile.contacts import Contact
 from skinware.text import NO_VALUE, age_text, figure_text, plural
-from skinware.views.beside import TouchedPlace
+from skinware.views.live import TouchedPlace
 
 _LONGEST_PLACE = 22
 TITLES = f"{'id':>4}  {'kind':<7}  {'at':<{_LONGEST_PLACE}} {'x, y, z in m':<20} {'load':>6} {'mm/s':>5} {'age':>6}"

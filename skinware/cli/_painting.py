@@ -1,8 +1,8 @@
-"""Colour the codes of a heat map for what a terminal can show: palettes, segments and text of rich."""
+"""Colour the codes of a heat map as a terminal can show them: palettes, texts, and a widget of Textual."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TypeVar
@@ -14,9 +14,14 @@ from rich.color_triplet import ColorTriplet
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
+from textual import events
+from textual.geometry import Size
+from textual.message import Message
+from textual.scroll_view import ScrollView
+from textual.strip import Strip
 
 from skinware.cli import _heat_map as heat
-from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
+from skinware.cli._heat_map import BACKGROUND, LEVELS, Arrangement, Label
 from skinware.text import figure_text, printable
 
 Colours = tuple[ColorTriplet, ...]
@@ -25,14 +30,14 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """How levels and marks look.
+    """The looks of levels and marks.
 
     Attributes:
-        ramp: one colour per level.
-        stale: the same for what is not current: darker, or grey.
-        no_value: of a sensor of which nothing is known.
-        unmoved: of a sensor that never moved in a wipe test; no level looks like it.
-        characters: one per level where colours are not wanted, otherwise empty.
+        ramp: one colour for each level.
+        stale: the same for stale values: darker, or grey.
+        no_value: colour of a sensor without a value.
+        unmoved: colour of a sensor that never moved in a wipe test; no level has it.
+        characters: one for each level where colours are not wanted, otherwise empty.
     """
 
     ramp: Colours
@@ -43,11 +48,11 @@ class Palette:
 
 
 def palette_for(color_system: str | None, *, no_color: bool = False) -> Palette:
-    """The palette for a terminal.
+    """Return the palette for a terminal.
 
     Args:
-        color_system: what rich found out about it: ``truecolor``, ``256``, ``standard`` (16 colours), None (none).
-        no_color: the person wants none (``NO_COLOR`` is set).
+        color_system: of the terminal as rich detects it: ``truecolor``, ``256``, ``standard`` (16 colours), None.
+        no_color: the person wants no colours (``NO_COLOR`` is set).
     """
     if no_color or color_system is None:
         return CHARACTERS
@@ -55,17 +60,17 @@ def palette_for(color_system: str | None, *, no_color: bool = False) -> Palette:
 
 
 def mixed(one: ColorTriplet, other: ColorTriplet, share: float) -> ColorTriplet:
-    """A colour between two: ``one`` at share 0, ``other`` at 1."""
+    """Return a colour between two: ``one`` at share 0, ``other`` at 1."""
     return ColorTriplet(*(round(a + (b - a) * share) for a, b in zip(one, other, strict=True)))
 
 
 def _spread(colours: Sequence[_T]) -> tuple[_T, ...]:
-    """One of a few colours per level; the first is level 0 alone, so that the lightest touch is seen."""
+    """Return one of a few colours for each level; the first is level 0 alone, so that the lightest touch is seen."""
     return tuple(colours[-(-level * (len(colours) - 1) // (LEVELS - 1))] for level in range(LEVELS))
 
 
 def _between(anchors: Sequence[str]) -> Colours:
-    """One colour per level, from the first anchor to the last."""
+    """Return one colour for each level, from the first anchor to the last."""
     colours = [Color.parse(text).get_truecolor() for text in anchors]
     steps = [level * (len(colours) - 1) / (LEVELS - 1) for level in range(LEVELS)]
     return tuple(
@@ -74,12 +79,12 @@ def _between(anchors: Sequence[str]) -> Colours:
 
 
 def _ansi(numbers: Sequence[int]) -> Colours:
-    """Colours of the table of 256; they stay what they are when a triplet is turned into a number again."""
+    """Return colours of the table of 256, which stay the same when they are turned into numbers again."""
     return tuple(Color.from_ansi(number).get_truecolor() for number in numbers)
 
 
 _GROUND = ColorTriplet(18, 18, 18)
-"""Of the screen."""
+"""Colour of the screen."""
 _WHITE = ColorTriplet(255, 255, 255)
 _VIRIDIS = _between(
     (
@@ -108,7 +113,7 @@ _BASIC = {
         "red": (170, 0, 0),
     }.items()
 }
-"""As rich has the 16 colours: these exact values are sent as their numbers."""
+"""The 16 colours as rich defines them: these exact values are sent as their numbers."""
 
 TRUE_COLOURS = Palette(
     ramp=_VIRIDIS,
@@ -163,7 +168,7 @@ MARK_NAMES = {
 
 
 def colour_of(code: int, palette: Palette) -> ColorTriplet:
-    """What a sensor of this code looks like where there is no room for its character."""
+    """Return the colour of a sensor with this code where there is no room for its character."""
     mark, level = divmod(code, LEVELS)
     if mark == heat.UNMOVED:
         return palette.unmoved
@@ -173,7 +178,7 @@ def colour_of(code: int, palette: Palette) -> ColorTriplet:
 
 
 def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> list[int]:
-    """Lines in which any pixel has another code than before; both are (2 * lines, columns) uint8."""
+    """Return the lines in which any pixel has another code; both are (2 * lines, columns) uint8."""
     differs = (before != now).any(axis=1)
     lines: list[int] = np.flatnonzero(differs[0::2] | differs[1::2]).tolist()
     return lines
@@ -182,11 +187,11 @@ def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> 
 def segments_of(
     upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label], palette: Palette
 ) -> list[Segment]:
-    """One line of a map.
+    """Return one line of a map.
 
     Args:
         upper: (columns,) uint8, codes of the pixels in the upper half of the line.
-        lower: (columns,) uint8, codes of those in the lower half.
+        lower: (columns,) uint8, codes of the pixels in the lower half.
         labels: words to put in.
         palette: the terminal's.
     """
@@ -209,12 +214,13 @@ _MARK = Style.parse("bold #ffffff on #27548a")
 
 @cache
 def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
-    """Character and colours of one cell: its upper code in the high byte, its lower one in the low."""
+    """Return character and colours of a cell, whose upper code is the high byte and whose lower code is the low one."""
     upper, lower = divmod(pair, 256)
     if palette.characters:
         return _character(lower if upper == BACKGROUND else upper, palette), Style.null()
     if upper != lower and BACKGROUND in (upper, lower):
-        return ("▀", _style(upper, palette)) if lower == BACKGROUND else ("▄", _style(lower, palette))
+        code = upper if lower == BACKGROUND else lower
+        return "▀" if code == upper else "▄", Style(color=_colour(colour_of(code, palette)))
     if upper != lower:
         return "▀", Style(color=_colour(colour_of(upper, palette)), bgcolor=_colour(colour_of(lower, palette)))
     if upper == BACKGROUND:
@@ -233,7 +239,7 @@ def _character(code: int, palette: Palette) -> str:
 
 
 def _ink(colour: ColorTriplet) -> ColorTriplet:
-    """Black or white, whichever can be read on a colour."""
+    """Return black or white, whichever can be read on a colour."""
     red, green, blue = colour
     return ColorTriplet(0, 0, 0) if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else ColorTriplet(255, 255, 255)
 
@@ -242,15 +248,11 @@ def _colour(triplet: ColorTriplet) -> Color:
     return Color.from_triplet(triplet)
 
 
-def _style(code: int, palette: Palette) -> Style:
-    return Style(color=_colour(colour_of(code, palette)))
-
-
 def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
-    """The colours, from that of the least level to that of the highest.
+    """Return the colours from the lowest level to the highest, with their values.
 
     Args:
-        values: of the lowest level, the middle one if it is to be said, the highest.
+        values: of the lowest level, of the middle one if it is wanted, and of the highest.
         unit: of the values.
         palette: the terminal's.
     """
@@ -269,14 +271,14 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
 
 
 def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
-    """How many sensors are fresh, and which of the other marks are to be seen, with what they mean.
+    """Return how many sensors are fresh, and the other marks that are seen, with their meaning.
 
     Args:
         marks: (n,) uint8, marks of all sensors that are drawn.
         palette: the terminal's.
     """
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
-    fresh = counts[heat.FRESH] + counts[heat.UNMOVED]  # a stuck one comes in time, too
+    fresh = counts[heat.FRESH] + counts[heat.UNMOVED]  # a stuck sensor is fresh, too
     text = Text(f"{fresh} fresh", no_wrap=True, overflow="ellipsis")
     for mark, name in MARK_NAMES.items():
         if counts[mark]:
@@ -286,3 +288,72 @@ def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
             text.append(character, style)
             text.append(f" {counts[mark]} {name}")
     return text
+
+
+class HeatMap(ScrollView, can_focus=False):
+    """A picture, line by line in the colours of a palette; only lines that changed are drawn again."""
+
+    class Pointed(Message):
+        """The mouse points at a sensor (its position in a snapshot), or at none."""
+
+        def __init__(self, sensor: int | None) -> None:
+            super().__init__()
+            self.sensor = sensor
+
+    def __init__(self, palette: Palette, *, id: str) -> None:  # noqa: A002 - Textual's name
+        super().__init__(id=id)
+        self._palette = palette
+        self._arrangement: Arrangement | None = None
+        self._pixels: npt.NDArray[np.uint8] | None = None
+        self._marks: Mapping[int, Sequence[Label]] = {}
+        self._strips: dict[int, Strip] = {}
+
+    def show(
+        self,
+        arrangement: Arrangement,
+        pixels: npt.NDArray[np.uint8],
+        marks: Mapping[int, Sequence[Label]],
+    ) -> None:
+        """Draw the lines that changed.
+
+        Args:
+            arrangement: of the sensors.
+            pixels: (2 * lines, columns) uint8 from ``arrangement.draw``; not changed afterwards.
+            marks: words over sensors, by line.
+        """
+        before = self._pixels if arrangement is self._arrangement else None
+        moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}
+        self._arrangement, self._pixels, self._marks = arrangement, pixels, marks
+        if before is None:
+            self._strips.clear()
+            self.virtual_size = Size(arrangement.columns, arrangement.lines)
+            self.refresh()
+            return
+        top = self.scroll_offset.y
+        for line in moved.union(changed_lines(before, pixels)):
+            self._strips.pop(line, None)
+            if top <= line < top + self.size.height:
+                self.refresh_line(line)
+
+    def render_line(self, y: int) -> Strip:
+        left, top = self.scroll_offset
+        strip = self._strips.get(y + top) or self._strip(y + top)
+        return strip.crop_extend(left, left + self.size.width, None).apply_style(self.rich_style)
+
+    def _strip(self, line: int) -> Strip:
+        arrangement, pixels = self._arrangement, self._pixels
+        if arrangement is None or pixels is None or line >= arrangement.lines:
+            return Strip.blank(0)
+        upper, lower = pixels[2 * line : 2 * line + 2]
+        labels = [*arrangement.labels.get(line, ()), *self._marks.get(line, ())]
+        segments = segments_of(upper, lower, labels, self._palette)
+        strip = self._strips[line] = Strip(segments, arrangement.columns)
+        return strip
+
+    def on_mouse_move(self, event: events.MouseMove) -> None:
+        if self._arrangement is not None:
+            left, top = self.scroll_offset
+            self.post_message(self.Pointed(self._arrangement.sensor_at(event.y + top, event.x + left)))
+
+    def on_leave(self) -> None:
+        self.post_message(self.Pointed(None))

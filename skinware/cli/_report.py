@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 
 from skinware import bridge_state
-from skinware.cli import _bridges
 from skinware.cli._terminal import echo, print_json, style, terminal_width
 from skinware.driver_service import KIND, DriverReader
 from skinware.driver_snapshot import DriverSnapshot
@@ -33,10 +32,11 @@ from skinware.state import (
     untouched,
 )
 from skinware.status import DataPath, load_report
-from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.health_service import KIND as HEALTH_KIND
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.text import age_text, count_text, plural, table, wrapped
+from skinware.views import bridges
 
 SampleT = TypeVar("SampleT", bound=Sample)
 
@@ -119,7 +119,7 @@ def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
     """What a bridge tells of itself; None before it has told anything."""
     with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
         frame = _newest(reader)
-        return None if frame is None else {"robot": frame.state.robot, **_bridges.as_data(frame.state)}
+        return None if frame is None else {"robot": frame.state.robot, **bridges.as_data(frame.state)}
 
 
 def _newest(service: ServiceReader[SampleT]) -> SampleT | None:

@@ -1,4 +1,4 @@
-"""The live view of ``skin-top``, with Textual: a list of drivers, buses and patches, and a picture of one of them."""
+"""The live view of ``skin-top`` with Textual: a list of drivers, buses and patches, and a picture of one of them."""
 
 from __future__ import annotations
 
@@ -15,24 +15,22 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
-from skinware.cli._heat_widget import HeatMap
-from skinware.cli._painting import Palette, palette_for
+from skinware.cli._painting import HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
-from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
+from skinware.cli._top_rows import COLUMNS, Row, RowKey, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.state import LIVE, life_of
 from skinware.tactile.regions import Regions
-from skinware.text import NOT_FRESH, plural, printable
-from skinware.views.beside import LiveBridges, live_contacts, places_of
-from skinware.views.live import LiveDrivers
+from skinware.text import NOT_FRESH, counters_text, plural, printable
+from skinware.views.bridges import as_data, summary
+from skinware.views.live import LiveDriver, Overview
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
 _MOST_CONTACTS = 9
-"""Lines for them, where there is room."""
+"""Lines of contacts, where there is room."""
 _WIDTHS = (19, 10, 8, 6, 11, 5, 7, 60)
 _LEFT_COLUMNS = (0, 1, 7)
 _STATE_COLOURS = {
@@ -49,6 +47,7 @@ _STATE_COLOURS = {
     "gone": "#e8453c",
     "dead": "#e8453c",
 }
+_LINES = ("head", "why", "title", "scale", "contacts", "marks", "detail")
 _ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NOTHING = """\
 No driver runs in namespace {name!r} now.
@@ -58,20 +57,20 @@ Start one in another terminal, for example:
   skin-driver --bus virtual    an emulated skin, needs no hardware
   skin-driver --bus can0       ROBOSKIN patches on a CAN bus
 
-It appears here by itself.  q quits."""
+It appears here when it runs.  q quits."""
 
 
 class SkinTop(App[None]):
-    """Drivers, buses and patches, and what the sensors of the one under the cursor feel.
+    """Show drivers, buses and patches, and a picture of the sensors under the cursor.
 
     Args:
-        namespace: where to look.
+        namespace: to show.
         type_name: type of sensors to draw first; default: each driver's first.
-        duration_s: end after this time; None = until told to.
-        scale_name: what the colours mean at first: ``change``, ``range`` or ``raw``.
-        palette: default: what the terminal can show.
+        duration_s: end after this time; None: only by a key or signal.
+        scale_name: the first meaning of the colours: ``change``, ``range`` or ``raw``.
+        palette: default: the best that the terminal can show.
         regions: that a person may choose from; None: there are none.
-        region: only sensors in this one are drawn at first; None: all.
+        region: draw only sensors in this one at first; None: all.
     """
 
     TITLE = "skin-top"
@@ -124,23 +123,12 @@ class SkinTop(App[None]):
     ) -> None:
         super().__init__()
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
-        self._drivers = LiveDrivers(namespace)
-        self._contacts = live_contacts(namespace)
-        self._bridges = LiveBridges(namespace)
+        self._overview = Overview(namespace)
         self._duration_s = duration_s
         self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
-        self._has_regions = regions is not None
-        self._head = Static(id="head", markup=False)
-        self._nothing = Container(id="nothing")
-        self._why = Static(id="why", markup=False)
-        self._all = Vertical(id="all")
         self._table = DataTable[Text](id="list", cursor_type="row")
-        self._title = Static(id="title", markup=False)
-        self._scale = Static(id="scale", markup=False)
         self._heat_map = HeatMap(palette, id="map")
-        self._touched = Static(id="contacts", markup=False)
-        self._marks = Static(id="marks", markup=False)
-        self._detail = Static(id="detail", markup=False)
+        self._lines = {name: Static(id=name, markup=False) for name in _LINES}
         self._rows: list[Row] = []
         self._heading = ""
         self._pointed: int | None = None
@@ -148,20 +136,20 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def compose(self) -> ComposeResult:
-        yield self._head
-        with self._nothing:
-            yield self._why
-        with self._all:
-            self._table.can_focus = False  # keys go to the app: nobody has to think about focus
+        yield self._lines["head"]
+        with Container(id="nothing"):
+            yield self._lines["why"]
+        with Vertical(id="all"):
+            self._table.can_focus = False  # keys go to the app wherever the focus is
             yield self._table
             with Horizontal(id="above"):
-                yield self._title
-                yield self._scale
+                yield self._lines["title"]
+                yield self._lines["scale"]
             yield self._heat_map
-            self._touched.display = False
-            yield self._touched
-            yield self._marks
-            yield self._detail
+            self._lines["contacts"].display = False
+            yield self._lines["contacts"]
+            yield self._lines["marks"]
+            yield self._lines["detail"]
         yield Footer()
 
     def on_mount(self) -> None:
@@ -169,7 +157,7 @@ class SkinTop(App[None]):
             self._table.add_column(_cell(title, column), key=title, width=_WIDTHS[column])
         loop = asyncio.get_running_loop()
         for number in _ENDING_SIGNALS:
-            with contextlib.suppress(ValueError, RuntimeError):  # we are not in the main thread
+            with contextlib.suppress(ValueError, RuntimeError):  # not in the main thread
                 loop.add_signal_handler(number, self.exit)
         self._update_list()
         self.set_interval(_LIST_PERIOD_S, self._update_list)
@@ -180,11 +168,7 @@ class SkinTop(App[None]):
     def on_unmount(self) -> None:
         for number in _ENDING_SIGNALS:
             asyncio.get_running_loop().remove_signal_handler(number)
-        self._bridges.close()
-        self._contacts.close()
-        self._drivers.close()
-
-    # -- what the person does -----------------------------------------------------------------------------------
+        self._overview.close()
 
     def action_choose(self, step: int) -> None:
         self._missed = None
@@ -195,24 +179,23 @@ class SkinTop(App[None]):
 
     def action_next_type(self) -> None:
         row = self._chosen
-        driver = self._drivers.get(row.key.driver) if row else None
+        driver = self._driver_of(row) if row else None
         if driver is not None:
             self._picture.next_type(driver.reader.structure)
             self._must_draw = True
 
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
+        return self._picture.has_regions or action != "next_region"
+
     def action_next_scale(self) -> None:
         self._picture.next_scale()
         self._must_draw = True
-
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
-        return self._has_regions or action != "next_region"
 
     def action_next_region(self) -> None:
         self._picture.next_region()
         self._must_draw = True
 
     def action_take_baselines(self) -> None:
-        """Take what comes next for what the sensors read at rest."""
         self._picture.take_baselines()
         self._must_draw = True
 
@@ -232,7 +215,6 @@ class SkinTop(App[None]):
             self.notify(f"saved: {path}", markup=False)
 
     def on_data_table_row_highlighted(self) -> None:
-        """Another row was chosen, by key or mouse."""
         self._pointed = None
         self._must_draw = True
 
@@ -244,49 +226,52 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def on_resize(self) -> None:
-        """The room for the picture changes with the next layout."""
-        self._must_draw = True
-
-    # -- what is shown ------------------------------------------------------------------------------------------
+        self._must_draw = True  # the next layout changes the space for the picture
 
     @property
     def _chosen(self) -> Row | None:
         at = self._table.cursor_row
         return self._rows[at] if 0 <= at < len(self._rows) else None
 
+    def _driver_of(self, row: Row) -> LiveDriver | None:
+        return self._overview.drivers.get(row.key.driver)
+
+    def _say(self, where: str, text: str | Text) -> None:
+        """Show a text, which may come from others, in a line of the screen."""
+        line, text = self._lines[where], _printable(text)
+        if line.content != text:
+            line.update(text)
+
     def _update_list(self) -> None:
-        if not self._detail.is_attached:
+        if not self._lines["detail"].is_attached:
             return  # the screen is being taken down
+        namespace = self._overview.drivers.namespace.name
         rows: list[Row] = []
-        why = _NOTHING.format(name=self._drivers.namespace.name)
-        count, bridges = 0, []
+        why = _NOTHING.format(name=namespace)
+        heading = ["skin-top", f"namespace {namespace}"]
         try:
-            for driver in self._drivers.look():
-                self._drivers.poll(driver)
-                count += 1
-                rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
-            self._contacts.look(self._drivers.others)
-            self._bridges.look(self._drivers.others)
-            bridges = self._bridges.states()
+            drivers = self._overview.look()
+            rows = [row for driver in drivers for row in rows_of(driver.report())]
+            heading += [plural(len(drivers), "driver")]
+            heading += [summary(bridge.robot, as_data(bridge)) for bridge in self._overview.bridges.states()]
         except NamespaceError as error:
             why = str(error)
-        told = [_bridges.summary(bridge.robot, _bridges.as_data(bridge)) for bridge in bridges]
-        place = f"namespace {self._drivers.namespace.name}"
-        self._heading = "   ".join(["skin-top", place, plural(count, "driver"), *told])
-        _say(self._why, why)
-        self._nothing.display, self._all.display = not rows, bool(rows)
+        self._heading = "   ".join(heading)
+        self._say("why", why)
+        self.query("#nothing").set(display=not rows)
+        self.query("#all").set(display=bool(rows))
         self._fill(rows)
-        self._say_what_is_hidden()
-        self._must_draw = True  # counters and ages, even if no frame comes
+        self._say("head", "   ".join([self._heading, *self._hidden_rows()]))
+        self._must_draw = True  # counters and ages change without a snapshot
 
-    def _say_what_is_hidden(self) -> None:
-        """How many rows of the list there are above and below those that are seen, and how to get there."""
-        seen = max(0, self._table.size.height - 1)  # under the titles
+    def _hidden_rows(self) -> list[str]:
+        """Return how many rows of the list are above and below those that are seen."""
+        seen = max(0, self._table.size.height - 1)  # without the titles
+        if not self._rows or not seen:
+            return []
         above = min(int(self._table.scroll_offset.y), len(self._rows))
         below = max(0, len(self._rows) - above - seen)
-        hidden = [f"↑ {above} more"] * bool(above) + [f"↓ {below} more"] * bool(below)
-        is_laid_out = self._all.display and seen
-        _say(self._head, "   ".join([self._heading, *(hidden if is_laid_out else [])]))
+        return [f"↑ {above} more"] * bool(above) + [f"↓ {below} more"] * bool(below)
 
     def _fill(self, rows: list[Row]) -> None:
         table, before = self._table, self._rows
@@ -309,40 +294,39 @@ class SkinTop(App[None]):
 
     def _update_picture(self) -> None:
         row, size = self._chosen, self._heat_map.size
-        driver = self._drivers.get(row.key.driver) if row else None
-        if row is None or driver is None or not size.area or not self._detail.is_attached:
+        driver = self._driver_of(row) if row else None
+        if row is None or driver is None or not size.area or not self._lines["detail"].is_attached:
             return
-        is_newer = self._drivers.poll(driver)
+        is_newer = self._overview.drivers.poll(driver)
         frame, picture = driver.frame, self._picture
         if frame is None or not (is_newer or self._must_draw):
             return
         self._must_draw = False
         picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
-        contacts = self._contacts.of(row.key.driver)
-        touched = places_of(contacts, frame.structure)
-        self._touched.display = contacts is not None
-        _say(self._touched, "\n".join(lines_of(touched, self._touched.size.height or _MOST_CONTACTS)))
-        if picture.arrangement is not None:
-            self._heat_map.show(picture.arrangement, picture.pixels, labels_of(touched, picture.arrangement))
+        self._show_contacts(driver)
         hidden = 0 if picture.arrangement is None else picture.arrangement.lines - size.height
-        _say(self._title, picture.title + f" (PgUp, PgDn: {plural(hidden, 'more line')})" * (hidden > 0))
-        _say(self._scale, picture.scale)
-        _say(self._marks, picture.marks)
+        self._say("title", picture.title + f" (PgUp, PgDn: {plural(hidden, 'more line')})" * (hidden > 0))
+        self._say("scale", picture.scale)
+        self._say("marks", picture.marks)
         if self._pointed is not None and self._pointed < frame.structure.n_sensors:
-            regions = picture.regions_of(row.key.driver, self._pointed)
-            _say(self._detail, describe_sensor(frame, self._pointed) + f"; in {', '.join(regions)}" * bool(regions))
+            regions = picture.regions_of(driver.name, self._pointed)
+            self._say("detail", describe_sensor(frame, self._pointed) + f"; in {', '.join(regions)}" * bool(regions))
         else:
-            _say(self._detail, picture.wipe_text(row.key.driver) or counters_text(row.counters))
+            self._say("detail", picture.wipe_text(driver.name) or counters_text(row.counters))
 
-
-def _say(line: Static, text: str | Text) -> None:
-    text = _printable(text)
-    if line.content != text:
-        line.update(text)
+    def _show_contacts(self, driver: LiveDriver) -> None:
+        """Show the picture with the contacts over it, and a line for each contact."""
+        contacts, panel = self._overview.contacts_on(driver), self._lines["contacts"]
+        panel.display = contacts is not None
+        places = contacts or []
+        self._say("contacts", "\n".join(lines_of(places, panel.size.height or _MOST_CONTACTS)))
+        arrangement = self._picture.arrangement
+        if arrangement is not None:
+            self._heat_map.show(arrangement, self._picture.pixels, labels_of(places, arrangement))
 
 
 def _printable(text: str | Text) -> str | Text:
-    """A text that came from others, as :func:`skinware.text.printable` has it; its colours stay."""
+    """Return a text of others as :func:`skinware.text.printable` does; its colours stay."""
     if isinstance(text, str):
         return printable(text, "\n")
     text.plain = printable(text.plain, "\n")

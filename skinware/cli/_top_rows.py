@@ -1,4 +1,4 @@
-"""The list of ``skin-top``: a row per driver, bus and patch, and the same as plain lines and JSON. Pure functions."""
+"""Write what skin-top lists: a row for each driver, bus and patch, and the same as plain lines and JSON."""
 
 from __future__ import annotations
 
@@ -7,42 +7,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skinware.driver_service import DriverReader
-from skinware.driver_snapshot import DriverSnapshot
-from skinware.state import (
-    DEAD,
-    LIVE,
-    SILENT,
-    STARTING,
-    WITHOUT_NEWS,
-    SkinHealth,
-    bus_reason_name,
-    bus_state_name,
-    patch_ages_ns,
-    patch_state_name,
-    rate_now_hz,
-    status_now,
-)
+from skinware.state import DEAD, LIVE, SILENT, STARTING, DriverReport
 from skinware.structure import Structure
-from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
+from skinware.text import NO_VALUE, age_text, count_text, counters_text, plural, rate_text, state_shown, words
 
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
 """Titles of the cells of a row."""
 
 _NOT_AMONG_OTHERS = ("lost", "orphans", "bytes_in", "frame_bytes", "idle_bytes")
-"""Counters that have columns of their own, and those that grow while all is well: the chosen row shows them."""
+"""Counters with a column of their own, and counters that grow while all is well: the chosen row shows them."""
 
 DRIVER, BUS, PATCH = "driver", "bus", "patch"
 
 
 class RowKey(NamedTuple):
-    """What a row is about; the same thing keeps its key when drivers come and go."""
+    """The driver, bus or patch of a row; it stays the same when drivers come and go."""
 
     driver: str
     kind: str
     """``driver``, ``bus`` or ``patch``."""
     number: int
-    """Which bus or patch of the driver; 0 for the driver itself."""
+    """Index of the bus or patch in its driver; 0 for the driver itself."""
 
 
 class Row(NamedTuple):
@@ -50,88 +35,55 @@ class Row(NamedTuple):
 
     key: RowKey
     cells: tuple[str, ...]
-    """One text per column."""
+    """One text for each column."""
     state: str
-    """The state's name, which gives the row its colour."""
+    """Name of the state, which gives the row its colour."""
     counters: dict[str, int]
     """Every counter that the driver publishes for this row, by name."""
 
 
-def rows_of(
-    reader: DriverReader,
-    frame: DriverSnapshot | None,
-    health: SkinHealth,
-    patch_rates_hz: Sequence[float | None] = (),
-) -> list[Row]:
-    """The driver, then each of its buses with its patches below it.
-
-    Args:
-        reader: of the driver.
-        frame: its newest.
-        health: the driver in a few figures.
-        patch_rates_hz: updates per second of each patch, where they are known.
-    """
-    name, n_fresh = health.name, health.statuses.get("fresh", 0)
-    shown = health.life if frame is None else state_shown(health.life, n_fresh, health.sensors)
-    first = Row(
-        RowKey(name, DRIVER, 0),
-        (
-            name,
-            shown,
-            rate_text(health.rate_hz),
-            age_text(health.age_ns),
-            f"{n_fresh}/{health.sensors}",
-            count_text(health.counters.get("lost")),
-            count_text(health.counters.get("orphans")),
-            "",
-        ),
-        shown,
-        health.counters,
+def rows_of(report: DriverReport) -> list[Row]:
+    """Return the row of a driver, then those of its buses, each followed by its patches."""
+    name, counters = report.name, report.counters
+    state = report.life if report.age_ns is None else state_shown(report.life, report.fresh, report.sensors)
+    cells = (
+        name,
+        state,
+        rate_text(report.rate_hz),
+        age_text(report.age_ns),
+        f"{report.fresh}/{report.sensors}",
+        count_text(counters.get("lost")),
+        count_text(counters.get("orphans")),
+        "",
     )
-    if frame is None:
-        return [first]
-    structure = frame.structure
-    rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
-    patches = _patch_rows(reader, frame, health.life, rates)
-    was = "was " if health.life in WITHOUT_NEWS else ""
-    rows = [first]
-    for bus, counters in enumerate(reader.bus_counters(frame)):
-        state = bus_state_name(int(frame.bus_state[bus]))
-        reason = bus_reason_name(int(frame.bus_reason[bus]))
-        lost, others = count_text(counters.get("lost")), counters_text(counters, besides=_NOT_AMONG_OTHERS)
-        told = f"{reason.replace('_', '-')}  {others}".rstrip() if reason else others
-        cells = (f"  {structure.buses[bus]}", was + state, "", "", "", lost, "", told)
-        rows.append(Row(RowKey(name, BUS, bus), cells, was + state, counters))
-        rows += [patches[patch] for patch in np.flatnonzero(structure.patch_bus == bus).tolist()]
-    return rows
-
-
-def _patch_rows(reader: DriverReader, frame: DriverSnapshot, life: str, rates_hz: Sequence[float | None]) -> list[Row]:
-    structure, status = frame.structure, status_now(life, frame)
-    was = "was " if life in WITHOUT_NEWS else ""
-    total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
-    fresh = np.bincount(structure.sensor_patch[status == 0], minlength=structure.n_patches).tolist()
-    ages_ns = patch_ages_ns(frame)
-    rows = []
-    for patch, counters in enumerate(reader.patch_counters(frame)):
-        state = state_shown(was + patch_state_name(int(frame.patch_state[patch])), fresh[patch], total[patch])
-        cells = (
-            f"    {structure.patch_name[patch].decode()}",
-            state,
-            "" if rates_hz[patch] is None else rate_text(rate_now_hz(life, rates_hz[patch])),
-            age_text(ages_ns[patch]),
-            f"{fresh[patch]}/{total[patch]}",
-            "",
-            count_text(counters.get("orphans")),
-            counters_text(counters, besides=_NOT_AMONG_OTHERS),
+    rows = [Row(RowKey(name, DRIVER, 0), cells, state, counters)]
+    for at, bus in enumerate(report.buses):
+        state, lost = report.last(bus.state), count_text(bus.counters.get("lost"))
+        reason = "" if bus.reason is None else bus.reason.replace("_", "-")
+        others = f"{reason}  {counters_text(bus.counters, besides=_NOT_AMONG_OTHERS)}".strip()
+        rows.append(
+            Row(RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", lost, "", others), state, bus.counters)
         )
-        rows.append(Row(RowKey(reader.name, PATCH, patch), cells, state, counters))
+        for number, patch in enumerate(report.patches):
+            if patch.bus != at:
+                continue
+            state = state_shown(report.last(patch.state), patch.fresh, patch.sensors)
+            cells = (
+                f"    {patch.name}",
+                state,
+                "" if patch.rate_hz is None else rate_text(patch.rate_hz),
+                age_text(patch.age_ns),
+                f"{patch.fresh}/{patch.sensors}",
+                "",
+                count_text(patch.counters.get("orphans")),
+                counters_text(patch.counters, besides=_NOT_AMONG_OTHERS),
+            )
+            rows.append(Row(RowKey(name, PATCH, number), cells, state, patch.counters))
     return rows
 
 
-def patches_of(key: RowKey, frame: DriverSnapshot) -> list[int]:
-    """The patches that a row stands for: its own, those of its bus, or all of its driver."""
-    structure = frame.structure
+def patches_of(key: RowKey, structure: Structure) -> list[int]:
+    """Return the patches of a row: its own, those of its bus, or all of its driver."""
     if key.kind == PATCH:
         return [key.number] if key.number < structure.n_patches else []
     if key.kind == BUS:
@@ -141,14 +93,14 @@ def patches_of(key: RowKey, frame: DriverSnapshot) -> list[int]:
 
 
 def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: str, sensors: int) -> str:
-    """What is drawn, in words.
+    """Return the title of a picture.
 
     Args:
-        key: the row.
+        key: of the row.
         structure: of its driver now, which may have changed since the list was made.
-        patches: what ``patches_of`` said.
+        patches: that :func:`patches_of` returned.
         type_name: the type of sensors that are drawn.
-        sensors: how many there are.
+        sensors: their number.
     """
     if not patches:
         return "no patches here"
@@ -162,44 +114,34 @@ def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: s
     return f"{name}: {plural(len(patches), 'patch', 'patches')}, {drawn}"
 
 
-def counters_text(counters: dict[str, int], *, besides: tuple[str, ...] = ()) -> str:
-    """The counters that are not 0, in the driver's own words; those in ``besides`` are left out."""
-    return "  ".join(
-        f"{name.replace('_', ' ')} {count_text(count)}"
-        for name, count in counters.items()
-        if count and name not in besides
-    )
-
-
-def plain_line(health: SkinHealth) -> str:
-    if health.life == STARTING:
-        return f"{health.name}  starting, no frame yet  sensors {health.sensors}"
+def plain_line(report: DriverReport) -> str:
+    if report.life == STARTING:
+        return f"{report.name}  starting, no frame yet  sensors {report.sensors}"
     life = {
-        LIVE: "? Hz" if health.rate_hz is None else rate_text(health.rate_hz),
+        LIVE: "? Hz" if report.rate_hz is None else rate_text(report.rate_hz),
         DEAD: "DEAD, this is its last frame",
         SILENT: "SILENT, its process publishes nothing",
-    }.get(health.life, health.life)
+    }.get(report.life, report.life)
     statuses = [
-        f"{name.replace('_', ' ')} {count}"
-        for name, count in health.statuses.items()
-        if count or name in ("fresh", "stale")
+        f"{words(name)} {count}" for name, count in report.statuses.items() if count or name in ("fresh", "stale")
     ]
-    patches = ", ".join(f"{count} {state}" for state, count in health.patches.items()) or NO_VALUE
-    losses = [f"{name} {health.counters[name]}" for name in ("lost", "orphans") if name in health.counters]
-    age = f"age {age_text(health.age_ns)}"
-    sensors = f"sensors {health.sensors} ({', '.join(statuses)})"
-    return "  ".join([health.name, life, age, sensors, f"patches {patches}", *losses])
+    patches = ", ".join(f"{count} {state}" for state, count in report.patch_states.items()) or NO_VALUE
+    counters = report.counters
+    losses = [f"{name} {counters[name]}" for name in ("lost", "orphans") if name in counters]
+    age = f"age {age_text(report.age_ns)}"
+    sensors = f"sensors {report.sensors} ({', '.join(statuses)})"
+    return "  ".join([report.name, life, age, sensors, f"patches {patches}", *losses])
 
 
-def as_data(health: SkinHealth, contacts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def as_data(report: DriverReport, contacts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {
-        "driver": health.name,
-        "state": health.life,
-        "rate_hz": None if health.rate_hz is None else round(health.rate_hz, 3),
-        "age_ms": None if health.age_ns is None else round(health.age_ns / 1e6, 3),
-        "sensors": health.sensors,
-        "status": health.statuses,
-        "patches": health.patches,
-        "counters": health.counters,
+        "driver": report.name,
+        "state": report.life,
+        "rate_hz": None if report.rate_hz is None else round(report.rate_hz, 3),
+        "age_ms": None if report.age_ns is None else round(report.age_ns / 1e6, 3),
+        "sensors": report.sensors,
+        "status": report.statuses,
+        "patches": report.patch_states,
+        "counters": report.counters,
         "contacts": list(contacts),
     }

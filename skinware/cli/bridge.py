@@ -1,4 +1,4 @@
-"""``skin-bridge``: a namespace of one machine on another, in a ROS 2 graph, and as ports of YARP."""
+"""``skin-bridge``: the services of one machine on another, in a ROS 2 graph, and as ports of YARP."""
 
 from __future__ import annotations
 
@@ -27,19 +27,25 @@ from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
-    from skinware.bridge import Server, Wish
+    from collections.abc import Callable
+
+    from skinware.bridge import Server
     from skinware.bridge_state import BridgeState
 
 _PORT = 7448
+_MODES = {
+    "push": "the link is fast: every frame is sent when it is published",
+    "pull": "frames wait on the link: only the newest are asked for, as many as it takes",
+}
 
 
 @click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
 @version_option
 def command() -> None:
-    """Have the drivers and services of one machine on another, as if they ran there; or in a ROS 2 graph, or in YARP.
+    """Publish the drivers and services of one machine on another, in a ROS 2 graph, or as ports of YARP.
 
-    On the robot: skin-bridge serve. Elsewhere: skin-bridge join. For many robots: skin-bridge list, skin-bridge route.
-    For ROS 2: skin-bridge ros2. For YARP: skin-bridge yarp.
+    On the robot: skin-bridge serve. On other machines: skin-bridge join. For many robots: skin-bridge list and
+    skin-bridge route. For other middlewares: skin-bridge ros2 and skin-bridge yarp.
     """
 
 
@@ -52,19 +58,19 @@ for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-bridge serve --robot icub                                     for programs of this machine",
-        "skin-bridge serve --robot icub --listen tcp/0.0.0.0:7448 --insecure  for all in a network that is trusted",
+        "skin-bridge serve --robot icub --listen tcp/0.0.0.0:7448 --insecure  for all in a trusted network",
         "skin-bridge serve --robot icub --listen tls/0.0.0.0:7448 --tls certs  for all with a certificate",
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--robot", required=True, metavar="R", help="What others call this robot.")
+@click.option("--robot", required=True, metavar="R", help="Name of this robot.")
 @click.option(
     "--listen",
     multiple=True,
     metavar="ENDPOINT",
-    help=f"Where others connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
+    help=f"Where peers connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
 )
-@click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router to connect to, instead of being called.")
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Connect to a router instead.")
 @tls_option
 @caller_option
 @insecure_option
@@ -81,7 +87,7 @@ def serve(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Let other machines join drivers and services NAME..., or all there are and come.
+    """Let other machines join drivers and services NAME..., or all, also later ones.
 
     A receiver that is slow, stopped or gone costs neither the drivers nor other receivers anything.
 
@@ -93,7 +99,7 @@ def serve(
 
     for name in names:
         check_name(name, "service")
-    Keys(robot)  # what is no name is refused before anything is opened
+    Keys(robot)  # refuses a wrong name before anything is opened
     place = Namespace(namespace)
     places = endpoints(
         listen=listen or (() if connect else (DEFAULT_LISTEN,)),
@@ -106,36 +112,33 @@ def serve(
         server = Server(robot, link, place, names or None, callers=callers)
         with contextlib.closing(server), signals_end(server.stop):
             if as_json:
-                told = {"robot": robot, "namespace": place.name}
-                print_json({"event": "ready", **told, "listen": list(places.listen), "connect": list(places.connect)})
+                where = {"listen": list(places.listen), "connect": list(places.connect)}
+                print_json({"event": "ready", "robot": robot, "namespace": place.name, **where})
             else:
                 echo(f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
-            status = _Serving(server, as_json)
-            server.run(status.tell)
+            server.run(_serving_status(server, as_json))
 
 
-class _Serving:
-    """Tells each second what was sent."""
+def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
+    before: dict[str, int] = {}
+    shown: dict[str, str] = {}
 
-    def __init__(self, server: Server, as_json: bool) -> None:
-        self._server, self._as_json = server, as_json
-        self._before: dict[str, int] = {}
-        self._known: dict[str, str] = {}
-
-    def tell(self) -> None:
-        frames = self._server.frames()
-        if self._as_json:
+    def report() -> None:
+        frames = server.frames()
+        if as_json:
             services = {
-                name: {"state": state, "rate_hz": count - self._before.get(name, 0), "pulled_by": pullers}
+                name: {"state": state, "rate_hz": count - before.get(name, 0), "pulled_by": pullers}
                 for name, (state, count, pullers) in frames.items()
             }
-            guard = self._server.guard
-            counts = {"lost": self._server.lost, "refused": guard.count, "last_refused": guard.last or None}
+            guard = server.guard
+            counts = {"lost": server.lost, "refused": guard.count, "last_refused": guard.last or None}
             print_json({"event": "status", **counts, "services": services})
         for name, (state, count, _) in frames.items():
-            if not self._as_json and self._known.get(name) != state:
+            if not as_json and shown.get(name) != state:
                 echo(f"{name}: {state}")
-            self._known[name], self._before[name] = state, count
+            shown[name], before[name] = state, count
+
+    return report
 
 
 @command.command(
@@ -148,7 +151,13 @@ class _Serving:
     ),
 )
 @click.argument("robot", metavar="R")
-@click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Where it is: tcp/HOST:PORT.")
+@click.option(
+    "--connect",
+    multiple=True,
+    required=True,
+    metavar="ENDPOINT",
+    help="Robot or router: tcp/HOST:PORT.",
+)
 @click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
 @tls_option
 @click.option(
@@ -156,12 +165,10 @@ class _Serving:
     type=click.Choice(["auto", "push", "pull"]),
     default="auto",
     show_default=True,
-    help="Every frame as it comes, or only the newest as fast as the link takes them.",
+    help="Get every frame (push), or only the newest, as fast as the link takes them (pull).",
 )
-@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated.")
-@click.option(
-    "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
-)
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; repeatable.")
+@click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; repeatable.")
 @regions_option
 @json_option
 def join(
@@ -175,24 +182,24 @@ def join(
     region_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Have the services of robot R here: same names, structures, states and operations, for all programs and readers.
+    """Publish the services of robot R here, with the same names, structures, states and operations.
 
-    Times are moved to the clock of this machine. What the link cannot take is left out, and counted as lost. With
-    --patch or --region only those sensors of its drivers travel, and no other services.
+    Times are moved to the clock of this machine. Frames that the link cannot take are counted as lost. With --patch or
+    --region only those sensors of its drivers travel, and no other services.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.bridge import Joiner, Link, endpoints
+    from skinware.bridge import Joiner, Link, Wish, endpoints
     from skinware.bridge.endpoints import why_unreachable
     from skinware.bridge.messages import Keys
     from skinware.memory.namespace import Namespace
 
-    wish = _wish(patches, in_regions, region_files)
-    Keys(robot)  # likewise
+    regions = tuple(regions_asked_for(in_regions, region_files))
+    wish = Wish(patches, in_regions, regions) if patches or in_regions else None  # None: all sensors and services
+    Keys(robot)  # refuses a wrong name before anything is opened
     place = Namespace(into or robot)
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:
-        status = _Joined(as_json)
         joiner = Joiner(
             robot,
             link,
@@ -200,57 +207,41 @@ def join(
             mode=None if mode == "auto" else mode,
             wish=wish,
             why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
-            tell=status.happened,
+            on_event=print_json if as_json else _show_event,
         )
         with contextlib.closing(joiner), signals_end(joiner.stop):
             if as_json:
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
             else:
                 echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
-            joiner.run(status.tell)
+            joiner.run(_joined_status(as_json))
 
 
-def _wish(patches: tuple[str, ...], in_regions: tuple[str, ...], region_files: tuple[Path, ...]) -> Wish | None:
-    """Which sensors are wanted; None: all, and all services."""
-    from skinware.bridge import Wish
+def _show_event(event: dict[str, Any]) -> None:
+    if event["event"] == "trouble":
+        warn(event["why"])
+    elif event["event"] == "mode":
+        echo(f"{event['service']}: {_MODES[event['mode']]}")
+    else:
+        echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
-    regions = regions_asked_for(in_regions, region_files)
-    return Wish(patches, in_regions, tuple(regions)) if patches or in_regions else None
 
+def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
+    from skinware.views.bridges import as_data
 
-class _Joined:
-    """Tells each second what came, and what happens at once."""
+    shown: dict[str, tuple[str, str]] = {}
 
-    def __init__(self, as_json: bool) -> None:
-        self._as_json = as_json
-        self._known: dict[str, tuple[str, str]] = {}
-
-    def happened(self, event: dict[str, Any]) -> None:
-        if self._as_json:
-            print_json(event)
-        elif event["event"] == "trouble":
-            warn(event["why"])
-        elif event["event"] == "mode":
-            echo(f"{event['service']}: {_MODES[event['mode']]}")
-        else:
-            echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
-
-    def tell(self, bridge: BridgeState) -> None:
-        from skinware.cli._bridges import as_data
-
-        for name, service in bridge.services.items():
-            shown = service.state, service.mode
-            if not self._as_json and self._known.get(name) != shown:
-                echo(f"{name}: {service.state}")
-            self._known[name] = shown
-        if self._as_json:
+    def report(bridge: BridgeState) -> None:
+        if as_json:
             print_json({"event": "status"} | as_data(bridge))
+            return
+        for name, service in bridge.services.items():
+            state = service.state, service.mode
+            if shown.get(name) != state:
+                echo(f"{name}: {service.state}")
+            shown[name] = state
 
-
-_MODES = {
-    "push": "the link is fast: every frame comes as it is published",
-    "pull": "frames wait on the link: the newest are asked for, as many as it takes",
-}
+    return report
 
 
 def main() -> None:

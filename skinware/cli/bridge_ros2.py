@@ -1,4 +1,4 @@
-"""``skin-bridge ros2``: drivers in a ROS 2 graph."""
+"""``skin-bridge ros2``: publish drivers in a ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     type=click.Choice(["dds", "zenoh"]),
     default="dds",
     show_default=True,
-    help="What carries the graph's messages: zenoh for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp.",
+    help="Middleware of the graph: zenoh for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp.",
 )
 @click.option(
     "--connect",
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     "interfaces",
     multiple=True,
     metavar="NAME",
-    help="A network to use, over DDS: eth0, or an address of this machine; may be repeated.  [default: $CYCLONEDDS_URI,"
-    " else this machine alone]",
+    help="A network to use, with --rmw dds: eth0, or an address of this machine; repeatable.  [default:"
+    " $CYCLONEDDS_URI, else this machine alone]",
 )
 @click.option(
     "--domain",
@@ -63,24 +63,26 @@ if TYPE_CHECKING:
     metavar="N",
     envvar="ROS_DOMAIN_ID",
     default=0,
-    help="Which graph.  [default: $ROS_DOMAIN_ID, else 0]",
+    help="Id of the graph.  [default: $ROS_DOMAIN_ID, else 0]",
 )
-@click.option("--ros-namespace", metavar="NAME", default="/", show_default=True, help="Before all topics: /robot_1.")
+@click.option(
+    "--ros-namespace", metavar="NAME", default="/", show_default=True, help="Namespace of the topics: /robot_1."
+)
 @click.option(
     "--distro",
     type=click.Choice(["humble", "jazzy"]),
     default=lambda: "humble" if os.environ.get("ROS_DISTRO") == "humble" else "jazzy",
-    help="Who is to understand it: Humble, or Jazzy and all from Iron on.  [default: as $ROS_DISTRO, else jazzy]",
+    help="Release of the other nodes; jazzy: Iron and later.  [default: $ROS_DISTRO, else jazzy]",
 )
 @click.option(
-    "--rate", type=float, default=20.0, show_default=True, metavar="HZ", help="Of point clouds and images, at most."
+    "--rate", type=float, default=20.0, show_default=True, metavar="HZ", help="Highest rate of point clouds and images."
 )
 @click.option(
     "--root-frame",
     default="",
     metavar="NAME",
-    help="Publish /tf_static: all coordinate frames of the drivers at the origin of NAME, unturned; where no other node"
-    " publishes where they are.",
+    help="Publish /tf_static, if no other node does: all coordinate frames of the drivers at the origin of NAME,"
+    " without rotation.",
 )
 @click.option("--tare", "with_tare", is_flag=True, help="Offer a service NAME/tare to everyone in the graph.")
 @namespace_option
@@ -99,13 +101,14 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Have drivers NAME..., or all there are and come, in a ROS 2 graph. ROS need not be installed.
+    """Publish drivers NAME..., or all, also later ones, in a ROS 2 graph. ROS need not be installed.
 
-    The node publishes each driver's frames, point clouds, images and diagnostics. The graph can only read,
-    unless you give --tare. Subscribers that are slow, stopped or gone cost the drivers nothing.
+    The node publishes frames, point clouds, images and diagnostics of each driver. The graph can only read, unless you
+    give --tare. Subscribers that are slow, stopped or gone cost the drivers nothing.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
+    from skinware.conversion.showing import in_topic
     from skinware.memory.namespace import Namespace, check_name
     from skinware.ros2.serving import Ros2Server
     from skinware.ros2.transport import Distro, Identity
@@ -117,8 +120,8 @@ def command(
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
-    identity = Identity(f"skinware_{_plain(place.name)}", ros_namespace, domain, Distro(distro))
-    with contextlib.closing(_node(rmw, identity, connect, interfaces, _Router(as_json).tell)) as node:
+    identity = Identity(f"skinware_{in_topic(place.name)}", ros_namespace, domain, Distro(distro))
+    with contextlib.closing(_node(rmw, identity, connect, interfaces, _router_report(as_json))) as node:
         server = Ros2Server(
             node,
             place,
@@ -132,12 +135,10 @@ def command(
         with contextlib.closing(server), signals_end(server.stop):
             where = f"{identity.prefix}/{identity.name}"
             if as_json:
-                told = {"rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
-                print_json({"event": "ready", **told})
+                print_json({"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name})
             else:
                 echo(f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
-            status = _Status(server, as_json)
-            server.run(status.tell)
+            server.run(_status(server, as_json))
 
 
 def _node(
@@ -145,50 +146,38 @@ def _node(
     identity: Identity,
     connect: tuple[str, ...],
     interfaces: tuple[str, ...],
-    tell: Callable[[bool, str], None],
+    router_changed: Callable[[bool, str], None],
 ) -> Node:
     if rmw == "zenoh":
         from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
 
-        return ZenohNode(identity, connect=connect or (ROUTER,), tell=tell)
+        return ZenohNode(identity, connect=connect or (ROUTER,), router_changed=router_changed)
     from skinware.ros2.dds import DdsNode
 
     return DdsNode(identity, interfaces)
 
 
-def _plain(name: str) -> str:
-    from skinware.conversion.showing import in_topic
-
-    return in_topic(name)
-
-
-class _Router:
-    """Tells whether there is one."""
-
-    def __init__(self, as_json: bool) -> None:
-        self._as_json = as_json
-
-    def tell(self, is_there: bool, line: str) -> None:
-        if self._as_json:
+def _router_report(as_json: bool) -> Callable[[bool, str], None]:
+    def report(is_there: bool, line: str) -> None:
+        if as_json:
             print_json({"event": "router", "is_there": is_there, "why": line})
-        elif is_there:
-            echo(line)
         else:
-            warn(line)
+            (echo if is_there else warn)(line)
+
+    return report
 
 
-class _Status:
-    """Tells each second what was told."""
+def _status(server: Ros2Server, as_json: bool) -> Callable[[], None]:
+    shown: dict[str, str] = {}
 
-    def __init__(self, server: Ros2Server, as_json: bool) -> None:
-        self._server, self._as_json = server, as_json
-        self._known: dict[str, str] = {}
+    def report() -> None:
+        drivers = server.drivers()
+        if as_json:
+            print_json({"event": "status", "drivers": {name: asdict(driver) for name, driver in drivers.items()}})
+            return
+        for name, driver in drivers.items():
+            if shown.get(name) != driver.state:
+                echo(f"{name}: {driver.state}")
+            shown[name] = driver.state
 
-    def tell(self) -> None:
-        drivers = self._server.drivers()
-        if self._as_json:
-            print_json({"event": "status", "drivers": {name: asdict(told) for name, told in drivers.items()}})
-        for name, told in drivers.items():
-            if not self._as_json and self._known.get(name) != told.state:
-                echo(f"{name}: {told.state}")
-            self._known[name] = told.state
+    return report

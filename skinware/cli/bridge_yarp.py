@@ -1,4 +1,4 @@
-"""``skin-bridge yarp``: drivers as ports of YARP."""
+"""``skin-bridge yarp``: publish drivers as ports of YARP."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skinware.yarp.names import NameServer
-    from skinware.yarp.outlet import Outlet
+    from skinware.yarp.serving import YarpServer
 
 
 @click.command(
@@ -34,13 +36,13 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="What names of ports begin with.")
-@click.option("--type", "type_name", default="pressure", show_default=True, metavar="TYPE", help="Type of sensors.")
+@click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="Prefix of all port names.")
+@click.option("--type", "type_name", default="pressure", show_default=True, metavar="TYPE", help="Sensor type.")
 @click.option(
     "--full-scale",
     type=click.FloatRange(min=0, min_open=True),
     metavar="X",
-    help="Physical value that becomes 255.  [default: the greatest of the type]",
+    help="Physical value that becomes 255.  [default: the maximum of the type]",
 )
 @click.option(
     "--regions",
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     metavar="FILE",
     multiple=True,
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    help="A port for each region of FILE, as skin-import writes them of a robot's ports; repeat it for several.",
+    help="Make a port of each region of FILE; skin-import writes the regions of a robot's ports; repeatable.",
 )
 @click.option(
     "--server", metavar="HOST:PORT", help="YARP's name server.  [default: as yarp.conf says, else 127.0.0.1:10000]"
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
     "--yarp",
     "yarp",
     type=click.Choice(["3", "4"]),
-    help="Major version of the YARP whose programs read in binary; without it, only readers in text are served.",
+    help="Major version of the YARP of binary readers; without it, only text readers are served.",
 )
 @click.option(
     "--listen", "host", default="127.0.0.1", show_default=True, metavar="HOST", help="Address at which ports listen."
@@ -76,32 +78,31 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Serve drivers NAME..., or all there are and come, as ports of YARP: one vector of doubles, 0 to 255, a frame.
+    """Publish drivers NAME..., or all, also later ones, as ports of YARP: for each frame a vector of doubles, 0 to 255.
 
     A reader that is slow, stopped or gone misses vectors, and costs neither drivers nor other readers anything. YARP
-    asks nobody who he is: whoever reaches a port can read it, and can have it call other ports.
+    has no authentication: all programs that reach a port can read it, and can make it call other ports.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.memory.namespace import Namespace, check_name
     from skinware.tactile.regions import read_regions
-    from skinware.yarp.outlet import Outlet, Wanted
+    from skinware.yarp.serving import Settings, YarpServer
 
     for name in names:
         check_name(name, "service")
     regions = tuple(read_regions(*region_files)) if region_files else ()
-    wanted = Wanted(names, prefix.rstrip("/"), type_name, full_scale, regions, host, int(yarp) if yarp else None)
-    place, told = Namespace(namespace), _name_server(server)
-    status = _Status(as_json)
-    outlet = Outlet(place, wanted, told, status.happened)
-    with contextlib.closing(outlet), signals_end(outlet.stop):
+    settings = Settings(names, prefix.rstrip("/"), type_name, full_scale, regions, host, int(yarp) if yarp else None)
+    place, known_by = Namespace(namespace), _name_server(server)
+    yarp_server = YarpServer(place, settings, known_by, print_json if as_json else _show_event)
+    with contextlib.closing(yarp_server), signals_end(yarp_server.stop):
         if as_json:
-            print_json(
-                {"event": "ready", "namespace": place.name, "server": f"{told.host}:{told.port}", "listen": host}
-            )
+            address = f"{known_by.host}:{known_by.port}"
+            print_json({"event": "ready", "namespace": place.name, "server": address, "listen": host})
+            yarp_server.run(_status(yarp_server))
         else:
-            echo(f"namespace {place.name!r} as ports {wanted.prefix}/..., {told} (Ctrl-C ends)")
-        outlet.run(lambda: status.tell(outlet))
+            echo(f"namespace {place.name!r} as ports {settings.prefix}/..., {known_by} (Ctrl-C ends)")
+            yarp_server.run()
 
 
 def _name_server(text: str | None) -> NameServer:
@@ -115,31 +116,22 @@ def _name_server(text: str | None) -> NameServer:
     return NameServer(host, int(port))
 
 
-class _Status:
-    """Tells each second who reads what, and what happens at once."""
+def _show_event(event: dict[str, Any]) -> None:
+    if event["event"] == "trouble":
+        warn(f"{event['about']}: {event['why']}")
+    else:
+        echo(f"{event['port']}: driver {event['driver']}")
 
-    def __init__(self, as_json: bool) -> None:
-        self._as_json = as_json
-        self._before: dict[str, int] = {}
 
-    def happened(self, event: dict[str, Any]) -> None:
-        if self._as_json:
-            print_json(event)
-        elif event["event"] == "trouble":
-            warn(f"{event['about']}: {event['why']}")
-        else:
-            echo(f"{event['port']}: driver {event['driver']}")
+def _status(server: YarpServer) -> Callable[[], None]:
+    before: dict[str, int] = {}
 
-    def tell(self, outlet: Outlet) -> None:
-        ports = outlet.ports()
-        if self._as_json:
-            rates = {name: port["messages"] - self._before.get(name, 0) for name, port in ports.items()}
-            shown = {
-                name: {
-                    "rate_hz": rates[name],
-                    **{key: port[key] for key in ("driver", "registered", "values", "readers")},
-                }
-                for name, port in ports.items()
-            }
-            print_json({"event": "status", "lost": outlet.lost, "ports": shown})
-        self._before = {name: port["messages"] for name, port in ports.items()}
+    def report() -> None:
+        ports = {}
+        for name, port in server.ports().items():
+            count = port.pop("messages")
+            ports[name] = {"rate_hz": count - before.get(name, 0), **port}
+            before[name] = count
+        print_json({"event": "status", "lost": server.lost, "ports": ports})
+
+    return report

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._bridges import as_lines
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
@@ -21,6 +20,7 @@ from skinware.cli._command import (
 )
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.text import NO_VALUE, NOT_FRESH, age_text, count_text, plural, rate_text, state_shown, table, wrapped
+from skinware.views.bridges import as_lines
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace

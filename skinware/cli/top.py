@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from importlib.util import find_spec
@@ -24,10 +25,10 @@ from skinware.cli._regions import regions_of, regions_option
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from skinware.memory.namespace import Namespace
-    from skinware.tactile.contacts_service import ContactsSample
-    from skinware.views.beside import LiveBridges, LiveSources
-    from skinware.views.live import LiveDrivers
+    from skinware.views.live import LiveDriver, Overview
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
@@ -96,29 +97,23 @@ def command(
 
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
-    from skinware.views.beside import LiveBridges, live_contacts
-    from skinware.views.live import LiveDrivers
+    from skinware.views.live import Overview
 
-    start_s = time.monotonic()
-    end_s = None if duration_s is None else start_s + duration_s
-    drivers, contacts, bridges = LiveDrivers(namespace), live_contacts(namespace), LiveBridges(namespace)
+    overview = Overview(namespace)
+    lines_at_s = time.monotonic()
+    end_s = math.inf if duration_s is None else lines_at_s + duration_s
     try:
-        lines_at_s = start_s
-        while end_s is None or time.monotonic() < end_s:
-            for driver in drivers.look():
-                drivers.poll(driver)
+        while True:
+            drivers = overview.look()
             if time.monotonic() >= lines_at_s:
-                _print_lines(drivers, contacts, as_json)
-                if not as_json:
-                    bridges.look(drivers.others)
-                    _print_bridges(bridges)
+                _print_lines(overview, drivers, as_json)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
-            next_s = time.monotonic() + _TAKE_PERIOD_S
-            time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
+            if time.monotonic() >= end_s:
+                return
+            next_s = min(time.monotonic() + _TAKE_PERIOD_S, lines_at_s, end_s)
+            time.sleep(max(0.0, next_s - time.monotonic()))
     finally:
-        bridges.close()
-        contacts.close()
-        drivers.close()
+        overview.close()
 
 
 def _on_terminal() -> bool:
@@ -127,29 +122,24 @@ def _on_terminal() -> bool:
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
-def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsSample], as_json: bool) -> None:
+def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
-    from skinware.views.beside import places_of
+    from skinware.views import bridges
 
-    found = drivers.look()
-    contacts.look(drivers.others)
-    for driver in found:
-        places = places_of(contacts.of(driver.name), driver.reader.structure)
+    for driver in drivers:
+        places = overview.contacts_on(driver) or []
         if as_json:
-            print_json(as_data(driver.health(), [_contacts.as_data(place) for place in places]))
+            print_json(as_data(driver.report(), [_contacts.as_data(place) for place in places]))
         else:
-            for line in (plain_line(driver.health()), *map(_contacts.plain_text, places)):
+            for line in (plain_line(driver.report()), *map(_contacts.plain_text, places)):
                 echo(line)
-    if not found and not as_json:
-        echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
-
-
-def _print_bridges(bridges: LiveBridges) -> None:
-    from skinware.cli._bridges import as_data, summary
-
-    for bridge in bridges.states():
-        echo(summary(bridge.robot, as_data(bridge)))
+    if as_json:
+        return
+    if not drivers:
+        echo(f"no driver runs in namespace {overview.drivers.namespace.name!r}; start one: skin-driver --bus virtual")
+    for bridge in overview.bridges.states():
+        echo(bridges.summary(bridge.robot, bridges.as_data(bridge)))
 
 
 def main() -> None:

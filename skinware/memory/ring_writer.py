@@ -15,9 +15,9 @@ from skinware import native
 from skinware.errors import Closed, ServiceError
 from skinware.memory import file_layout
 from skinware.memory.ring import LATEST, MISSED_PERIODS, STATE, slots_of
-from skinware.memory.ring_reader import RingWords, ring_words
 from skinware.memory.segments import Segment
 from skinware.memory.statistics import bucket_of
+from skinware.memory.take import RingWords
 
 _begin = native.core().quick.skinware_native_begin
 _commit = native.core().quick.skinware_native_commit
@@ -29,7 +29,7 @@ _LATENESS = (file_layout.STATISTICS_OFFSET + file_layout.STATISTICS.fields["late
 _MOST_NS, _ALL_FLAGS = (1 << 63) - 1, (1 << 64) - 1
 
 
-class _WriterState(RingWords):
+class WriterState(RingWords):
     """``skinware_ring_writer`` of ring.h."""
 
     _fields_: ClassVar = [
@@ -57,7 +57,8 @@ class RingWriter:
             for slot in slots_of(segment)
         ]
         self._contents = [slot[file_layout.SLOT.itemsize :] for slot in slots_of(segment)]
-        self._state = _WriterState(*ring_words(segment), 0, time.thread_time_ns())
+        self._state = WriterState.of(segment)
+        self._state.cpu_ns = time.thread_time_ns()
         self._state_at = ctypes.byref(self._state)
         self.native_address: int = ctypes.addressof(self._state)
         for page in range(0, layout.file_size, mmap.PAGESIZE):

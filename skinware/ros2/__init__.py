@@ -1,1 +1,1 @@
-"""Drivers in a ROS 2 graph, without ROS: what is told there, and the carriers that tell it."""
+"""Publish drivers in a ROS 2 graph, over DDS or zenoh, without ROS."""

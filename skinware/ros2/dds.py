@@ -1,7 +1,7 @@
-"""A node of a ROS 2 graph over DDS, as ROS has them with rmw_cyclonedds and rmw_fastrtps. All of Cyclone DDS is here.
+"""A node of a ROS 2 graph over DDS, for peers with rmw_cyclonedds or rmw_fastrtps. Only this module knows Cyclone DDS.
 
-Messages that are ready are given to Cyclone DDS as they are: its own way, from objects of Python, takes a hundred times
-as long for a point cloud. Nothing is called back in threads of DDS: they would wait for the interpreter.
+Cyclone DDS gets messages as bytes: its own way, from Python objects, takes a hundred times as long for a point cloud.
+No thread of DDS calls back: it would wait for the interpreter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from skinware.errors import BridgeError, ConfigurationError, MissingExtra
-from skinware.ros2 import discovery, types
+from skinware.ros2 import types
+from skinware.ros2.messages import DISCOVERY_TOPIC, PARTICIPANT_DATA, endpoint_data, entities
 from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
 
 if find_spec("cyclonedds") is None:
@@ -54,7 +55,7 @@ _REQUESTS_AT_ONCE = 16
 _ENCAPSULATION = 4
 _REQUEST_ID = {"guid": idl.uint64, "sequence": idl.int64}
 _REQUEST_ID_SIZE = 16
-"""Before what is asked and answered, as rmw_cyclonedds has it."""
+"""Size of the header that rmw_cyclonedds writes before requests and responses."""
 _FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
 _ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
 _PLAIN = {
@@ -79,12 +80,12 @@ _NETWORK = "<CycloneDDS><Domain id='any'><General><Interfaces>{}</Interfaces></G
 
 
 class DdsNode:
-    """See :class:`skinware.ros2.transport.Node`.
+    """A :class:`skinware.ros2.transport.Node`.
 
     Args:
         identity: of the node.
-        interfaces: networks to use, by the name or the address of an interface of this machine. None given: those that
-            ``CYCLONEDDS_URI`` configures, and where that is not set, loopback alone.
+        interfaces: networks to use, by the name or address of an interface of this machine; empty: as
+            ``CYCLONEDDS_URI`` says, or loopback alone if that is not set.
 
     Raises:
         ConfigurationError: ``interfaces`` are given and ``CYCLONEDDS_URI`` is set.
@@ -96,7 +97,7 @@ class DdsNode:
         configuration = _configuration(interfaces)
         try:
             self._domain = Domain(identity.domain, configuration)
-            self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(discovery.PARTICIPANT_DATA)))
+            self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(PARTICIPANT_DATA)))
         except DDSException as error:
             raise BridgeError(
                 f"domain {identity.domain} of DDS cannot be joined ({_reason(error)}); is a network interface up,"
@@ -106,37 +107,30 @@ class DdsNode:
         self._writers: list[_Writer] = []
         self._services: list[_Service] = []
         self._worker: _Worker | None = None
-        self._info = self._writer(discovery.TOPIC, types.PARTICIPANT, Qos(depth=1, latched=True), is_told=False)
-        self._tell()
+        self._info = self._writer(DISCOVERY_TOPIC, types.PARTICIPANT, Qos(depth=1, latched=True), is_listed=False)
+        self._publish_endpoints()
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
         writer = self._writer(f"rt{topic}", message_type, qos)
-        self._tell()
+        self._publish_endpoints()
         return writer
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
         with self._lock:
-            reader = self._made(
-                lambda: DataReader(
-                    self._participant,
-                    Topic(self._participant, f"rq{name}Request", _type(service_type.request, with_id=True)),
-                    self._qos(service_type.request, _SERVICE_QOS),
-                ),
-                name,
-            )
+            reader = self._declare(DataReader, f"rq{name}Request", service_type.request, _SERVICE_QOS, with_id=True)
             writer = self._writer(f"rr{name}Reply", service_type.response, _SERVICE_QOS, with_id=True)
             if self._worker is None:
                 self._worker = _Worker(self._participant)
             service = _Service(reader, writer, handler, self._worker)
             self._services.append(service)
-            self._tell()
+            self._publish_endpoints()
 
         def end() -> None:
             with self._lock:
                 if service in self._services:
                     self._services.remove(service)
                     service.close()
-                    self._tell()
+                    self._publish_endpoints()
 
         return end
 
@@ -159,55 +153,56 @@ class DdsNode:
         qos: Qos,
         *,
         with_id: bool = False,
-        is_told: bool = True,
+        is_listed: bool = True,
     ) -> _Writer:
-        def make() -> DataWriter[Any]:
-            made = Topic(self._participant, topic, _type(message_type, with_id))
-            return DataWriter(self._participant, made, self._qos(message_type, qos))
-
         with self._lock:
-            writer = _Writer(self._made(make, topic), self._closed if is_told else lambda _: None, qos.latched)
-            if is_told:
+            declared = self._declare(DataWriter, topic, message_type, qos, with_id=with_id)
+            writer = _Writer(declared, self._closed if is_listed else lambda _: None, qos.latched)
+            if is_listed:
                 self._writers.append(writer)
             return writer
 
-    def _made(self, make: Callable[[], Any], what: str) -> Any:
-        try:
-            return make()
-        except DDSException as error:
-            raise BridgeError(f"{what}: {_reason(error)}") from None
-
-    def _qos(self, message_type: MessageType, qos: Qos) -> DdsQos:
-        return DdsQos(
+    def _declare(
+        self,
+        kind: type[DataReader[Any] | DataWriter[Any]],
+        topic: str,
+        message_type: MessageType,
+        qos: Qos,
+        *,
+        with_id: bool,
+    ) -> Any:
+        policies = DdsQos(
             Policy.Reliability.Reliable(max_blocking_time=0) if qos.reliable else Policy.Reliability.BestEffort,
             Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(qos.depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(discovery.endpoint_data(message_type.hash, self._identity.distro)),
+            Policy.Userdata(endpoint_data(message_type.hash, self._identity.distro)),
         )
+        try:
+            return kind(self._participant, Topic(self._participant, topic, _type(message_type, with_id)), policies)
+        except DDSException as error:
+            raise BridgeError(f"{topic}: {_reason(error)}") from None
 
     def _closed(self, writer: _Writer) -> None:
         with self._lock:
             if writer in self._writers:
                 self._writers.remove(writer)
-                self._tell()
+                self._publish_endpoints()
 
-    def _tell(self) -> None:
+    def _publish_endpoints(self) -> None:
         with self._lock:
             if self._participant is not None:
                 readers = [service.id for service in self._services]
                 writers = [writer.id for writer in self._writers]
-                self._info.publish(discovery.entities(self._identity, self._participant.guid.bytes, readers, writers))
+                self._info.publish(entities(self._identity, self._participant.guid.bytes, readers, writers))
 
 
 class _Writer:
-    """See :class:`skinware.ros2.transport.Publisher`."""
-
     def __init__(self, writer: DataWriter[Any], closed: Callable[[_Writer], None], is_latched: bool) -> None:
         self._writer: DataWriter[Any] | None = writer
-        self._ref: int = writer._ref  # noqa: SLF001, what is written to without objects of Python
+        self._ref: int = writer._ref  # noqa: SLF001, for writing bytes
         self._closed, self._is_latched = closed, is_latched
-        self._words = bytearray()
+        self._buffer = bytearray()
         self.id: bytes = writer.guid.bytes
 
     @property
@@ -229,14 +224,14 @@ class _Writer:
         return True
 
     def _padded(self, message: Cdr) -> bytes | bytearray:
-        """In whole words; in memory that is warm: a fresh copy of a large message takes ten times as long."""
+        """Return it in whole words, in memory that is kept: a fresh copy of a large message takes ten times as long."""
         size = len(message) + -len(message) % 4
         if size == len(message):
             return message
-        if len(self._words) != size:
-            self._words = bytearray(size)
-        self._words[: len(message)] = message
-        return self._words
+        if len(self._buffer) != size:
+            self._buffer = bytearray(size)
+        self._buffer[: len(message)] = message
+        return self._buffer
 
     def close(self) -> None:
         if self._writer is not None:
@@ -245,8 +240,6 @@ class _Writer:
 
 
 class _Service:
-    """Answers what comes in."""
-
     def __init__(self, reader: DataReader[Any], writer: _Writer, handler: Handler, worker: _Worker) -> None:
         self._reader: DataReader[Any] | None = reader
         self._writer, self._handler, self._worker = writer, handler, worker
@@ -262,7 +255,7 @@ class _Service:
         except DDSException:
             return
         for request in requests:
-            if isinstance(request, IdlStruct):  # otherwise who asked is gone
+            if isinstance(request, IdlStruct):  # otherwise the peer is gone
                 asked = request.serialize()
                 after_id = _ENCAPSULATION + _REQUEST_ID_SIZE
                 answer = self._handler(asked[:_ENCAPSULATION] + asked[after_id:])
@@ -275,8 +268,6 @@ class _Service:
 
 
 class _Worker:
-    """A thread in which requests are answered."""
-
     def __init__(self, participant: DomainParticipant) -> None:
         self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
         self._waitset.attach(self._woken)
@@ -313,10 +304,10 @@ class _Worker:
 
 @cache
 def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
-    """A type as Cyclone DDS wants it, which looks whether what comes is one."""
+    """Return a type for Cyclone DDS, which checks incoming messages by it."""
     fields: dict[str, Any] = dict(_REQUEST_ID) if with_id else {}
     for field in _FIELD.finditer(types.definition(message_type)):
-        kind: Any = _PLAIN.get(field["type"]) or _type(_part(field["type"]))
+        kind: Any = _PLAIN.get(field["type"]) or _type(MessageType(field["type"].replace("/", "/msg/"), ""))
         if field["bound"]:
             kind = idl.bounded_str[int(field["bound"])]
         if field["length"]:
@@ -329,13 +320,8 @@ def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
     return made
 
 
-def _part(name: str) -> MessageType:
-    """The type of a field: ``std_msgs/Header``."""
-    return MessageType(name.replace("/", "/msg/"), "")
-
-
 def _configuration(interfaces: Sequence[str]) -> str:
-    """For Cyclone DDS, which adds the interfaces of several parts: exactly one part names them."""
+    """Return the configuration of Cyclone DDS; only one part of it may name interfaces, since it adds them up."""
     given = os.environ.get("CYCLONEDDS_URI", "")
     if given and interfaces:
         raise ConfigurationError("--interface and CYCLONEDDS_URI both choose networks: give one of them")

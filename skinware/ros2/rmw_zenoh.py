@@ -1,7 +1,7 @@
-"""A node of a ROS 2 graph that rmw_zenoh carries: publishers and services that its nodes find as they find their own.
+"""A node of a ROS 2 graph over zenoh, for peers with rmw_zenoh.
 
-Nodes are peers: each listens on this machine only, and connects to a router, which tells them of each other. Messages
-of one machine then go straight to those who want them; the router passes on those for other machines.
+Nodes are peers of zenoh: each listens on this machine only and connects to a router, through which they discover each
+other. Messages on one machine then go straight to their subscribers; the router passes on those for other machines.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ from skinware.ros2.rmw_zenoh_keys import Attachment, Kind, endpoint_token, gid, 
 from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
 
 ROUTER = "tcp/localhost:7447"
-"""Where the router of a machine is."""
+"""The router of a machine."""
 _LISTEN = "tcp/localhost:0"
 _SETTINGS = {
     "scouting/gossip/enabled": "true",
     "scouting/gossip/target": '{ router: ["router", "peer"], peer: ["router"] }',
     "timestamping/enabled": "true",
 }
-"""As nodes of rmw_zenoh have them; late subscribers are given stamped messages only."""
+"""As nodes of rmw_zenoh; late subscribers get only messages with time stamps."""
 _SERVICE_QOS = Qos(depth=10)
 _MOST_REQUESTS = 10
-"""So many may wait; a node of ROS keeps as many."""
+"""Requests that may wait, as in a node of ROS."""
 _LOOK_S = 1.0
-"""How often to look for the router."""
+"""Time between two looks for the router."""
 _NODE = 0
 """Number of the only node in a session."""
 
 
 class ZenohNode:
-    """A node (:class:`skinware.ros2.transport.Node`).
+    """A :class:`skinware.ros2.transport.Node`.
 
-    Whether there is a router makes no difference to who publishes: the node is found as soon as there is one, and again
-    after it was away.
+    It can publish without a router. Others discover it as soon as there is one, and again after the router was away.
 
     Args:
         identity: of the node.
         connect: endpoints of routers, ``tcp/HOST:PORT``.
-        tell: is called when the router is away (not earlier than a second after the start), and when it is there
-            again, with which of them it is and a line for people; in a thread of the node.
+        router_changed: called with (is there, line for people) when the router goes or comes back, and a second after
+            the start if there is none; in a thread of the node.
+
+    Attributes:
+        is_seen: there was a router at the last look; nodes that start without one do not discover this one.
 
     Raises:
-        ConfigurationError: something that cannot be connected to.
+        ConfigurationError: an endpoint is malformed.
         BridgeError: there cannot be such a node; the message says why.
     """
 
@@ -64,10 +66,10 @@ class ZenohNode:
         identity: Identity,
         *,
         connect: Sequence[str] = (ROUTER,),
-        tell: Callable[[bool, str], None] = lambda _is_there, _line: None,
+        router_changed: Callable[[bool, str], None] = lambda _is_there, _line: None,
     ) -> None:
         places = endpoints(connect=connect)
-        self._identity, self._tell = identity, tell
+        self._identity, self._router_changed = identity, router_changed
         self._at = ", ".join(places.connect)
         self._session = open_session(replace(places, listen=(_LISTEN,), security=_SETTINGS))
         self._zid = str(self._session.info.zid())
@@ -75,7 +77,7 @@ class ZenohNode:
         self._endpoints: set[_Publisher | _Service] = set()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._answering = threading.RLock()
-        self._is_seen = True
+        self.is_seen: bool = True
         self._worker = threading.Thread(target=self._work, name=f"node {identity.name}")
         try:
             self._token = self._announce(node_token(identity, self._zid, _NODE))
@@ -84,13 +86,8 @@ class ZenohNode:
             raise
         self._worker.start()
 
-    @property
-    def is_seen(self) -> bool:
-        """Whether there was a router when it was last looked for: nodes that start without one do not find this one."""
-        return self._is_seen
-
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
-        """What sends under an absolute topic.
+        """Return a publisher of an absolute topic.
 
         Raises:
             BridgeError: there cannot be such a publisher.
@@ -104,10 +101,10 @@ class ZenohNode:
         return made
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
-        """Answer under an absolute name, one request after the other; ten may wait, more are refused.
+        """Answer requests under an absolute name, one after the other; ten may wait, more are refused.
 
         Returns:
-            What ends the service; waits for a request that is being answered.
+            A function that ends the service; it waits for a request that is being answered.
 
         Raises:
             BridgeError: there cannot be such a service.
@@ -131,7 +128,7 @@ class ZenohNode:
             self._worker.join()
         self._close_session()
 
-    def _endpoint_token(self, kind: Kind, name: str, of_type: MessageType | ServiceType, qos: Qos) -> str:
+    def _endpoint_token(self, kind: Kind, name: str, of_type: MessageType, qos: Qos) -> str:
         return endpoint_token(self._identity, self._zid, _NODE, next(self._numbers), kind, name, of_type, qos)
 
     def _announce(self, token: str) -> zenoh.LivelinessToken:
@@ -159,15 +156,15 @@ class ZenohNode:
 
     def _look(self) -> None:
         is_seen = bool(self._session.info.routers_zid())
-        if is_seen == self._is_seen:
+        if is_seen == self.is_seen:
             return
-        self._is_seen = is_seen
-        name = self._identity.name
+        self.is_seen, name = is_seen, self._identity.name
         if is_seen:
-            self._tell(True, f"the zenoh router at {self._at} is there: nodes find {name}")
+            line = f"the zenoh router at {self._at} is there: nodes find {name}"
         else:
             start_one = "start one with: ros2 run rmw_zenoh_cpp rmw_zenohd"
-            self._tell(False, f"no zenoh router at {self._at}: nodes that start now do not find {name}; {start_one}")
+            line = f"no zenoh router at {self._at}: nodes that start now do not find {name}; {start_one}"
+        self._router_changed(is_seen, line)
 
     def _close_session(self) -> None:
         with contextlib.suppress(zenoh.ZError):
@@ -175,8 +172,6 @@ class ZenohNode:
 
 
 class _Publisher:
-    """Of one topic; numbers its messages from 1 on."""
-
     def __init__(
         self,
         publisher: Any,
@@ -191,11 +186,11 @@ class _Publisher:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether anybody listens; of a latched topic also who comes late."""
+        """Whether there are subscribers; always True for a latched topic."""
         return self._is_open and (self._qos.latched or bool(self._publisher.matching_status.matching))
 
     def publish(self, message: Cdr) -> bool:
-        """Send a message; False if it is closed. What a slow subscriber does not take is left out for that one."""
+        """Send a message; return False if it is closed. A slow subscriber misses messages."""
         if not self._is_open:
             return False
         self._sequence += 1
@@ -214,11 +209,7 @@ class _Publisher:
 
 
 class _Service:
-    """Answers requests under a key, one at a time of all that share a lock.
-
-    Attributes:
-        declared: what ends with it.
-    """
+    """Answers requests under a key, one at a time of all services that share a lock."""
 
     def __init__(
         self, at: str, handler: Handler, answering: threading.RLock, closed: Callable[[_Service], None]
@@ -242,7 +233,7 @@ class _Service:
         return None
 
     def close(self) -> None:
-        """End it. Idempotent; waits for a request that is being answered, and answers none after that."""
+        """End it, after the request that is being answered. Idempotent."""
         was_open, self._is_open = self._is_open, False
         with self._answering:
             if was_open:
@@ -251,9 +242,9 @@ class _Service:
 
 
 def _declare_publisher(session: zenoh.Session, at: str, qos: Qos) -> Any:
-    """Messages hardly wait for who is slow; a latched topic keeps its last for who comes late.
+    """Declare a publisher that hardly waits for slow subscribers; one of a latched topic keeps messages for late ones.
 
-    It sends no heartbeats, as rmw_zenoh does: they wait for who hangs, and all other messages with them.
+    Unlike rmw_zenoh it sends no heartbeats: they wait for a peer that hangs, and hold up all other messages.
     """
     how: dict[str, Any] = {
         "congestion_control": zenoh.CongestionControl.DROP,

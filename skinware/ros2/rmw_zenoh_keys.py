@@ -1,6 +1,6 @@
-"""What rmw_zenoh says where: keys of topics and services, tokens by which nodes are found, what goes with messages.
+"""Keys, tokens and attachments of rmw_zenoh.
 
-As its design document has it (ros2/rmw_zenoh, docs/design.md), in versions from 0.1.2 (Humble) and 0.2.4 (Jazzy) on.
+Source: its design document (ros2/rmw_zenoh, docs/design.md), from versions 0.1.2 (Humble) and 0.2.4 (Jazzy) on.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from enum import Enum
 from importlib.util import find_spec
 
 from skinware.errors import BridgeError, MissingExtra
-from skinware.ros2.transport import Distro, Identity, MessageType, Qos, ServiceType
+from skinware.ros2.transport import Distro, Identity, MessageType, Qos
 
 if find_spec("xxhash") is None:
     raise MissingExtra("ROS 2 over zenoh needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
@@ -24,12 +24,12 @@ _NO_HASH = "TypeHashNotSupported"
 _NAME = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
-_SILENT_DEPTH = 42
-"""What a depth is that is not told."""
+_DEFAULT_DEPTH = 42
+"""Depth that is not written."""
 
 
 class Kind(Enum):
-    """What can be found in a graph."""
+    """Kinds of endpoints."""
 
     PUBLISHER = "MP"
     SERVICE = "SS"
@@ -37,12 +37,12 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Attachment:
-    """What goes with each message, request and response.
+    """The attachment of a message, request or response.
 
     Attributes:
-        sequence: of what its sender sent, from 1 on; a response has that of its request.
+        sequence: number of the message, by its sender, from 1 on; a response has that of its request.
         time_ns: when it was sent, ns since 1970.
-        gid: 16 bytes that tell the sender from all others; a response has that of its request.
+        gid: identity of the sender, 16 bytes; a response has that of its request.
     """
 
     sequence: int
@@ -50,15 +50,15 @@ class Attachment:
     gid: bytes
 
     def packed(self) -> bytes:
-        """Its 33 bytes."""
+        """Return its 33 bytes."""
         return _ATTACHMENT.pack(self.sequence, self.time_ns, _GID_BYTES, self.gid)
 
     @classmethod
     def of(cls, data: bytes) -> Attachment:
-        """The attachment that bytes are.
+        """Read an attachment.
 
         Raises:
-            ValueError: they are none.
+            ValueError: it is malformed.
         """
         try:
             sequence, time_ns, gid_bytes, gid = _ATTACHMENT.unpack(data)
@@ -69,16 +69,11 @@ class Attachment:
         return cls(sequence, time_ns, gid)
 
 
-def key(identity: Identity, name: str, of_type: MessageType | ServiceType) -> str:
-    """Under which messages of a topic, or requests to a service, go.
-
-    Args:
-        identity: of the node.
-        name: of the topic or service, absolute.
-        of_type: of its messages.
+def key(identity: Identity, name: str, of_type: MessageType) -> str:
+    """Return the key of the messages of a topic, or of the requests to a service.
 
     Raises:
-        BridgeError: ROS has no such name.
+        BridgeError: ``name`` is no absolute name of ROS.
     """
     if not _NAME.fullmatch(name):
         raise BridgeError(f"{name!r} is no absolute name of a topic or service in ROS 2, as /skin/arm/points is")
@@ -86,13 +81,7 @@ def key(identity: Identity, name: str, of_type: MessageType | ServiceType) -> st
 
 
 def node_token(identity: Identity, session: str, node: int) -> str:
-    """By which a node is found.
-
-    Args:
-        identity: of the node.
-        session: id of zenoh's session.
-        node: its number in the session.
-    """
+    """Return the token of a node, which has a number in a session of zenoh."""
     return "/".join((_TOKENS, str(identity.domain), session, str(node), str(node), "NN", *_of_node(identity)))
 
 
@@ -103,35 +92,24 @@ def endpoint_token(
     endpoint: int,
     kind: Kind,
     name: str,
-    of_type: MessageType | ServiceType,
+    of_type: MessageType,
     qos: Qos,
 ) -> str:
-    """By which a publisher or a service is found.
-
-    Args:
-        identity: of its node.
-        session: id of zenoh's session.
-        node: number of its node in the session.
-        endpoint: its own number there.
-        kind: of it.
-        name: of its topic, or of the service; absolute.
-        of_type: of its messages.
-        qos: what it offers.
-    """
+    """Return the token of a publisher or a service, which has a number of its own in the session."""
     place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
     return "/".join((*place, _mangled(name), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 
 def qos_text(qos: Qos) -> str:
-    """Reliability, durability, history, deadline, lifespan and liveliness; nothing stands for what is usual."""
+    """Return reliability, durability, history, deadline, lifespan and liveliness; defaults are not written."""
     reliability = "" if qos.reliable else "2"
     durability = "1" if qos.latched else ""
-    depth = "" if qos.depth == _SILENT_DEPTH else qos.depth
+    depth = "" if qos.depth == _DEFAULT_DEPTH else qos.depth
     return f"{reliability}:{durability}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:
-    """The identity of who has a token, 16 bytes: all in the graph compute the same."""
+    """Return the identity of the endpoint with a token, 16 bytes; all nodes compute the same."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
@@ -143,5 +121,5 @@ def _mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def _hash(identity: Identity, of_type: MessageType | ServiceType) -> str:
+def _hash(identity: Identity, of_type: MessageType) -> str:
     return _NO_HASH if identity.distro is Distro.HUMBLE else of_type.hash

@@ -1,4 +1,4 @@
-"""Drivers of a namespace in a ROS 2 graph, until it is stopped."""
+"""Publish the drivers of a namespace in a ROS 2 graph, with diagnostics, and tare them on request."""
 
 from __future__ import annotations
 
@@ -8,36 +8,45 @@ from dataclasses import dataclass
 
 from skinware.conversion.showing import in_topic
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import NamespaceError
+from skinware.errors import NamespaceError, RequestTimeout
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
-from skinware.ros2 import diagnostics, types
-from skinware.ros2.taring import Taring
-from skinware.ros2.topics import DriverTopics
-from skinware.ros2.transforms import Transforms
+from skinware.ros2 import types
+from skinware.ros2.messages import Level, Status, diagnostics, trigger_response
+from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
+from skinware.service import ServiceReader
 from skinware.service._tap import wake_word_of
-from skinware.state import WITHOUT_NEWS, life_of
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, bus_state_name, life_of
+from skinware.status import BusState
 from skinware.views.live import LiveDriver, LiveDrivers
 
 RATE_HZ = 20.0
 GONE = "gone"
-"""What a driver does that was withdrawn."""
+"""State of a driver that was withdrawn."""
 _LIFE_NS = NS_PER_S // 5
+_TARE_S = 10.0
+_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
+_LEVEL_OF_LIFE = {SILENT: Level.STALE, PAUSED: Level.WARN, DEAD: Level.ERROR}
+_LEVEL_OF_BUS = {
+    bus_state_name(BusState.LIVE): Level.OK,
+    bus_state_name(BusState.CONNECTING): Level.WARN,
+    bus_state_name(BusState.SILENT): Level.WARN,
+}
 
 
 @dataclass(frozen=True)
-class Told:
-    """How a driver is, and what was told of it.
+class ServedReport:
+    """State of a driver, and traffic of its topics.
 
     Attributes:
-        state: what it does; see :func:`skinware.state.life_of`; ``gone``: it was withdrawn.
-        rate_hz: frames that it publishes; None where not known yet.
-        age_ms: of its newest data; None before its first frame.
-        lost: frames so far that somebody wanted each of, and that could not be taken.
-        messages: that were sent so far.
-        left_out: that were not sent so far, since the carrier took no more.
+        state: as :func:`skinware.state.life_of`; ``gone``: it was withdrawn.
+        rate_hz: frames that it publishes; None: not known yet.
+        age_ms: of its newest data; None: no frame so far.
+        lost: frames so far that a subscriber wanted and that could not be taken.
+        messages: sent so far.
+        left_out: messages that were not sent, because the carrier took no more.
     """
 
     state: str
@@ -53,18 +62,14 @@ class _Served:
     """A driver that was found at any time.
 
     Attributes:
-        topics: of it.
-        end_tare: ends its service.
-        frame: that was told last.
-        due_ns: when the next point clouds and images are.
+        due_ns: when point clouds and images are due.
         look_ns: when to look whether it lives.
-        is_over: that nothing newer comes was told.
-        wants_frames: somebody wanted the last frame because it wants each.
-        lost: see :class:`Told`.
+        is_over: its frame was published as the last one.
+        wants_frames: each frame was wanted when the newest one was taken.
     """
 
     topics: DriverTopics
-    end_tare: Callable[[], None]
+    end_tare: Callable[[], None] = lambda: None
     frame: DriverSnapshot | None = None
     due_ns: int = 0
     look_ns: int = 0
@@ -78,19 +83,25 @@ class _Served:
             self.lost += frame.sequence - before.sequence - 1
         self.frame, self.wants_frames, self.is_over = frame, wants_frames, False
 
+    def publish_last(self) -> None:
+        """Publish all sensors as stale, once."""
+        self.is_over = True
+        if self.frame is not None:
+            self.topics.publish(self.frame, with_pictures=True, is_last=True)
+
 
 class Ros2Server:
-    """Tells a ROS 2 graph of drivers; nobody there can hold them up.
+    """Publishes drivers in a ROS 2 graph; nothing there can hold them up.
 
     Args:
         node: of the graph.
         namespace: whose drivers.
-        names: of them; none: all there are and come.
+        names: of drivers; empty: all, also later ones.
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.
         root_frame: parent of all coordinate frames in ``/tf_static``; empty: no such topic.
         with_tare: offer everyone in the graph a service for each driver that tares it.
-        trouble: called with what cannot be told, a line each.
+        trouble: called with each new problem, one line.
     """
 
     def __init__(
@@ -107,7 +118,7 @@ class Ros2Server:
     ) -> None:
         self._node, self._prefix, self._trouble = node, prefix, trouble
         self._period_ns = period_ns(rate_hz)
-        self._taring = Taring(node, namespace) if with_tare else None
+        self._with_tare = with_tare
         self._transforms = Transforms(node, root_frame) if root_frame else None
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _Served] = {}
@@ -115,26 +126,25 @@ class Ros2Server:
         self._diagnostics = node.publisher("/diagnostics", types.DIAGNOSTICS, Qos())
         self._stopping = False
 
-    def run(self, tell: Callable[[], object] = lambda: None) -> None:
-        """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
+    def run(self, each_second: Callable[[], object] = lambda: None) -> None:
+        """Run until ``stop``; call ``each_second`` once a second."""
+        second_ns = now_ns() + NS_PER_S
         with short_turns():
             while not self._stopping:
-                words, until_ns = self._take_all(min(now_ns() + WAIT_SLICE_NS, tell_ns))
-                if now_ns() >= tell_ns:
-                    tell_ns = max(tell_ns + NS_PER_S, now_ns())
-                    self._diagnose()
-                    tell()
+                words, until_ns = self._take_all(min(now_ns() + WAIT_SLICE_NS, second_ns))
+                if now_ns() >= second_ns:
+                    second_ns = max(second_ns + NS_PER_S, now_ns())
+                    if self._diagnostics.is_wanted:
+                        self._diagnostics.publish(diagnostics(list(self._statuses()), time.time_ns()))
+                    each_second()
                 futex.sleep_on(words, until_ns)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
         self._stopping = True
-        if self._taring is not None:
-            self._taring.stop()
 
     def close(self) -> None:
-        """Let go of all drivers, and of their topics and services. Idempotent."""
+        """Release all drivers, their topics and services. Idempotent."""
         self.stop()
         for served in self._served.values():
             served.end_tare()
@@ -144,13 +154,23 @@ class Ros2Server:
             self._transforms.close()
         self._live.close()
 
-    def drivers(self) -> Mapping[str, Told]:
-        return {name: self._told(name, served) for name, served in self._served.items()}
+    def drivers(self) -> Mapping[str, ServedReport]:
+        """Return the state of all drivers that were found at any time, by name."""
+        reports = {}
+        for name, served in self._served.items():
+            live, traffic = self._live.get(name), (served.lost, served.topics.messages, served.topics.left_out)
+            if live is None:
+                reports[name] = ServedReport(GONE, 0.0, None, *traffic)
+                continue
+            report = live.report()
+            age_ms = None if report.age_ns is None else report.age_ns / 1e6
+            reports[name] = ServedReport(report.life, report.rate_hz, age_ms, *traffic)
+        return reports
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def _take_all(self, until_ns: int) -> tuple[list[tuple[futex.Word, int]], int]:
-        """Tell all that is new; what to sleep on then, and until when."""
+        """Publish all new frames; return what to sleep on, and until when."""
         words = []
         for live in self._look():
             served = self._served.get(live.name) or self._serve(live.name)
@@ -163,72 +183,89 @@ class Ros2Server:
             words.append(wake_word_of(live.reader))
             if self._live.poll(live) and live.frame is not None:
                 served.take(live.frame, wants_frames=wants_frames)
-                served.topics.tell(live.frame, with_pictures=is_due)
+                served.topics.publish(live.frame, with_pictures=is_due)
                 if self._transforms is not None:
                     self._transforms.add(live.frame.structure)
                 if is_due:
                     served.due_ns = max(served.due_ns + self._period_ns, now_ns() + self._period_ns // 2)
-            elif not served.is_over and self._is_over(live, served):
-                self._tell_last(served)
+            elif not served.is_over and now_ns() >= served.look_ns and self._live.get(live.name) is live:
+                served.look_ns = now_ns() + _LIFE_NS
+                if life_of(live.reader, live.frame) in WITHOUT_NEWS:
+                    served.publish_last()
         return words, until_ns
 
     def _look(self) -> list[LiveDriver]:
         try:
             found = self._live.look()
         except NamespaceError as error:
-            self._tell_trouble(str(error))
+            self._report_once(str(error))
             return []
         for name, served in self._served.items():
             if not served.is_over and self._live.get(name) is None:
-                self._tell_last(served)
+                served.publish_last()
         return found
-
-    def _is_over(self, live: LiveDriver, served: _Served) -> bool:
-        """Whether nothing newer comes for now: looked at now and then."""
-        if now_ns() < served.look_ns or self._live.get(live.name) is not live:
-            return False
-        served.look_ns = now_ns() + _LIFE_NS
-        return life_of(live.reader, live.frame) in WITHOUT_NEWS
-
-    def _tell_last(self, served: _Served) -> None:
-        """That all of a driver's sensors are stale, once."""
-        served.is_over = True
-        if served.frame is not None:
-            served.topics.tell(served.frame, with_pictures=True, is_last=True)
 
     def _serve(self, name: str) -> _Served | None:
         topic = in_topic(name)
         if any(in_topic(other) == topic for other in self._served):
-            self._tell_trouble(f"driver {name!r} is left out: another one has its topics, /skin/{topic}/...")
+            self._report_once(f"driver {name!r} is left out: another one has its topics, /skin/{topic}/...")
             return None
         topics = DriverTopics(self._node, self._prefix, name)
-        end_tare = (lambda: None) if self._taring is None else self._taring.offer(f"{topics.base}/tare", name)
-        self._served[name] = served = _Served(topics, end_tare)
+        self._served[name] = served = _Served(topics)
+        if self._with_tare:
+            served.end_tare = self._node.service(f"{topics.base}/tare", types.TRIGGER, lambda _: self._tare(name))
         return served
 
-    def _tell_trouble(self, text: str) -> None:
+    def _report_once(self, text: str) -> None:
         if text not in self._troubles:
             self._troubles.add(text)
             self._trouble(text)
 
-    # -- how they are -----------------------------------------------------------------------------------------------
+    # -- taring and diagnostics -----------------------------------------------------------------------------------
 
-    def _diagnose(self) -> None:
-        if self._diagnostics.is_wanted:
-            self._diagnostics.publish(diagnostics.message(self._statuses(), time.time_ns()))
+    def _tare(self, driver: str) -> bytes:
+        """Tare a driver; return the response, also that of a driver that cannot be tared."""
+        try:
+            with ServiceReader(driver, namespace=self._live.namespace, announce=False) as reader:
+                pending = reader.ask("tare")
+                until_ns, pause_s = now_ns() + round(_TARE_S * NS_PER_S), _SHORTEST_PAUSE_S
+                while not pending.done():
+                    if self._stopping or now_ns() > until_ns:
+                        pending.cancel()
+                        raise RequestTimeout(f"no answer within {_TARE_S:g} s; it may have been carried out")
+                    time.sleep(pause_s)
+                    pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+                pending.result(0.0)
+        except Exception as error:  # noqa: BLE001, the caller gets it
+            return trigger_response(False, str(error))
+        return trigger_response(True, "")
 
-    def _statuses(self) -> Iterator[diagnostics.Status]:
+    def _statuses(self) -> Iterator[Status]:
         for name in self._served:
             live = self._live.get(name)
             if live is None:
-                yield diagnostics.Status(diagnostics.Level.ERROR, f"skin: {name}", GONE, "", {})
+                yield Status(Level.ERROR, f"skin: {name}", GONE, "", {})
             else:
-                yield from diagnostics.statuses(live)
+                yield from _statuses_of(live)
 
-    def _told(self, name: str, served: _Served) -> Told:
-        live, topics = self._live.get(name), served.topics
-        if live is None:
-            return Told(GONE, 0.0, None, served.lost, topics.messages, topics.left_out)
-        health = live.health()
-        age_ms = None if health.age_ns is None else health.age_ns / 1e6
-        return Told(health.life, health.rate_hz, age_ms, served.lost, topics.messages, topics.left_out)
+
+def _statuses_of(driver: LiveDriver) -> Iterator[Status]:
+    """Yield the status of a driver, and of each of its buses while it lives."""
+    report = driver.report()
+    is_live = report.life == LIVE
+    words = f"{report.fresh} of {report.sensors} sensors are fresh" if is_live else report.life
+    level = _LEVEL_OF_LIFE.get(report.life, Level.WARN)
+    if is_live and report.age_ns is not None and report.fresh == report.sensors:
+        level = Level.OK
+    values = {"state": report.life, "sensors": str(report.sensors)}
+    if report.rate_hz is not None:
+        values["rate_hz"] = f"{report.rate_hz:.1f}"
+    if report.age_ns is not None:
+        values["age_ms"] = f"{report.age_ns / NS_PER_S * 1e3:.1f}"
+    patches = {f"patches {state}": n for state, n in report.patch_states.items()}
+    counts = {**report.statuses, **patches, **report.counters}
+    values |= {name: str(count) for name, count in counts.items() if count}
+    yield Status(level, f"skin: {driver.name}", words, driver.reader.driver_type, values)
+    for bus in report.buses if is_live else ():
+        words = ": ".join(filter(None, (bus.state, bus.reason)))
+        yield Status(_LEVEL_OF_BUS.get(bus.state, Level.ERROR), f"skin: {driver.name}: {bus.name}", words, bus.name, {})

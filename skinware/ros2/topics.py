@@ -1,4 +1,4 @@
-"""What a driver is in a ROS 2 graph: its topics, over all of its generations."""
+"""The topics of a node: those of each driver, over all of its generations, and ``/tf_static``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinware.conversion.showing import Showing, in_topic
 from skinware.conversion.tables import sensor_names
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import now_ns
-from skinware.ros2 import types
+from skinware.ros2 import messages, types
 from skinware.ros2.transport import Node, Publisher, Qos
 from skinware.status import Status
 from skinware.structure import Structure
@@ -21,20 +21,16 @@ _STALE = np.uint8(Status.STALE)
 
 
 class DriverTopics:
-    """The topics of a driver.
-
-    Args:
-        node: that tells them.
-        prefix: before all topics: empty or ``/robot_1``.
-        name: of the driver.
+    """The topics of a driver, which begin with ``base``.
 
     Attributes:
-        messages: that were sent.
-        left_out: that were not, since a subscriber is too slow.
+        messages: number of those that were sent.
+        left_out: number of those that were not sent, because a subscriber is too slow.
     """
 
     def __init__(self, node: Node, prefix: str, name: str) -> None:
         self._node, self._prefix, self._name = node, prefix, name
+        self.base: str = f"{prefix}/skin/{in_topic(name)}"
         self.messages = self.left_out = 0
         self._structure: Structure | None = None
         self._generation = 0
@@ -44,25 +40,22 @@ class DriverTopics:
         self._sensors = node.publisher(f"{self.base}/sensors", types.SENSORS, _LATCHED)
 
     @property
-    def base(self) -> str:
-        return f"{self._prefix}/skin/{in_topic(self._name)}"
-
-    @property
     def wants_frames(self) -> bool:
+        """Whether there are subscribers that want each frame."""
         return self._frames.is_wanted
 
-    def tell(self, frame: DriverSnapshot, *, with_pictures: bool, is_last: bool = False) -> None:
-        """Send what somebody wants of a frame.
+    def publish(self, frame: DriverSnapshot, *, with_pictures: bool, is_last: bool = False) -> None:
+        """Publish a frame under all topics that have subscribers.
 
         Args:
-            frame: it.
+            frame: to be published.
             with_pictures: point clouds and images, too.
-            is_last: nothing newer comes for now: all of it is stale.
+            is_last: no newer frame comes for now: all sensors are stale.
         """
         time_ns = time.time_ns() - (now_ns() - frame.published_ns)
         status = frame.status | _STALE if is_last else frame.status
         if frame.generation != self._generation:
-            self._take_generation(frame, time_ns)
+            self._begin(frame, time_ns)
         if self._frames.is_wanted:
             self._send(self._frames, ros_messages.skin_frame(frame, time_ns, status))
         if with_pictures and self._showing is not None:
@@ -74,7 +67,8 @@ class DriverTopics:
         for publisher in (self._frames, self._sensors, *self._pictures.values()):
             publisher.close()
 
-    def _take_generation(self, frame: DriverSnapshot, time_ns: int) -> None:
+    def _begin(self, frame: DriverSnapshot, time_ns: int) -> None:
+        """Publish the sensors of a new generation; open and close topics of pictures."""
         structure, self._generation = frame.structure, frame.generation
         if structure is not self._structure:
             self._structure, self._showing = structure, Showing(self._name, structure)
@@ -85,11 +79,34 @@ class DriverTopics:
                 if topic not in self._pictures:
                     message_type = types.OF_SCHEMAS[schema.name]
                     self._pictures[topic] = self._node.publisher(self._prefix + topic, message_type, Qos())
-        told = ros_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
-        self._send(self._sensors, told)
+        sensors = ros_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
+        self._send(self._sensors, sensors)
 
     def _send(self, publisher: Publisher, message: bytes) -> None:
         if publisher.publish(message):
             self.messages += 1
         else:
             self.left_out += 1
+
+
+class Transforms:
+    """Publishes a static transform from a root to each coordinate frame: at its origin, without rotation.
+
+    Skinware does not know where coordinate frames are relative to each other.
+    """
+
+    def __init__(self, node: Node, root: str) -> None:
+        self._root = root
+        self._frames: set[str] = set()
+        self._publisher = node.publisher("/tf_static", types.TRANSFORMS, _LATCHED)
+
+    def add(self, structure: Structure) -> None:
+        """Publish the frames of a driver's sensors together with those of other drivers, if any is new."""
+        geometry = structure.geometry
+        new = set() if geometry is None else set(geometry.frame[geometry.known].tolist()) - {"", self._root}
+        if new - self._frames:
+            self._frames |= new
+            self._publisher.publish(messages.transforms(self._root, sorted(self._frames), time.time_ns()))
+
+    def close(self) -> None:
+        self._publisher.close()

@@ -1,4 +1,4 @@
-"""A node of a ROS 2 graph as Skinware needs it, whatever carries it: messages are bytes (CDR) here, types only names.
+"""The node of a ROS 2 graph that Skinware needs, whatever carries it. Messages are bytes (CDR), types only names.
 
 A carrier (DDS, zenoh) is a module with one class that is a :class:`Node`, made of an :class:`Identity`.
 """
@@ -14,31 +14,33 @@ from typing import Protocol
 from skinware.errors import ConfigurationError
 
 HIGHEST_DOMAIN = 232
-"""With one above, DDS would need ports that there are not."""
+"""A higher one would need DDS ports beyond 65535."""
 _NAME = "[A-Za-z_][A-Za-z0-9_]*"
 
 Cdr = bytes
-"""A message with the four bytes that tell its encapsulation before it: CDR of version 1, little-endian."""
+"""A message after the four bytes of its encapsulation: CDR of version 1, little-endian."""
+Handler = Callable[[Cdr], Cdr]
+"""Answers a request; may take seconds, and does not raise."""
 
 
 class Distro(Enum):
-    """What differs between releases of ROS 2 for those who talk to them."""
+    """Releases of ROS 2 that differ for their peers."""
 
     HUMBLE = "humble"
     """No type hashes, and 24 bytes of identity for an endpoint."""
     JAZZY = "jazzy"
-    """Type hashes, and 16 bytes: from Iron on."""
+    """Type hashes, and 16 bytes; from Iron on."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Which node of which graph.
+    """A node and its graph.
 
     Attributes:
         name: of the node: letters, digits and underscores.
         namespace: of the node, absolute: ``/`` or ``/robot_1``.
-        domain: id of the graph, as ``ROS_DOMAIN_ID`` has it.
-        distro: of those who are to understand it.
+        domain: id of the graph, as ``ROS_DOMAIN_ID``.
+        distro: release of the peers.
 
     Raises:
         ConfigurationError: there is no such node; the message says why.
@@ -59,7 +61,7 @@ class Identity:
 
     @property
     def prefix(self) -> str:
-        """Of absolute names of topics and services in the namespace."""
+        """The namespace before an absolute name: empty or ``/robot_1``."""
         return self.namespace.rstrip("/")
 
 
@@ -68,7 +70,7 @@ class MessageType:
     """A type of messages.
 
     Attributes:
-        name: as ROS has it: ``sensor_msgs/msg/PointCloud2``.
+        name: in ROS: ``sensor_msgs/msg/PointCloud2``.
         hash: of its definition (REP 2016): ``RIHS01_`` and 64 hexadecimal digits.
     """
 
@@ -77,40 +79,32 @@ class MessageType:
 
     @property
     def dds_name(self) -> str:
-        """As DDS has it: ``sensor_msgs::msg::dds_::PointCloud2_``."""
-        return _dds_name(self.name)
+        """Its name in DDS: ``sensor_msgs::msg::dds_::PointCloud2_``."""
+        package, kind, plain = self.name.split("/")
+        return f"{package}::{kind}::dds_::{plain}_"
 
 
 @dataclass(frozen=True)
-class ServiceType:
-    """A type of services.
+class ServiceType(MessageType):
+    """A type of services; its hash is that of both messages and the event together.
 
     Attributes:
-        name: as ROS has it: ``std_srvs/srv/Trigger``.
-        hash: of its definition, both messages and the event together.
-        request: type of what is asked: ``std_srvs/srv/Trigger_Request``.
+        request: type of the question: ``std_srvs/srv/Trigger_Request``.
         response: type of the answer.
     """
 
-    name: str
-    hash: str
     request: MessageType
     response: MessageType
-
-    @property
-    def dds_name(self) -> str:
-        """``std_srvs::srv::dds_::Trigger_``."""
-        return _dds_name(self.name)
 
 
 @dataclass(frozen=True)
 class Qos:
-    """What is offered to subscribers; history is always keep-last.
+    """Quality of service that is offered to subscribers; history is always keep-last.
 
     Attributes:
-        depth: messages that are kept for who is slow.
-        reliable: what was lost on the way is sent again.
-        latched: who comes late has the last ``depth`` messages, too (durability ``transient_local``).
+        depth: messages that are kept for a slow subscriber.
+        reliable: send lost messages again.
+        latched: give the last ``depth`` messages to late subscribers (durability ``transient_local``).
     """
 
     depth: int = 5
@@ -119,44 +113,40 @@ class Qos:
 
 
 class Publisher(Protocol):
-    """Sends messages under one topic; of one thread at a time."""
+    """Sends messages under one topic; for one thread at a time."""
 
     @property
     def is_wanted(self) -> bool:
-        """Whether anybody listens; also True where nobody knows. It costs next to nothing to ask."""
+        """Whether there are subscribers; also True if that is not known. This costs next to nothing."""
 
     def publish(self, message: Cdr) -> bool:
-        """Send a message. Never waits for anybody.
+        """Send a message without waiting.
 
         Returns:
-            False: it was left out, since who listens is too slow, or the node was closed.
+            False: it was left out, because a subscriber is too slow or the node was closed.
         """
 
     def close(self) -> None:
         """End it. Idempotent."""
 
 
-Handler = Callable[[Cdr], Cdr]
-"""Answers a request; may take seconds, and does not raise."""
-
-
 class Node(Protocol):
     """A node of a graph. Publishers and services end with it."""
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
-        """What sends under an absolute topic: ``/skin/arm/points``.
+        """Return a publisher of an absolute topic: ``/skin/arm/points``.
 
         Raises:
             BridgeError: there cannot be such a publisher; the message says why.
         """
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
-        """Answer under an absolute name.
+        """Answer requests under an absolute name.
 
-        The handler is called in a thread of the node, one request of all services after the other.
+        A thread of the node calls the handlers, one request of all services after the other.
 
         Returns:
-            What ends the service. Idempotent; waits for a request that is being answered.
+            A function that ends the service. Idempotent; waits for a request that is being answered.
 
         Raises:
             BridgeError: as ``publisher``.
@@ -164,8 +154,3 @@ class Node(Protocol):
 
     def close(self) -> None:
         """Leave the graph. Idempotent."""
-
-
-def _dds_name(name: str) -> str:
-    package, kind, plain = name.split("/")
-    return f"{package}::{kind}::dds_::{plain}_"

@@ -1,4 +1,4 @@
-"""Types of messages and services that are used in a ROS 2 graph: their definitions and the hashes of these."""
+"""Types of messages and services of ROS 2, with their definitions and the hashes of these."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TEXTS = {
     "std_srvs/srv/Trigger_Request": "uint8 structure_needs_at_least_one_member\n",
     "std_srvs/srv/Trigger_Response": "bool success\nstring message\n",
 }
-"""Definitions, by type; those of messages are called without ``msg``."""
+"""Definitions, by type; names of messages are without ``msg``."""
 
 POINTS = MessageType(
     "sensor_msgs/msg/PointCloud2", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
@@ -78,7 +78,7 @@ PARTICIPANT = MessageType(
     "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",
 )
 OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
-"""Types of what is shown, by the names of their definitions."""
+"""Types of point clouds and images, by the names of their definitions."""
 
 
 def definition(message_type: MessageType) -> str:

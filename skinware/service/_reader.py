@@ -10,9 +10,12 @@ from skinware.errors import Overrun
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
+from skinware.memory.take import NEWER, NEXT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
 from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
+
+_ENDLESS_NS = 1 << 61
 
 
 class ServiceReader(Taking[SampleT]):
@@ -102,7 +105,10 @@ class ServiceReader(Taking[SampleT]):
             Closed: this reader was closed, or belongs to the process before a fork.
         """
         known = newer_than.position if isinstance(newer_than, Sample) else newer_than
-        return self._read(known, max_age_s, self._deadline_ns(_in_ns(timeout_s), False))
+        timeout_ns = _in_ns(timeout_s)
+        if known is not None:
+            return self._take_turn(NEWER, timeout_ns, max_age_s, known)
+        return self._read(None, max_age_s, now_ns() + timeout_ns)
 
     @contextlib.contextmanager
     def view(self) -> Iterator[SampleT]:
@@ -155,12 +161,7 @@ class ServiceReader(Taking[SampleT]):
             timeout_ns = _in_ns(timeout_s)
             with short_turns():
                 while True:
-                    in_c = self._turns_in_c and not self._closed and max_age_s is None
-                    frame = self._ring.next_turn(timeout_ns, False) if in_c else None
-                    if frame is None:
-                        frame = self._read(self._last, max_age_s, self._deadline_ns(timeout_ns, in_c))
-                        self._go_round_in_c()
-                    yield frame
+                    yield self._take_turn(NEWER, timeout_ns, max_age_s)
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
@@ -188,12 +189,7 @@ class ServiceReader(Taking[SampleT]):
         timeout_ns = _in_ns(timeout_s)
         with short_turns():
             while True:
-                in_c = self._turns_in_c and not self._closed
-                frame = self._ring.next_turn(timeout_ns, True) if in_c else None
-                if frame is None:
-                    frame = self._read_in_order(self._deadline_ns(timeout_ns, in_c))
-                    self._go_round_in_c()
-                yield frame
+                yield self._take_turn(NEXT, timeout_ns)
 
     def request(self, *, timeout_s: float = 5.0) -> SampleT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
@@ -241,5 +237,5 @@ class ServiceReader(Taking[SampleT]):
         return f"<{type(self).__name__} of {self.name!r} in {self.namespace.name!r}>"
 
 
-def _in_ns(timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else round(timeout_s * NS_PER_S)
+def _in_ns(timeout_s: float | None) -> int:
+    return _ENDLESS_NS if timeout_s is None else round(timeout_s * NS_PER_S)

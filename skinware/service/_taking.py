@@ -8,6 +8,7 @@ from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Sample, SampleT
 from skinware.memory.ring_reader import RingReader
+from skinware.memory.take import NEXT
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._attachment import GENERATION_ENDED, Attachment
 from skinware.service.messages import Accounts
@@ -43,7 +44,7 @@ class Taking(Attachment[SampleT]):
             self._last = (ring.generation, 0)
         super()._adopt(ring)
 
-    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> SampleT:
+    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int) -> SampleT:
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
@@ -57,7 +58,7 @@ class Taking(Attachment[SampleT]):
                 return frame
             known = frame.position
 
-    def _read_in_order(self, deadline_ns: int | None) -> SampleT:
+    def _read_in_order(self, deadline_ns: int) -> SampleT:
         self._require_open()
         if self._lags():
             self._end_turn()
@@ -67,17 +68,16 @@ class Taking(Attachment[SampleT]):
     def _next_frame(
         self,
         known: Position | None,
-        deadline_ns: int | None,
+        deadline_ns: int,
         *,
         in_order: bool = False,
         max_age_s: float | None = None,
     ) -> SampleT:
         """Wait for a frame that is newer than ``known``: the newest, or the next in order.
 
-        One that is slept for was published within the last slice: its writer lived then, which saves the question
-        at the very moment at which a reader is in a hurry.
+        One that is slept for was published within the last slice, when its writer lived.
         """
-        look_around = False
+        slept = look_around = False
         self._end_turn()
         while True:
             self._require_open()
@@ -90,24 +90,17 @@ class Taking(Attachment[SampleT]):
                 wake_count = ring.wake_count
             latest = ring.latest
             if latest and (known is None or (ring.generation, latest) > known):
-                take = self._next_in_order if in_order else self._ring.copy
-                return self._taken(self._whole(take), self.alive)
+                take = self._next_in_order if in_order else ring.copy
+                return self._taken(self._whole(take), slept or self.alive)
             if self._moved:
                 raise self._structure_changed()
-            remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
+            remaining_ns = deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came(max_age_s))
             self._end_turn()
-            timeout_ns = min(remaining_ns, WAIT_SLICE_NS)
-            try:
-                frame = ring.wait(wake_count, latest, timeout_ns, latest + 1 if in_order else None)
-            except Overrun:
-                self._accounts.record.overruns += 1
-                raise
-            if frame is not None and (known is None or frame.position > known):
-                self._count(frame)
-                return frame
-            look_around = frame is None
+            ring.wake_word.wait(wake_count, min(remaining_ns, WAIT_SLICE_NS))
+            slept = ring.latest != latest
+            look_around = not slept
 
     def _structure_changed(self) -> StructureChanged:
         return StructureChanged(
@@ -182,18 +175,40 @@ class Taking(Attachment[SampleT]):
         self._come_back()
         self._last_taken = position
 
-    def _deadline_ns(self, timeout_ns: int | None, in_c: bool) -> int | None:
-        """Of the wait for a frame that begins now, or began when C was asked for it."""
-        if timeout_ns is None:
-            return None
-        return (self._ring.begun_ns if in_c else now_ns()) + timeout_ns
+    def _take_turn(
+        self, wanted: int, timeout_ns: int, max_age_s: float | None = None, newer_than: Position | None = None
+    ) -> SampleT:
+        """Return the next frame after ``newer_than`` (default: the last one taken).
 
-    def _go_round_in_c(self) -> None:
-        """Leave a loop's next turns to C until something else happens than samples."""
-        if self._last_taken is None:
-            return
-        self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
-        self._turns_in_c, self._open_turn = True, None
+        C takes it, as long as nothing but frames happens since the last one.
+
+        Args:
+            wanted: ``NEWER`` for the newest, or ``NEXT``.
+            timeout_ns: longest wait.
+            max_age_s: as for ``read``.
+            newer_than: position of a frame.
+        """
+        begun_ns = 0
+        if self._turns_in_c and max_age_s is None and not self._closed:
+            ring = self._ring
+            if newer_than is None or newer_than == (ring.generation, ring.state_in_c.last):
+                frames = ring.take.next(wanted, timeout_ns)
+                if frames:
+                    return frames[0]
+                begun_ns = ring.take.begun_ns
+        deadline_ns = (begun_ns or now_ns()) + timeout_ns
+        if wanted == NEXT:
+            frame = self._read_in_order(deadline_ns)
+        else:
+            frame = self._read(newer_than or self._last, max_age_s, deadline_ns)
+        self._leave_to_c()
+        return frame
+
+    def _leave_to_c(self) -> None:
+        """Leave the next turns to C until something else happens than frames."""
+        if self._last_taken is not None:
+            self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
+            self._turns_in_c, self._open_turn = True, None
 
     def _come_back(self) -> None:
         if self._turns_in_c:

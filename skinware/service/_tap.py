@@ -50,7 +50,7 @@ class Tap(ServiceReader[SampleT]):
 
     def ring_in_c(self) -> RingReader[SampleT]:
         if not self._turns_in_c:
-            self._go_round_in_c()
+            self._leave_to_c()
         return self._ring
 
     def tell(self) -> None:

@@ -12,7 +12,8 @@ import msgspec
 
 from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring_reader import Turn, Turns
+from skinware.memory.ring_reader import Turns
+from skinware.memory.take import Turn
 from skinware.realtime import NS_PER_S, now_ns
 
 MAX_PACKET = 1 << 16
@@ -147,7 +148,7 @@ class Accounts:
     def settle(self, turns: Turns) -> None:
         self._record.frames += turns.frames
         self._record.lost += turns.lost
-        self._turns += turns.over
+        self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
 
     def end_turn(self, turn: tuple[int, int] | None) -> None:
         """Note the turn that ends now, if there is one; add up and tell everybody now and then."""

@@ -1,21 +1,21 @@
-"""Frames as bytes: what changed since the frame before, as few bits of it as there are.
+"""Code frames as the differences to the frame before, in as few bits as these need.
 
-A message of a frame, all little-endian::
+The message of a frame, all little-endian::
 
     HEADER                     48 bytes
     codes    u1[n_columns]     how each column is coded; columns as in the service's column table
     sizes    <u4[n_columns]    bytes of each
     ...                        those bytes, column after column
 
-The words of a column are its numbers; a column that has no integers or floats of 1 to 8 bytes is taken as words of one
-byte. For each word there is a difference to the same word of the frame before (``HEADER.after``; of a key frame: to
-0): for integers modulo 2**bits and zigzag-coded (0, -1, 1, -2 ... become 0, 1, 2, 3 ...), for all others by exclusive
-or. The code says in its lower four bits what follows of the differences: 0: nothing, all are 0; 1 to 8: so many byte
-planes, the lowest first, of which plane k has byte k of every difference; 15: four differences of two bits a byte, the
-first the lowest. Its bit ``PACKED`` says that those bytes are packed by DEFLATE (raw, RFC 1951).
+The words of a column are its numbers; a column without integers or floats of 1 to 8 bytes has words of one byte. Each
+word is coded as its difference to the same word of the frame before (``HEADER.after``; in a key frame: to 0). Integers
+are subtracted modulo 2**bits and zigzag-coded (0, -1, 1, -2 ... become 0, 1, 2, 3 ...); all others are exclusive ors.
+The lower four bits of the code say which bytes of the differences follow: 0: none, all are 0; 1 to 8: this many byte
+planes, the lowest first, where plane k has byte k of every difference; 15: four differences of two bits in each byte,
+the first in the lowest bits. Its bit ``PACKED`` says that these bytes are packed by DEFLATE (raw, RFC 1951).
 
-Noise of a few counts is one plane, whose values have no order: symbols of different length are all that helps, and any
-search for repetitions costs time and bytes. So numbers of up to four bytes are packed by Huffman codes only (and runs).
+Noise of a few counts is one plane of values without order: only symbols of different length make it smaller, and a
+search for repetitions costs time and bytes. So numbers of up to four bytes are packed by Huffman codes and runs only.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ HEADER = np.dtype(
         ("after", "<u8"),
     ]
 )
-"""``after``: sequence of the frame that this one is the difference to; 0: a key frame, which needs no other."""
+"""``after``: sequence of the frame before; 0: this is a key frame, which needs no other."""
 
 PACKED = 0x80
 _TWO_BITS = 15
 _PACKED_FROM = 1024
-"""Bytes of a column from which on it is packed by itself; smaller ones are left to the chunk."""
+"""Least size of a column that is packed by itself, bytes; smaller ones are packed with their chunk."""
 _HEADER = struct.Struct("<6Q")
 
 Words = npt.NDArray[np.unsignedinteger[Any]]
@@ -75,7 +75,7 @@ class CodedColumn:
 
     @staticmethod
     def of(column: Column) -> CodedColumn:
-        """How a column of a service's column table is coded."""
+        """Return how a column of a service's column table is coded."""
         dtype = column.dtype
         if dtype.kind in "uif" and dtype.itemsize in (1, 2, 4, 8):
             return CodedColumn(
@@ -88,11 +88,7 @@ class CodedColumn:
 
 
 class Encoder:
-    """Codes the frames of one generation, in order.
-
-    Args:
-        columns: of its slots.
-    """
+    """Codes the frames of one generation, in order."""
 
     def __init__(self, columns: Sequence[CodedColumn]) -> None:
         self._columns = columns
@@ -102,17 +98,17 @@ class Encoder:
         self._before = None
 
     def encode(self, frame: Sample) -> bytes:
-        """The message of a frame, which is kept until the next one."""
+        """Return the message of a frame, and keep the frame until the next one."""
         before, self._before = self._before, frame
         return encoded(frame, before, self._columns)
 
 
 def encoded(frame: Sample, before: Sample | None, columns: Sequence[CodedColumn]) -> bytes:
-    """The message of a frame.
+    """Return the message of a frame.
 
     Args:
-        frame: which.
-        before: the frame to which it is the difference; None: it is a key frame.
+        frame: to be coded.
+        before: the frame whose difference to it is coded; None: it becomes a key frame.
         columns: of the slots of both.
     """
     slot, slot_before = frame.slot, None if before is None else before.slot
@@ -144,7 +140,10 @@ def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
     if not greatest:
         return 0, b""
     if greatest < 4:
-        code, data = _TWO_BITS, _in_two_bits(change)
+        fours = np.zeros(-(-len(change) // 4) * 4, np.uint8)
+        fours[: len(change)] = change
+        first, second, third, fourth = fours.reshape(-1, 4).T
+        code, data = _TWO_BITS, (first | second << 2 | third << 4 | fourth << 6).tobytes()
     else:
         code = (greatest.bit_length() + 7) // 8
         data = change.view(np.uint8).reshape(-1, change.itemsize)[:, :code].T.tobytes()
@@ -152,20 +151,13 @@ def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
         return code, data
     strategy = zlib.Z_DEFAULT_STRATEGY
     if column.is_integer and column.words.itemsize <= 4:
-        strategy = zlib.Z_RLE if 1 < code < _TWO_BITS else zlib.Z_HUFFMAN_ONLY  # upper planes are zero for long
+        strategy = zlib.Z_RLE if 1 < code < _TWO_BITS else zlib.Z_HUFFMAN_ONLY  # upper planes have long runs of 0
     packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
     return code | PACKED, packer.compress(data) + packer.flush()
 
 
-def _in_two_bits(change: Words) -> bytes:
-    fours = np.zeros(-(-len(change) // 4) * 4, np.uint8)
-    fours[: len(change)] = change
-    first, second, third, fourth = fours.reshape(-1, 4).T
-    return (first | second << 2 | third << 4 | fourth << 6).tobytes()
-
-
 class Run:
-    """Messages of frames of one generation, the first of a key frame and each of the others after the one before it.
+    """Messages of frames of one generation: a key frame, and frames that are each coded after the one before.
 
     Args:
         messages: of n frames.
@@ -175,7 +167,7 @@ class Run:
         headers: (n,) of :data:`HEADER`.
 
     Raises:
-        BadRecording: they are not such messages.
+        BadRecording: a message is malformed.
     """
 
     def __init__(self, messages: Sequence[bytes | memoryview], columns: Sequence[CodedColumn]) -> None:
@@ -202,7 +194,7 @@ class Run:
             into: (n, count) of its words' dtype; rows may lie apart.
 
         Raises:
-            BadRecording: its bytes are not what they should be.
+            BadRecording: its bytes are malformed.
         """
         column = self._columns[number]
         change = np.zeros((len(self._messages), column.count), column.words)
@@ -217,7 +209,7 @@ class Run:
             np.bitwise_xor.accumulate(change, axis=0, out=into)
 
     def decode_slots(self, stride: int) -> npt.NDArray[np.uint8]:
-        """(n, stride) the slots of the frames, as they were in the ring."""
+        """Return (n, stride) uint8, the slots of the frames as they were in the ring."""
         slots = np.zeros((len(self._messages), stride), np.uint8)
         heads = slots[:, : SLOT.itemsize].view(SLOT)[:, 0]
         for name in ("sequence", "acquired_ns", "published_ns", "flags"):
@@ -229,12 +221,7 @@ class Run:
 
 
 class Decoder:
-    """Decodes frames of one generation, each of which may be the difference to one of the last two that were kept.
-
-    Args:
-        columns: of its slots.
-        stride: bytes of a slot.
-    """
+    """Decodes frames of one generation, each coded after one of the last two that were kept."""
 
     def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:
         self._columns, self._stride = columns, stride
@@ -242,18 +229,18 @@ class Decoder:
 
     @property
     def sequence(self) -> int:
-        """Of the newest frame that is kept; 0: none."""
+        """Sequence of the newest frame that is kept; 0: none."""
         return max(self._kept, default=0)
 
     def decode(self, message: bytes | memoryview, *, keeps: bool = True) -> npt.NDArray[np.uint8]:
-        """(stride,) the slot of a frame, not to be changed.
+        """Return (stride,) uint8, the slot of a frame; callers must not change it.
 
         Args:
             message: of the frame.
-            keeps: later frames may be the difference to this one.
+            keeps: later frames may be coded after this one.
 
         Raises:
-            BadRecording: it is no such message, or the difference to a frame that is not kept.
+            BadRecording: it is malformed, or coded after a frame that is not kept.
         """
         run = Run([message], self._columns)
         sequence, after = int(run.headers["sequence"][0]), int(run.headers["after"][0])
@@ -277,11 +264,7 @@ class Decoder:
 
 
 def _decode(code: int, data: bytes | memoryview, into: Words) -> None:
-    """The differences of one column of one frame, written into zeros.
-
-    Raises:
-        BadRecording: the bytes do not fit.
-    """
+    """Write the differences of one column of one frame into zeros, or raise BadRecording if the bytes do not fit."""
     planes = code & 15
     count = len(into)
     size = -(-count // 4) if planes == _TWO_BITS else planes * count
@@ -301,11 +284,11 @@ def _decode(code: int, data: bytes | memoryview, into: Words) -> None:
 
 
 def runs(messages: Sequence[bytes | memoryview]) -> Iterator[tuple[int, slice]]:
-    """Divide the messages of one service, in the order in which they were recorded, into runs.
+    """Divide the messages of one service, in recorded order, into runs.
 
-    What comes before the first key frame, or after a frame that is missing, is left out: nothing tells its values.
+    Messages before the first key frame, or after a frame that is missing, are left out: their values are not known.
 
-    Returns:
+    Yields:
         (generation, which messages) of each run.
     """
     begin, generation, sequence = None, 0, 0

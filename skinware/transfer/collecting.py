@@ -1,72 +1,62 @@
-"""Every frame of every service of a namespace, in order, with what happens to the services meanwhile."""
+"""Take every frame of every service of a namespace, in order, with the events of the services."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+from skinware.drivers import Drivers
 from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, StructureChanged
-from skinware.memory import futex, segments
+from skinware.memory import futex
 from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
-from skinware.service._tap import Tap, wake_word_of
+from skinware.service._tap import Tap
 from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50
-"""Between two looks for new services: of a ring of 8 slots at 100 Hz nothing is lost meanwhile."""
+"""Between two looks for new services: a ring of 8 slots at 100 Hz loses nothing meanwhile."""
 PAUSED, LIVE, CLOSED, DEAD = "paused", "live", "closed", "dead"
-"""How a service can be said to be."""
+"""States of a service, and events that begin them."""
 UNREADABLE = "unreadable"
-"""Event of a service that cannot be recorded."""
+"""Event of a service that cannot be read."""
 _LIFE_NS = NS_PER_S // 5
-"""Between two looks at who lives."""
+"""Between two looks whether services live."""
 _MOST_AT_ONCE = 64
-"""Frames of one service before it is the turn of the others."""
+"""Frames of one service that are taken before those of the others."""
 
 
 class Listener(Protocol):
-    """What is told to whom records. Nothing of it may wait for long."""
+    """Gets frames and events. None of its methods may wait for long."""
 
     def began(self, service: str, head: bytes) -> None:
-        """A new generation of a service begins with the next frame of it; ``head`` is its file up to its slots."""
+        """Begin a new generation of a service with its next frame; ``head`` is its file up to its slots."""
 
     def took(self, service: str, frame: Sample) -> None:
-        """A frame, with which nothing else is done."""
+        """Take a frame; nothing else uses it."""
 
     def happened(self, event: dict[str, Any]) -> None:
-        """Something happened to a service, as JSON has it."""
+        """Take an event of a service, as JSON has it."""
 
 
 @dataclass
 class _Source:
-    """A service that is read.
-
-    Attributes:
-        reader: of the service.
-        generation: of the frame that was taken last, 0 before the first.
-        lost: frames that are known to be lost.
-        state: what was told of it last.
-    """
-
     reader: Tap[Sample]
     generation: int = 0
     lost: int = 0
-    state: str = field(default="live")
+    state: str = LIVE
+
+    @property
+    def has_more(self) -> bool:
+        """Whether the newest frame of this generation is another than the last one that was taken."""
+        latest = self.reader.latest
+        return latest is not None and latest != self.reader.last_taken
 
 
 class _Taken(NamedTuple):
-    """A frame, and what is to be told before it.
-
-    Attributes:
-        service: its name.
-        frame: it.
-        head: of its generation, if it is the first one of that.
-        is_restarted: there was another generation before.
-        lost: frames that were lost right before it.
-    """
+    """A frame, and the events before it; ``head`` of its generation if it is the first one."""
 
     service: str
     frame: Sample
@@ -79,29 +69,36 @@ class Collector:
     """Takes frames as they come; services may come, die, come back changed, and go.
 
     Args:
-        namespace: where they are.
-        names: of services; None: all there are.
-        listener: who is told.
-        with_wires: drivers are asked to publish what goes over their wires; it is taken, too.
+        namespace: of the services.
+        names: of services; None: all.
+        listener: gets frames and events.
+        with_wires: ask drivers to publish the frames of their buses, and take those, too.
     """
 
     def __init__(
         self, namespace: Namespace, names: Collection[str] | None, listener: Listener, *, with_wires: bool = False
     ) -> None:
-        self._namespace = namespace
-        self._names = None if names is None else frozenset(names)
         self._wish = Announcement(namespace, WISH) if with_wires else None
-        self._left_out: set[str] = set()
+        if names is not None and with_wires:
+            names = [*names, *(service_name(name) for name in names)]
+        self._services: Drivers[Tap[Sample]] = Drivers(
+            namespace,
+            Tap,
+            names,
+            wants=lambda reader: with_wires or reader.kind != KIND,  # another program wants the wires
+            only_living=True,
+            every_ns=_DISCOVERY_NS,
+        )
         self._listener = listener
         self._sources: dict[str, _Source] = {}
-        self._next_discovery_ns = self._next_life_ns = 0
+        self._next_life_ns = 0
         self._is_first_look = True
         self._trouble: dict[str, str] = {}
         self._stopping = False
 
     @property
     def lost(self) -> int:
-        """Frames that were published while this collected, and that it could not take."""
+        """Frames that were published meanwhile and could not be taken."""
         return sum(source.reader.lost for source in self._sources.values())
 
     @property
@@ -110,22 +107,23 @@ class Collector:
 
     @property
     def slack_ns(self) -> int:
-        """How long it takes the fastest writer to go round its ring; 0: not known."""
+        """Time in which the fastest writer fills its ring, ns; 0: not known."""
         return min((source.reader.slack_ns for source in self._sources.values()), default=0)
 
     def take(self) -> bool:
-        """Take what is there; never waits.
-
-        Returns:
-            Whether there was anything.
-        """
+        """Take all frames that wait; return whether there were any."""
         time_ns = now_ns()
-        if time_ns >= self._next_discovery_ns:
-            self._next_discovery_ns = time_ns + _DISCOVERY_NS
+        if time_ns >= self._services.next_look_ns:
             self._discover()
         taken = [one for name, source in self._sources.items() for one in self._take_from(name, source)]
         for one in sorted(taken, key=lambda one: one.frame.published_ns):
-            self._hand_over(one)
+            if one.head is not None:
+                self._listener.began(one.service, one.head)
+            if one.is_restarted:
+                self._report("restarted", one.service)
+            if one.lost:
+                self._report("lost", one.service, count=one.lost, before=one.frame.sequence)
+            self._listener.took(one.service, one.frame)
         if time_ns >= self._next_life_ns:
             self._next_life_ns = time_ns + _LIFE_NS
             for name, source in self._sources.items():
@@ -133,18 +131,14 @@ class Collector:
         return bool(taken)
 
     def wait(self, timeout_ns: int) -> None:
-        """Sleep until a service publishes, or it is time to look for others; may come back early."""
-        until_ns = min(now_ns() + timeout_ns, self._next_discovery_ns)
-        words = [wake_word_of(source.reader) for source in self._sources.values()]
-        if not any(self._has_more(source) for source in self._sources.values()):
+        """Sleep until a service publishes, or it is time to look for others; may return early."""
+        until_ns = min(now_ns() + timeout_ns, self._services.next_look_ns)
+        words = self._services.wake_words()
+        if not any(source.has_more for source in self._sources.values()):
             futex.sleep_on(words, until_ns)
 
     def run(self, each_second: Callable[[], object]) -> None:
-        """Take what comes until ``stop``.
-
-        Args:
-            each_second: called once a second, between two takes.
-        """
+        """Take frames until ``stop``; call ``each_second`` once a second, between two takes."""
         second_ns = now_ns() + NS_PER_S
         with short_turns():
             while not self._stopping:
@@ -159,44 +153,30 @@ class Collector:
         self._stopping = True
 
     def close(self) -> None:
-        for source in self._sources.values():
-            source.reader.close()
+        self._services.close()
         if self._wish is not None:
             self._wish.close()
 
     def _take_from(self, name: str, source: _Source) -> Iterator[_Taken]:
-        for frame in self._frames(name, source):
-            is_first = frame.generation != source.generation
-            is_restarted = is_first and source.generation != 0
-            lost = source.reader.lost - source.lost
-            yield _Taken(name, frame, source.reader.head if is_first else None, is_restarted, lost)
-            source.generation = frame.generation
-            source.lost += lost
-
-    def _hand_over(self, taken: _Taken) -> None:
-        if taken.head is not None:
-            self._listener.began(taken.service, taken.head)
-        if taken.is_restarted:
-            self._tell("restarted", taken.service)
-        if taken.lost:
-            self._tell("lost", taken.service, count=taken.lost, before=taken.frame.sequence)
-        self._listener.took(taken.service, taken.frame)
-
-    def _frames(self, name: str, source: _Source) -> Iterator[Sample]:
+        reader = source.reader
         for _ in range(_MOST_AT_ONCE):
-            if not (self._has_more(source) or source.reader.moved_on or source.reader.structure_changed):
+            if not (source.has_more or reader.moved_on or reader.structure_changed):
                 return
             try:
-                frame = source.reader.next_in_order()
+                frame = reader.next_in_order()
             except Overrun:
-                return  # it is counted, and found lost at the next frame
+                return  # it counts as lost before the next frame
             except StructureChanged:
                 if not self._reattach(name, source):
                     return
                 continue
             if frame is None:
                 return
-            yield frame
+            before, lost_before = source.generation, source.lost
+            source.generation, source.lost = frame.generation, reader.lost
+            is_first = frame.generation != before
+            head = reader.head if is_first else None
+            yield _Taken(name, frame, head, is_first and before != 0, reader.lost - lost_before)
 
     def _reattach(self, name: str, source: _Source) -> bool:
         try:
@@ -204,70 +184,45 @@ class Collector:
         except ServiceNotFound:
             return False
         except (BadServiceFile, NamespaceError) as error:
-            self._tell_trouble(name, str(error))
+            self._report_trouble(name, str(error))
             return False
         return True
-
-    @staticmethod
-    def _has_more(source: _Source) -> bool:
-        """Whether the newest frame of the generation at hand is another than the last one that was taken."""
-        latest = source.reader.latest
-        return latest is not None and latest != source.reader.last_taken
 
     def _discover(self) -> None:
         if self._wish is not None:
             self._wish.keep()
         try:
-            found = self._namespace.services()
+            self._services.look()
         except NamespaceError as error:
-            self._tell_trouble("", str(error))
+            self._report_trouble("", str(error))
             return
-        for name in found:
-            if name not in self._sources and name not in self._left_out and self._is_wanted(name):
-                self._attach(name)
+        for name, why in self._services.unreadable.items():
+            self._report_trouble(name, why)
+        for name, reader in self._services.readers.items():
+            if name not in self._sources:
+                reader.begin_in_order(with_first=not self._is_first_look)
+                self._sources[name] = _Source(reader)
+                self._report("found", name)
         self._is_first_look = False
-
-    def _is_wanted(self, name: str) -> bool:
-        if self._names is None or name in self._names:
-            return True
-        return self._wish is not None and any(name == service_name(driver) for driver in self._names)
-
-    def _attach(self, name: str) -> None:
-        if segments.living_inode(self._namespace, name) is None:
-            return
-        try:
-            reader: Tap[Sample] = Tap(name, namespace=self._namespace)
-        except ServiceNotFound:
-            return
-        except (BadServiceFile, NamespaceError) as error:
-            self._tell_trouble(name, str(error))
-            return
-        if reader.kind == KIND and self._wish is None:  # somebody else wants it
-            reader.close()
-            self._left_out.add(name)
-            return
-        reader.begin_in_order(with_first=not self._is_first_look)
-        self._sources[name] = _Source(reader)
-        self._tell("found", name)
 
     def _look_at(self, name: str, source: _Source) -> None:
         reader = source.reader
-        if self._has_more(source):
+        if source.has_more:
             return  # a newer generation would take their place
         reader.refresh()
         if reader.structure_changed:
-            return  # it is back, and gone over to at the next take
+            return  # it is back, and the next take attaches to it
         state = PAUSED if reader.paused else LIVE
         if not reader.alive:
             state = CLOSED if reader.moved_on else DEAD
         if state != source.state:
             source.state = state
-            self._tell(state, name)
+            self._report(state, name)
 
-    def _tell(self, event: str, service: str, **more: Any) -> None:
+    def _report(self, event: str, service: str, **more: Any) -> None:
         self._listener.happened({"event": event, "service": service, "time_ns": now_ns(), **more})
 
-    def _tell_trouble(self, name: str, text: str) -> None:
+    def _report_trouble(self, name: str, text: str) -> None:
         if self._trouble.get(name) != text:
             self._trouble[name] = text
-            self._tell(UNREADABLE, name, why=text)
+            self._report(UNREADABLE, name, why=text)

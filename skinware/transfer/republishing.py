@@ -1,4 +1,4 @@
-"""Recorded services, published again under their names: each by a writer of its own, all with the same operations."""
+"""Publish frames again under the names of their services, each by a writer of its own."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from skinware.transfer.generation import Generation, RecordedSample
 
 _TIMES_OF_DRIVERS = ("module_time_ns", "group_time_ns", "bus_since_ns")
 """Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""
-_OTHERS = "this is a recording"
 
 
 @dataclass
@@ -29,12 +28,11 @@ class Published:
     """A service that is published.
 
     Attributes:
-        writer: of it.
-        fd: by which requests come.
-        generation: that the newest frame has in the recording.
-        speed: of the replay when the writer's generation began, which told its rate to readers.
-        was_paused: its writer had paused it, in the recording.
-        waiting: who asked for a frame that is acquired from then on, CLOCK_MONOTONIC ns.
+        fd: readable when requests come.
+        generation: original one of the newest frame.
+        speed: of the replay when the writer's generation began; its rate depends on it.
+        was_paused: the original writer is paused.
+        waiting: requests for a newer frame, each with the time at which it came.
     """
 
     writer: ServiceWriter
@@ -46,21 +44,20 @@ class Published:
 
 
 class Republisher:
-    """Publishes frames that were published before: of a recording, or of another machine.
+    """Publishes frames of a recording, or of another machine.
 
-    Times are moved to now, unless they are to be kept: a frame and all times in it by as much as lies between its
-    publication then and now, so that ages stay as they were, whatever the speed.
+    By default all times of a frame are moved by the time between its two publications, so that ages stay as they were.
 
     Args:
         namespace: where to publish.
         operations: that every service offers, also while it is paused.
-        keeps_times: they stay as they were recorded.
-        keeps_counts: frames have the numbers that they have where they come from, so that readers know what they lost
-            even if another process published before; otherwise each new writer counts on from the last one.
+        keeps_times: publish times as they were recorded.
+        keeps_counts: frames keep their numbers, so that readers know what they lost even if another process published
+            before; otherwise a new writer counts on from the one before.
 
     Attributes:
-        frames: of each service that were published.
-        speed: 2.0: twice as fast as they were recorded; told to readers as the rate.
+        frames: number of published frames of each service.
+        speed: 2.0 for twice the recorded speed; readers see it in the rate.
     """
 
     def __init__(
@@ -76,7 +73,7 @@ class Republisher:
         self._services: dict[str, Published] = {}
         self._deserted: dict[str, Generation] = {}
         self._surplus: list[str] = []
-        self._counts: dict[str, int] = {}  # the origin's number of the frame that was published last
+        self._counts: dict[str, int] = {}  # the original number of the newest frame
         self._paused = False
         self._epoll = select.epoll()
         self._calls: dict[int, Callable[[], object]] = {}
@@ -84,7 +81,7 @@ class Republisher:
         self.speed: float = 1.0
 
     def shift_ns(self, frame: RecordedSample) -> int:
-        """By how much times of a frame that is published now are moved."""
+        """Return by how much to move the times of a frame that is published now."""
         return now_ns() - frame.published_ns
 
     def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:  # noqa: ARG002
@@ -95,9 +92,9 @@ class Republisher:
 
         Args:
             name: of the service.
-            frame: of it.
+            frame: to be published.
             generation: of the frame.
-            follows: it comes after the frame before, so that a restart between them is one; otherwise only other
+            follows: it comes after the frame before, so that another generation means a restart; otherwise only other
                 columns or tables begin a new generation.
 
         Raises:
@@ -112,12 +109,12 @@ class Republisher:
         service.was_paused = False
         if writer.paused:
             writer.resume()
-        lost = self._lost_before(name, count) if follows else 0
-        if lost and (lost + 1) % writer.slots == 0:  # it would take the slot of the newest frame, or leave out one more
+        lost = max(0, count - self._counts.get(name, count) - 1) if follows else 0
+        if lost and (lost + 1) % writer.slots == 0:  # the frame would get the slot of the newest one, or miss one more
             self._restructure(service, skip=lost)
             lost = 0
         columns = writer.begin(skip=lost, contents=frame.slot)
-        shift_ns = self.shift_ns(frame)  # last, so that filling the columns makes no frame older
+        shift_ns = self.shift_ns(frame)  # last: filling the columns takes time
         if generation.is_driver and not self._keeps_times:
             for into in (columns[column] for column in _TIMES_OF_DRIVERS if column in columns):
                 into[into != 0] += shift_ns
@@ -125,11 +122,15 @@ class Republisher:
         writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
         self._counts[name] = count
         self.frames[name] += 1
-        self._reply(service, acquired_ns)
+        answered = [request for time_ns, request in service.waiting if time_ns <= acquired_ns]
+        service.waiting = [(t, r) for t, r in service.waiting if t > acquired_ns and not r.cancelled]
+        for request in answered:
+            request.reply(position=writer.position)
         if self._paused:
             self._apply_pause(service)
 
     def happened(self, name: str, event: str) -> None:
+        """Apply an event of the original service."""
         service = self._services.get(name)
         if service is None:
             return
@@ -145,11 +146,11 @@ class Republisher:
             self._apply_pause(service)
 
     def withdraw_later(self, name: str) -> None:
-        """A service is not there any more, from the next ``tidy`` on: who asked for that is answered before."""
+        """Withdraw a service at the next ``tidy``, so that the request that caused it is answered before."""
         self._surplus.append(name)
 
     def tidy(self) -> None:
-        """Withdraw what is not there any more, and keep the files of the others."""
+        """Withdraw services that are not needed any more, and keep the files of the others."""
         for name in self._surplus:
             if name in self._services:
                 self._remove(name)
@@ -158,7 +159,7 @@ class Republisher:
             service.writer.keep_files()
 
     def watch(self, fd: int, call: Callable[[], object]) -> None:
-        """While requests are waited for, call something whenever a descriptor can be read."""
+        """Make ``answer`` call something whenever a descriptor can be read."""
         self._calls[fd] = call
         self._epoll.register(fd, select.EPOLLIN)
 
@@ -168,10 +169,10 @@ class Republisher:
                 self._epoll.unregister(fd)
 
     def answer(self, timeout_s: float) -> None:
-        """Carry out what is asked for.
+        """Carry out requests.
 
         Args:
-            timeout_s: longest wait for something, in full milliseconds.
+            timeout_s: longest wait for a request, in full milliseconds.
         """
         for fd, _ in self._epoll.poll(timeout_s):
             call = self._calls.get(fd)
@@ -191,9 +192,11 @@ class Republisher:
         service = self._services.get(name)
         if service is not None and service.generation is generation and service.speed == self.speed:
             return service
-        if service is not None and _kind_of(service.generation) != _kind_of(generation):
-            self._remove(name)
-            service = None
+        if service is not None:
+            old = service.generation
+            if (old.kind, old.slot_count) != (generation.kind, generation.slot_count):
+                self._remove(name)
+                service = None
         if service is None:
             return self._begin(name, generation, count)
         before, service.generation = service.generation, generation
@@ -215,7 +218,7 @@ class Republisher:
             self._counts[name] = published_before
         self._deserted.pop(name, None)
         server = writer.request_server()
-        server.while_paused, server.why_no_others = frozenset(self._operations), _OTHERS
+        server.while_paused, server.why_no_others = frozenset(self._operations), "this is a recording"
         service = self._services[name] = Published(writer, server.fileno(), generation, self.speed)
         self.watch(service.fd, lambda: self.take_requests(name, service))
         return service
@@ -249,17 +252,6 @@ class Republisher:
     def take_requests(self, name: str, service: Published) -> None:  # noqa: ARG002
         service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
 
-    def _lost_before(self, name: str, count: int) -> int:
-        """How many frames are missing between the one that has a number and the one that was published last."""
-        return max(0, count - self._counts.get(name, count) - 1)
-
-    @staticmethod
-    def _reply(service: Published, acquired_ns: int) -> None:
-        answered = [request for time_ns, request in service.waiting if time_ns <= acquired_ns]
-        service.waiting = [(t, r) for t, r in service.waiting if t > acquired_ns and not r.cancelled]
-        for request in answered:
-            request.reply(position=service.writer.position)
-
     def _remove(self, name: str, *, deserted: bool = False) -> None:
         service = self._services.pop(name)
         self.unwatch(service.fd)
@@ -268,10 +260,6 @@ class Republisher:
             self._deserted[name] = service.generation
         else:
             service.writer.close()
-
-
-def _kind_of(generation: Generation) -> tuple[str, int]:
-    return generation.kind, generation.slot_count
 
 
 def _tables(generation: Generation) -> dict[str, npt.NDArray[Any]]:

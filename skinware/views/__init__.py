@@ -1,1 +1,1 @@
-"""What a view of a skin needs, whatever it is drawn with: drivers followed live, places, levels, states."""
+"""Views of a skin: drivers followed live, places, levels and states, and the server of the page."""

@@ -20,7 +20,7 @@ _WORD = 4
 
 
 def account_of(peer: tuple[str, int], here: tuple[str, int]) -> int | None:
-    """The user id of the other end's owner; None where the kernel does not tell.
+    """Return the user id of the other end's owner; None where the kernel does not show it.
 
     Args:
         peer: address and port of the other end, on this machine.
@@ -39,14 +39,14 @@ def account_of(peer: tuple[str, int], here: tuple[str, int]) -> int | None:
 
 
 def _in_table(end: tuple[str, int]) -> str:
-    """As the tables have it: words of the address in the order of the machine, and the port."""
+    """Return an end as the tables write it: words of the address in the byte order of the machine, and the port."""
     address = ipaddress.ip_address(end[0]).packed
     words = [int.from_bytes(address[at : at + _WORD], sys.byteorder) for at in range(0, len(address), _WORD)]
     return "".join(f"{word:08X}" for word in words) + f":{end[1]:04X}"
 
 
 class Refused(Exception):
-    """A request that is not answered.
+    """A request is refused.
 
     Attributes:
         status: of the answer.
@@ -58,11 +58,11 @@ class Refused(Exception):
 
 
 class Access:
-    """Who may.
+    """Decide which requests may be answered.
 
     Args:
-        host: that the server listens at.
-        token: that is needed; None: this account may look, and root. Where other machines can connect, give one.
+        host: address at which the server listens.
+        token: that requests need; None: this account and root may look. Give one where other machines can connect.
     """
 
     def __init__(self, host: str, token: str | None = None) -> None:
@@ -72,20 +72,20 @@ class Access:
         self._hosts = None if not is_loopback(host) else {"localhost", "127.0.0.1", "::1", host.lower()}
 
     def check(self, target: str, headers: Mapping[str, str]) -> None:
-        """Make sure that a request may be answered.
+        """Check that a request may be answered.
 
         Args:
-            target: path and query that are asked for.
+            target: path and query of the request.
             headers: of the request.
 
         Raises:
-            Refused: it may not.
+            Refused: it may not be answered.
             ValueError: something in it cannot be an address.
         """
         host = _only(headers, "Host")
         name = urlsplit(f"http://{host}").hostname
         if not host or (self._hosts is not None and name not in self._hosts):
-            raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so: open the address that skin-view printed")
+            raise Refused(HTTPStatus.FORBIDDEN, "this server has another name: open the address that skin-view printed")
         origin = _only(headers, "Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             raise Refused(HTTPStatus.FORBIDDEN, "pages of other sites may not see this skin")
@@ -96,14 +96,14 @@ class Access:
             raise Refused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
 
     def check_account(self, peer: tuple[str, int], here: tuple[str, int]) -> None:
-        """Make sure that the account at the other end of a connection may look.
+        """Check that the account at the other end of a connection may look.
 
         Args:
             peer: address and port of that end.
             here: those of this end.
 
         Raises:
-            Refused: it may not.
+            Refused: it may not look.
         """
         if self.token is None and account_of(peer, here) not in (os.geteuid(), 0):
             raise Refused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
@@ -118,7 +118,7 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """By which a browser keeps the token, out of sight of the page."""
+        """The cookie in which a browser keeps the token, out of sight of the page."""
         return f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
 

@@ -1,29 +1,37 @@
-"""All drivers of a namespace, followed live: they come, die, come back changed, and go."""
+"""Follow drivers live, and the services about them: contacts, motion, calmed drivers, and bridges."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.bridge_state import BridgeReader, BridgeState
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.drivers import Drivers
+from skinware.errors import NamespaceError, StructureError
 from skinware.memory.namespace import Namespace
+from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.state import SkinHealth, health_of
+from skinware.state import DriverReport, report_of
 from skinware.structure import Structure
+from skinware.tactile.contacts import Contact
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.tactile.motion_service import MotionReader, MotionSample
+from skinware.tactile.source_service import SourceReader
 
-_LOOK_EVERY_NS = NS_PER_S // 4
 _RATE_WINDOW_NS = 2 * NS_PER_S
-_SAMPLE_EVERY_NS = NS_PER_S // 10
+_COUNT_EVERY_NS = NS_PER_S // 10
+_CALM_WITHIN_NS = 20_000_000
+"""A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 
 
-class _Sample(NamedTuple):
-    """One frame: when it was published, its number, and (n_patches,) how often modules of each patch were updated."""
+class _Count(NamedTuple):
+    """When a snapshot was published, its number, and (n_patches,) the updates of the modules of each patch so far."""
 
     time_ns: int
     sequence: int
@@ -31,17 +39,17 @@ class _Sample(NamedTuple):
 
 
 class LiveDriver:
-    """One driver and its newest frame.
+    """One driver and its newest snapshot.
 
     Attributes:
-        reader: its reader.
-        frame: its newest frame; None before the first.
+        reader: of the driver.
+        frame: its newest snapshot; None before the first.
     """
 
     def __init__(self, reader: DriverReader) -> None:
         self.reader = reader
         self.frame: DriverSnapshot | None = None
-        self._samples: deque[_Sample] = deque()  # of one generation
+        self._counts: deque[_Count] = deque()  # of one generation
 
     @property
     def name(self) -> str:
@@ -49,135 +57,264 @@ class LiveDriver:
 
     @property
     def structure(self) -> Structure:
-        """Of its newest frame; before the first of the service."""
+        """The structure of its newest snapshot, before the first that of the service."""
         return self.reader.structure if self.frame is None else self.frame.structure
-
-    def poll(self) -> bool:
-        """Take the newest frame if there is a newer one; never waits.
-
-        Returns:
-            Whether ``frame`` is another one now.
-
-        Raises:
-            ServiceNotFound: the driver was withdrawn just as it had changed.
-            BadServiceFile: it came back as something that cannot be read.
-        """
-        position = self.reader.refresh()
-        if self.reader.structure_changed:
-            self.reader.reattach()
-            position = self.reader.latest
-        if position is None or (self.frame is not None and position == self.frame.position):
-            return False
-        try:
-            frame = self.reader.read(timeout_s=0.0)
-        except (ServiceTimeout, Overrun):
-            return False  # it restarted this very moment, or is too fast; the next poll may be luckier
-        self._sample(frame)
-        self.frame = frame
-        return True
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames per second over the last two seconds; shortly after a start, over the frames in the ring."""
-        passed_s = self._passed_s
+        """Snapshots per second over the last two seconds; shortly after a start, over those in the ring."""
+        passed_s = self._counted_s()
         if not passed_s:
             return self.reader.rate_hz()
-        return (self._samples[-1].sequence - self._samples[0].sequence) / passed_s
+        return (self._counts[-1].sequence - self._counts[0].sequence) / passed_s
 
     @property
     def patch_rates_hz(self) -> list[float | None]:
         """Updates per second of each patch's modules over the last two seconds.
 
-        None shortly after a start, and of a driver that does not count them.
+        None shortly after a start, and for a driver that does not count them.
         """
-        structure, passed_s = self.structure, self._passed_s
-        if not passed_s or not self._samples[-1].updates.any():
+        structure, passed_s = self.structure, self._counted_s()
+        if not passed_s or not self._counts[-1].updates.any():
             return [None] * structure.n_patches
         modules = np.bincount(structure.module_patch, minlength=structure.n_patches)
-        updates = self._samples[-1].updates - self._samples[0].updates
+        updates = self._counts[-1].updates - self._counts[0].updates
         rates: list[float | None] = (updates / np.maximum(modules, 1) / passed_s).tolist()
         return rates
 
-    @property
-    def _passed_s(self) -> float:
-        """What the samples span, s; 0 if that is too little to tell a rate."""
-        passed_ns = self._samples[-1].time_ns - self._samples[0].time_ns if self._samples else 0
-        return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
+    def report(self) -> DriverReport:
+        return report_of(self.reader, self.frame, self.rate_hz, self.patch_rates_hz)
 
-    def health(self) -> SkinHealth:
-        return health_of(self.reader, self.frame, self.rate_hz)
-
-    def _sample(self, frame: DriverSnapshot) -> None:
-        samples = self._samples
+    def take(self, frame: DriverSnapshot) -> None:
+        """Make a snapshot the newest one."""
+        counts = self._counts
         if self.frame is not None and frame.generation != self.frame.generation:
-            samples.clear()
-        if samples and frame.published_ns - samples[-1].time_ns < _SAMPLE_EVERY_NS:
+            counts.clear()
+        self.frame = frame
+        if counts and frame.published_ns - counts[-1].time_ns < _COUNT_EVERY_NS:
             return
-        samples.append(
-            _Sample(frame.published_ns, frame.sequence, frame.patch_interval_counts.sum(axis=1).astype(np.int64))
-        )
-        while frame.published_ns - samples[0].time_ns > _RATE_WINDOW_NS:
-            samples.popleft()
+        updates = frame.patch_interval_counts.sum(axis=1).astype(np.int64)
+        counts.append(_Count(frame.published_ns, frame.sequence, updates))
+        while frame.published_ns - counts[0].time_ns > _RATE_WINDOW_NS:
+            counts.popleft()
+
+    def _counted_s(self) -> float:
+        """Return the time between the first and the last count, s; 0 if it is too short to measure a rate."""
+        passed_ns = self._counts[-1].time_ns - self._counts[0].time_ns if self._counts else 0
+        return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
 
 
 class LiveDrivers:
-    """The drivers that a namespace has now, dead ones among them as long as their last frame can be read.
+    """The drivers of a namespace, dead ones too as long as their last snapshot can be read.
 
     Args:
         namespace: where to look.
         names: of the drivers to follow; default: all.
-
-    Attributes:
-        others: names of the services that are no drivers.
     """
 
     def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
         self.namespace = namespace
-        self._wanted = frozenset(names)
-        self.others: tuple[str, ...] = ()
-        self._drivers: dict[str, LiveDriver] = {}
-        self._next_look_ns = 0
+        self._drivers = Drivers(namespace, DriverReader, names or None)
+        self._live: dict[str, LiveDriver] = {}
 
     def get(self, name: str) -> LiveDriver | None:
-        return self._drivers.get(name)
+        return self._live.get(name)
 
     def look(self) -> list[LiveDriver]:
-        """All drivers, by name, after looking for new ones and for those that went (four times a second at most).
+        """Look for drivers that came or went, if that is due, and return all by name.
 
         Raises:
             NamespaceError: the namespace cannot be trusted or read.
         """
-        if now_ns() >= self._next_look_ns:
-            self._next_look_ns = now_ns() + _LOOK_EVERY_NS
-            names = self.namespace.services()
-            for name in [name for name in self._drivers if name not in names]:
-                self._drop(name)
-            for name in names:
-                if name not in self._drivers and (not self._wanted or name in self._wanted):
-                    self._attach(name)
-            self._drivers = dict(sorted(self._drivers.items()))
-            self.others = tuple(name for name in names if name not in self._drivers)
-        return list(self._drivers.values())
+        self._drivers.look()
+        if self._drivers.trouble:
+            raise NamespaceError(self._drivers.trouble)
+        self._keep()
+        return list(self._live.values())
 
     def poll(self, driver: LiveDriver) -> bool:
-        """``driver.poll()``; one that cannot be read any more is dropped, until it can."""
-        try:
-            return driver.poll()
-        except (ServiceNotFound, BadServiceFile):
-            self._drop(driver.name)
-            return False
+        """Take the newest snapshot of a driver, and return whether there was a newer one. It never waits."""
+        frame = self._drivers.newest(driver.name, newer_than=driver.frame)
+        if frame is not None:
+            driver.take(frame)
+        else:
+            self._keep()
+        return frame is not None
 
     def close(self) -> None:
-        for driver in self._drivers.values():
-            driver.reader.close()
-        self._drivers = {}
+        self._drivers.close()
+        self._live = {}
 
-    def _attach(self, name: str) -> None:
-        try:
-            reader = DriverReader(name, namespace=self.namespace)
-        except (BadServiceFile, ConfigurationError, ServiceNotFound):
-            return  # no driver (skin-info says what is wrong with it), or just gone
-        self._drivers[name] = LiveDriver(reader)
+    def _keep(self) -> None:
+        readers = self._drivers.readers
+        if [live.reader for live in self._live.values()] != list(readers.values()):
+            kept = {id(live.reader): live for live in self._live.values()}
+            self._live = {name: kept.get(id(reader)) or LiveDriver(reader) for name, reader in readers.items()}
 
-    def _drop(self, name: str) -> None:
-        self._drivers.pop(name).reader.close()
+
+class LiveBridges(Drivers[BridgeReader]):
+    """The bridges of a namespace.
+
+    Args:
+        namespace: where to look.
+    """
+
+    def __init__(self, namespace: Namespace) -> None:
+        super().__init__(namespace, BridgeReader)
+
+    def states(self) -> list[BridgeState]:
+        """Return the state of each bridge whose program lives."""
+        samples = [self.newest(name) for name in list(self.readers)]
+        return [sample.state for sample in samples if sample is not None and not sample.stale]
+
+
+class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
+    """The services of one kind in a namespace, each of which is about one driver."""
+
+    def of(self, driver: str) -> SampleT | None:
+        """Return the newest sample of the service for a driver; None where no living service has one."""
+        for name, reader in self.readers.items():
+            if reader.source.driver == driver:
+                sample: SampleT | None = self.newest(name)
+                return None if sample is None or sample.stale else sample
+        return None
+
+
+def live_contacts(namespace: Namespace) -> LiveSources[ContactsSample]:
+    return LiveSources(namespace, ContactsReader)
+
+
+class TactileServices:
+    """Calmed drivers, contacts and motion for the drivers of a namespace, from it and from the namespace of calm.
+
+    Args:
+        drivers: of the namespace.
+        names: of the drivers that count; default: all.
+        calm: namespace of calmed drivers; None: without it.
+    """
+
+    def __init__(self, drivers: LiveDrivers, names: Collection[str] = (), calm: Namespace | None = None) -> None:
+        self._calm = None if calm is None else LiveDrivers(calm, names)
+        namespaces = [drivers.namespace, *([] if calm is None else [calm])]
+        self._contacts = [live_contacts(namespace) for namespace in namespaces]
+        self._motion = [LiveSources[MotionSample](namespace, MotionReader) for namespace in namespaces]
+
+    def look(self) -> None:
+        """Look for services that came or went.
+
+        Raises:
+            NamespaceError: the namespace of calmed drivers cannot be trusted or read.
+        """
+        if self._calm is not None:
+            self._calm.look()
+        for contacts, motion in zip(self._contacts, self._motion, strict=True):
+            contacts.look()
+            motion.look()
+
+    def is_due(self, live: LiveDriver) -> bool:
+        """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
+        frame, calm = live.frame, None if self._calm is None else self._calm.get(live.name)
+        if frame is None or calm is None or self._calm is None:
+            return frame is not None
+        self._calm.poll(calm)
+        is_here = calm.frame is not None and calm.frame.acquired_ns >= frame.acquired_ns
+        return is_here or now_ns() - frame.published_ns > _CALM_WITHIN_NS
+
+    def calm_of(self, driver: str) -> DriverSnapshot | None:
+        """Return the newest snapshot of a calmed driver; None where no living service publishes one."""
+        calm = None if self._calm is None else self._calm.get(driver)
+        return None if calm is None or calm.frame is None or calm.frame.stale else calm.frame
+
+    def contacts_of(self, driver: str) -> ContactsSample | None:
+        return next((sample for source in self._contacts if (sample := source.of(driver)) is not None), None)
+
+    def motion_of(self, driver: str) -> MotionSample | None:
+        return next((sample for source in self._motion if (sample := source.of(driver)) is not None), None)
+
+    def close(self) -> None:
+        for contacts, motion in zip(self._contacts, self._motion, strict=True):
+            contacts.close()
+            motion.close()
+        if self._calm is not None:
+            self._calm.close()
+
+
+class TouchedPlace(NamedTuple):
+    """A contact, and its place on the skin.
+
+    Attributes:
+        contact: from the service of contacts.
+        unit: of its load.
+        sensor: position in a snapshot of the taxel nearest to its centre; of its first taxel where places are not
+            known.
+        module: name of the module of that taxel.
+    """
+
+    contact: Contact
+    unit: str
+    sensor: int
+    module: str
+
+
+def places_of(frame: ContactsSample | None, structure: Structure) -> list[TouchedPlace]:
+    """Return the places of contacts, the oldest first; none if they are of other sensors than those of the driver.
+
+    Args:
+        frame: the contacts; None: there are none.
+        structure: of their driver now.
+    """
+    if frame is None:
+        return []
+    source = frame.source
+    try:
+        sensors = np.arange(structure.n_sensors)[structure.index(source.type_name)]
+    except StructureError:
+        return []
+    if not np.array_equal(structure.sensor_uid[sensors], source.uid):
+        return []
+    found = []
+    for contact in frame:
+        own = sensors[contact.taxels]
+        nearest = 0
+        if structure.geometry is not None:
+            away_m = np.linalg.norm(structure.geometry.position_m[own] - contact.cop_m, axis=1)
+            nearest = int(np.nan_to_num(away_m, nan=np.inf).argmin())
+        sensor = int(own[nearest])
+        module = structure.module_names[structure.sensor_module[sensor]]
+        found.append(TouchedPlace(contact, source.unit, sensor, module))
+    return found
+
+
+class Overview:
+    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges.
+
+    Args:
+        namespace: to follow.
+    """
+
+    def __init__(self, namespace: Namespace) -> None:
+        self.drivers = LiveDrivers(namespace)
+        self.contacts = live_contacts(namespace)
+        self.bridges = LiveBridges(namespace)
+
+    def look(self) -> list[LiveDriver]:
+        """Look for what came or went, take the newest snapshots without waiting, and return all drivers by name.
+
+        Raises:
+            NamespaceError: the namespace cannot be trusted or read.
+        """
+        for driver in self.drivers.look():
+            self.drivers.poll(driver)
+        self.contacts.look()
+        self.bridges.look()
+        return self.drivers.look()
+
+    def contacts_on(self, driver: LiveDriver) -> list[TouchedPlace] | None:
+        """Return the contacts on a driver with their places; None where no service publishes any."""
+        sample = self.contacts.of(driver.name)
+        return None if sample is None else places_of(sample, driver.structure)
+
+    def close(self) -> None:
+        self.bridges.close()
+        self.contacts.close()
+        self.drivers.close()

@@ -1,4 +1,4 @@
-"""What a page may ask for: the operations of the protocol, read from JSON."""
+"""Read the operations that a page may ask for from JSON."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from skinware.errors import ConfigurationError
 from skinware.views.looks import DEFAULT_FPS, Mode
 
 MOST_EXACT = 32
-"""Sensors whose values are told as they are, at once."""
+"""Sensors whose exact values are sent, at most."""
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
 
 
 class Next(msgspec.Struct, tag_field="op", tag="next"):
-    """Asks for the next turn."""
+    """Ask for the next turn."""
 
     protocol: str | None = None
 
 
 class Choose(msgspec.Struct, tag_field="op", tag="look"):
-    """Chooses what is looked at."""
+    """Choose mode, quantity, scale and pace."""
 
     mode: Mode = "raw"
     type: str | None = None
@@ -36,43 +36,43 @@ class Choose(msgspec.Struct, tag_field="op", tag="look"):
 
 
 class Exact(msgspec.Struct, tag_field="op", tag="exact"):
-    """Chooses the sensors whose values come as they are, as pairs of driver and position."""
+    """Choose the sensors whose exact values are sent, as pairs of driver and position."""
 
     sensors: Annotated[list[tuple[Number, Number]], msgspec.Meta(max_length=MOST_EXACT)]
 
 
 class Names(msgspec.Struct, tag_field="op", tag="names"):
-    """Asks for the names of the sensors of a driver's quantity."""
+    """Ask for the names of the sensors of a driver's quantity."""
 
     driver: Number
     type: str
 
 
 class Series(msgspec.Struct, tag_field="op", tag="series"):
-    """Asks for the last seconds of a sensor."""
+    """Ask for the last seconds of a sensor."""
 
     driver: Number
     position: Number
 
 
 class Tare(msgspec.Struct, tag_field="op", tag="tare"):
-    """Takes the present values for rest."""
+    """Take the present values for rest."""
 
 
 class Wipe(msgspec.Struct, tag_field="op", tag="wipe"):
-    """Begins a wipe test anew, or leaves it as it is."""
+    """Begin a wipe test again, or leave it as it is."""
 
     action: Literal["start", "stop"]
 
 
 class Record(msgspec.Struct, tag_field="op", tag="record"):
-    """Begins or ends a recording."""
+    """Begin or end a recording."""
 
     action: Literal["start", "stop"]
 
 
 class Replay(msgspec.Struct, tag_field="op", tag="replay"):
-    """Controls the replay that is shown."""
+    """Control the replay that is shown."""
 
     action: Literal["pause", "resume", "step", "seek", "speed", "loop"]
     value: int | float | bool | None = None
@@ -83,10 +83,10 @@ _DECODER = msgspec.json.Decoder(Operation)
 
 
 def operation_of(text: str | bytes) -> Operation:
-    """One operation from its JSON.
+    """Return an operation from its JSON.
 
     Raises:
-        ConfigurationError: it is none; the message says why.
+        ConfigurationError: this is no operation; the message says why.
     """
     try:
         operation: Operation = _DECODER.decode(text)

@@ -15,23 +15,23 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import PendingRequest
 from skinware.service.messages import OPERATIONS
 from skinware.state import DEAD
-from skinware.views.following import Followed
+from skinware.views.following import ShownDriver
 
 _END_S = 10.0
-"""How long it may take to complete its file."""
+"""Time for a recording to complete its file."""
 
 
 class Recording:
-    """Runs ``skin-record``, once at a time.
+    """Run ``skin-record``, one at a time.
 
     Args:
-        program: that records until its standard input is closed; takes arguments as ``skin-record`` does.
-        namespace: of what is recorded.
+        program: that records until its standard input is closed, with the arguments of ``skin-record``.
+        namespace: to record.
         names: of the drivers; default: everything.
-        folder: where the files go.
+        folder: of the files.
 
     Attributes:
-        problem: why the last one ended by itself; None: it did not.
+        problem: why the last recording ended by itself; None: it did not.
     """
 
     def __init__(
@@ -42,32 +42,32 @@ class Recording:
         self._folder = folder or Path.cwd()
         self._file = Path()
         self._begin_s = 0.0
-        self._told: dict[str, Any] = {}
+        self._report: dict[str, Any] = {}
         self._running: asyncio.Task[None] | None = None
         self._process: asyncio.subprocess.Process | None = None
 
     @property
     def state(self) -> dict[str, Any] | None:
-        """How it goes; None while nothing is recorded."""
+        """The file, its size, losses and duration; None while nothing is recorded."""
         if self._running is None:
             return None
-        told = {name: self._told.get(name, 0) for name in ("bytes", "lost")}
-        return {"file": str(self._file), **told, "s": round(time.monotonic() - self._begin_s, 1)}
+        figures = {name: self._report.get(name, 0) for name in ("bytes", "lost")}
+        return {"file": str(self._file), **figures, "s": round(time.monotonic() - self._begin_s, 1)}
 
     def start(self) -> None:
-        """Begin to record, if it does not go on already."""
+        """Begin to record, unless a recording runs."""
         if self._running is None:
-            self.problem, self._told, self._begin_s = None, {}, time.monotonic()
+            self.problem, self._report, self._begin_s = None, {}, time.monotonic()
             self._file = self._folder / time.strftime("skin-%Y%m%d-%H%M%S.mcap")
             self._running = asyncio.create_task(self._run())
 
     def stop(self) -> None:
-        """End it in good order; ``state`` is None when the file is complete."""
+        """End the recording in good order; ``state`` is None when the file is complete."""
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
     async def close(self) -> None:
-        """End it, and wait for that."""
+        """End the recording, and wait for the end."""
         if self._running is None:
             return
         self.stop()
@@ -96,38 +96,38 @@ class Recording:
     async def _listen(self, process: asyncio.subprocess.Process) -> None:
         assert process.stdout is not None  # noqa: S101 - it is a pipe
         async for line in process.stdout:
-            self._told = json.loads(line)
+            self._report = json.loads(line)
 
 
 async def _all_of(stream: asyncio.StreamReader | None) -> str:
     return "" if stream is None else (await stream.read()).decode(errors="replace")
 
 
-_TELL = "replay"
-"""Operation of every service of a replay: how it goes; the answer of the others is the same."""
+_STATE = "replay"
+"""Operation of every service of a replay that returns its state; the other operations return it too."""
 _VALUES = {"pause": None, "resume": None, "step": "frames", "seek": "time_s", "speed": "factor", "loop": "on"}
-"""The operations, with the name of the argument that each has."""
+"""The operations, each with the name of its argument."""
 _ASK_EVERY_NS = NS_PER_S // 4
 _PATIENCE_NS = 2 * NS_PER_S
 
 
 class ReplayControl:
-    """Looks whether a driver is one of a replay, and has it do what viewers ask for.
+    """Find a driver of a replay, and control the replay for viewers.
 
     Attributes:
-        state: how the replay goes; None: what is shown is none.
+        state: of the replay; None: no replay is shown.
     """
 
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
-        self._replayed: Followed | None = None
-        self._others: dict[str, int] = {}  # drivers that are of no replay, and their generations
-        self._asked: _Asked | None = None
-        self._acts: list[_Asked] = []
+        self._replayed: ShownDriver | None = None
+        self._others: dict[str, int] = {}  # drivers of no replay, and their generations
+        self._asked: _Question | None = None
+        self._acts: list[_Question] = []
         self._next_ns = 0
 
-    def follow(self, drivers: Sequence[Followed]) -> None:
-        """Take the answers that have come, and ask again; never waits."""
+    def follow(self, drivers: Sequence[ShownDriver]) -> None:
+        """Take answers, and ask again; never wait."""
         self._acts = [act for act in self._acts if not act.is_done()]
         if self._asked is not None and self._asked.is_done():
             self._asked = None
@@ -140,52 +140,52 @@ class ReplayControl:
         if driver is None:
             return
         if driver is self._replayed:
-            self._asked = _Asked(driver, _TELL, {}, self._hear, lambda _: self._forget(driver))
+            self._asked = _Question(driver, _STATE, {}, self._hear, lambda _: self._forget(driver))
         else:
-            self._asked = _Asked(
+            self._asked = _Question(
                 driver, OPERATIONS, {}, lambda found: self._learn(driver, found), lambda _: self._forget(driver)
             )
 
     def act(self, action: str, value: int | float | bool | None, complain: Callable[[str], object]) -> None:
-        """Have the replay do something.
+        """Call an operation of the replay.
 
         Args:
-            action: an operation.
-            value: of its argument; None: as it has it.
-            complain: called with why it was not done.
+            action: name of the operation.
+            value: of its argument; None: its default.
+            complain: called with the reason if the operation failed.
 
         Raises:
-            ConfigurationError: what is shown is no replay, or no such operation.
+            ConfigurationError: no replay is shown, or there is no such operation.
         """
         if self._replayed is None or action not in _VALUES:
-            raise ConfigurationError("what is shown is no replay")
+            raise ConfigurationError("no replay is shown")
         name = _VALUES[action]
         arguments = {} if name is None or value is None else {name: value}
-        self._acts.append(_Asked(self._replayed, action, arguments, self._hear, complain))
+        self._acts.append(_Question(self._replayed, action, arguments, self._hear, complain))
 
-    def _may_be(self, driver: Followed) -> bool:
+    def _may_be(self, driver: ShownDriver) -> bool:
         return driver.life != DEAD and self._others.get(driver.name) != driver.live.reader.generation
 
-    def _learn(self, driver: Followed, operations: dict[str, str]) -> None:
-        if _TELL in operations and operations.keys() >= _VALUES.keys():
+    def _learn(self, driver: ShownDriver, operations: dict[str, str]) -> None:
+        if _STATE in operations and operations.keys() >= _VALUES.keys():
             self._replayed, self._next_ns = driver, 0
         else:
             self._forget(driver)
 
-    def _forget(self, driver: Followed) -> None:
+    def _forget(self, driver: ShownDriver) -> None:
         self._others[driver.name] = driver.live.reader.generation
         self._replayed = self.state = None
 
-    def _hear(self, told: dict[str, Any]) -> None:
-        self.state = told
+    def _hear(self, state: dict[str, Any]) -> None:
+        self.state = state
 
 
-class _Asked:
-    """Something that a driver was asked for."""
+class _Question:
+    """A request to a driver, with what follows its answer."""
 
     def __init__(
         self,
-        driver: Followed,
+        driver: ShownDriver,
         operation: str,
         arguments: dict[str, Any],
         then: Callable[[Any], object],
@@ -200,7 +200,7 @@ class _Asked:
             fail(str(error))
 
     def is_done(self) -> bool:
-        """Whether it was answered, one way or another; who asked was told then."""
+        """Return whether the answer or an error came; the function for it has been called then."""
         if self._pending is None:
             return True
         if not self._pending.done() and now_ns() < self._late_ns:

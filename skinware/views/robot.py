@@ -1,15 +1,15 @@
-"""The robot under the skin: where its links are, and the meshes that they are drawn with.
+"""Read the robot under the skin: the places of its links, and their meshes.
 
-From a file of ours::
+From a file of links::
 
     format = "skinware-links"
     version = 1
 
     [[link]]
     frame = "chest"           # name of a coordinate frame of the geometry
-    mesh = "chest.stl"        # beside this file; may be left out: then the link is only placed
-    scale = 0.001             # of the mesh, which is in mm here; 1 if left out
-    xyz = [0.0, 0.0, 1.1]     # m, and rotations about the fixed x, y and z, rad; 0 if left out
+    mesh = "chest.stl"        # beside this file; without it the link is only placed
+    scale = 0.001             # of the mesh, which is in mm here; default: 1
+    xyz = [0.0, 0.0, 1.1]     # m, and rotations about the fixed x, y and z, rad; default: 0
     rpy = [0.0, 0.0, 1.57]
 
 or from a URDF file: its links with all joints at 0, and the STL meshes of their visuals.
@@ -37,11 +37,11 @@ _NOWHERE: Triple = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """What a link is drawn with.
+    """The mesh of a link.
 
     Attributes:
         frame: the link's coordinate frame.
-        file: with the mesh (STL).
+        file: of the mesh (STL).
         pose: (4, 4) of the mesh in that frame, with its scale.
     """
 
@@ -57,7 +57,7 @@ class Robot:
     Attributes:
         poses: (4, 4) of each frame, by name.
         meshes: of links.
-        left_out: what could not be taken from the file, for people.
+        left_out: the parts of the file that could not be used, for people.
     """
 
     poses: dict[str, Pose] = field(default_factory=dict)
@@ -83,13 +83,13 @@ def read_robot(path: Path) -> Robot:
     """Read a file of links, or a URDF file.
 
     Raises:
-        ConfigurationError: not there, none of both, or something in it is wrong; the message says where.
+        ConfigurationError: it does not exist, is of another format, or is wrong; the message says where.
     """
     return _from_urdf(path) if path.suffix in (".urdf", ".xml") else _from_toml(path)
 
 
 def pose_of(xyz: Triple, rpy: Triple) -> Pose:
-    """(4, 4): from a translation, m, and rotations about the fixed axes x, y and z, rad."""
+    """Return (4, 4) from a translation, m, and rotations about the fixed axes x, y and z, rad."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     pose = np.eye(4)
     pose[:3, :3] = [
@@ -141,7 +141,7 @@ def _from_urdf(path: Path) -> Robot:
 
 
 def _poses(robot: ElementTree.Element) -> dict[str, Pose]:
-    """Where all links are, with all joints at 0."""
+    """Return the places of all links with all joints at 0."""
     above: dict[str, tuple[str, Pose]] = {}
     for joint in robot.iterfind("joint"):
         parent, child = (_name(joint.find(which), "link") for which in ("parent", "child"))
@@ -182,7 +182,7 @@ def _visuals(robot: ElementTree.Element, path: Path) -> tuple[list[Mesh], list[s
 
 
 def _file(name: str, urdf: Path) -> Path | None:
-    """A file that a URDF names: beside it, or in the package that has it in one of its folders."""
+    """Find a file that a URDF names: beside it, or in the package that contains it in one of its folders."""
     scheme, has_scheme, rest = name.partition("://")
     if not has_scheme:
         candidates = [urdf.parent / name]

@@ -21,20 +21,20 @@ Cell = tuple[int, int]
 _TRIANGLE = ((2, 5), (3, 6), (3, 4), (2, 3), (3, 2), (3, 0), (2, 1), (1, 2), (0, 3), (1, 4))
 """The ten taxels of a ROBOSKIN triangle in the order of their channels (0 to 5, 7 to 9, 11), seen from outside.
 
-They lie 6.5 mm apart in rows of one, two, three and four: see the published positions of an iCub's skin.
+They lie 6.5 mm apart in rows of one, two, three and four, as in the published positions of an iCub's skin.
 """
 _FINGERTIP = ((3, 2), (3, 4), (3, 6), (3, 8), (3, 0), (2, 6), (2, 4), (2, 2), (1, 2), (1, 4), (1, 6), (0, 4))
-"""The twelve taxels of a ROBOSKIN fingertip, unrolled, its tip above; after the map that its maker publishes."""
+"""The twelve taxels of a ROBOSKIN fingertip, unrolled, its tip above, as in the map that its maker publishes."""
 
 _BY_KIND = {("triangle", 10): _TRIANGLE, ("fingertip", 12): _FINGERTIP}
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Places of the sensors of a module.
+    """The places of the sensors of a module.
 
     Attributes:
-        cells: of each sensor, in frame order.
+        cells: one for each sensor, in the order of a snapshot.
         rows: height.
         halves: width in halves of a sensor.
     """
@@ -46,11 +46,11 @@ class Shape:
 
 @cache
 def shape_of(kind: str, count: int) -> Shape:
-    """The shape of a module.
+    """Return the shape of a module.
 
     Args:
         kind: of the module: ``triangle``, ``fingertip``, rows and columns as ``4x6``; any other is drawn as a block.
-        count: how many sensors are drawn of it.
+        count: number of its sensors that are drawn.
     """
     known = _BY_KIND.get((kind, count))
     if known is not None:
@@ -68,7 +68,7 @@ def rows_of(count: int, columns: int) -> Shape:
 
 
 def block_columns(count: int) -> int:
-    """How many of ``count`` sensors of a module are drawn side by side: a compact block with few empty places."""
+    """Return the columns of a compact block of ``count`` sensors with few empty places."""
     narrowest = math.isqrt(count - 1) + 1
     widest = max(narrowest, int(2.5 * math.sqrt(count)))
     return min(range(narrowest, widest + 1), key=lambda columns: (-count % columns, columns))
@@ -76,21 +76,21 @@ def block_columns(count: int) -> int:
 
 Places = npt.NDArray[np.float32]
 Pose = npt.NDArray[np.float64]
-"""(4, 4): where a coordinate frame is."""
+"""(4, 4): the place of a coordinate frame."""
 
 FLAT_PITCH_M = 0.0065
-"""Between sensors that are laid out flat."""
+"""Distance between sensors that are laid out flat."""
 _BETWEEN_MODULES = 1.5
 _BETWEEN_PATCHES = 3.0
 """In pitches."""
 ASPECT = 1.4
-"""Of what is laid out flat: so many times as wide as high, like the windows that show it."""
+"""Width of a flat layout divided by its height, as of the windows that show it."""
 _ROWS_OF_TRIANGLES = 3**0.5 / 2
-"""From row to row, where each is shifted by half a sensor."""
+"""Distance of rows that are shifted by half a sensor, in pitches."""
 _BETWEEN_ISLANDS = 0.15
-"""Of the width of what is beside each other; at least some pitches."""
+"""Gap between bodies, as a part of the width of the right one; at least some pitches."""
 _NOMINAL = "_nominal"
-"""Ends the name of a coordinate frame that each driver has for itself, such as ``hand_nominal``."""
+"""End of the name of a coordinate frame that each driver has for itself, such as ``hand_nominal``."""
 _SAME_PLACE_M = 1e-4
 
 
@@ -100,10 +100,10 @@ class Placed:
 
     Attributes:
         position: (n, 3) float32, m.
-        normal: (n, 3) float32, outwards, of length 1; NaN where nobody knows.
-        radius: (n,) float32, m; NaN where nobody knows.
+        normal: (n, 3) float32, outwards, of length 1; NaN where it is not known.
+        radius: (n,) float32, m; NaN where it is not known.
         is_known: whether the places of most of them are known; the others are laid out flat.
-        spacing_m: from a taxel to the nearest other, usually.
+        spacing_m: usual distance from a taxel to the nearest other.
     """
 
     position: Places
@@ -116,11 +116,11 @@ class Placed:
 class Scene:
     """Places of all taxels.
 
-    Taxels with places in one coordinate frame are one body, also those of several drivers. But a driver is a body of
-    its own in a nominal frame, and where its taxels would lie on those of another driver. The first body of a frame
-    with a pose is where the pose says; the first other body is where its numbers say; all further bodies, by the names
-    of their drivers, then taxels without places, come beside it. So nothing is drawn over something else, and the order
-    in which drivers were started changes nothing.
+    Taxels with places in one coordinate frame are one body, also those of several drivers. A driver is a body of its
+    own in a nominal frame, and where its taxels would lie on those of another driver. The first body of a frame with a
+    pose is placed by that pose, and the first other body by its own coordinates. All further bodies stand beside them
+    in the order of the names of their drivers, then taxels without places. So nothing covers anything else, and the
+    order in which drivers were started changes nothing.
 
     Args:
         drivers: structure and quantities of each driver, by name.
@@ -131,7 +131,7 @@ class Scene:
         self, drivers: Mapping[str, tuple[Structure, Sequence[Quantity]]], poses: Mapping[str, Pose] | None = None
     ) -> None:
         self._poses = dict(poses or {})
-        self._right = -np.inf  # how far what is placed so far reaches
+        self._right = -np.inf  # the right end of everything that is placed so far
         self._low, self._high = 0.0, 0.0  # its y
         self._placed: dict[tuple[str, str], Placed] = {}
         self._pose_of: dict[tuple[str, str], Pose] = {}  # by driver and frame
@@ -148,7 +148,7 @@ class Scene:
         return self._placed[driver, quantity]
 
     def pose(self, driver: str, frame: str) -> Pose:
-        """(4, 4): where a driver's coordinate frame is; the identity for a frame in which it has no taxels."""
+        """Return (4, 4), the place of a driver's coordinate frame; the identity for a frame without its taxels."""
         return self._pose_of.get((driver, frame), np.eye(4))
 
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
@@ -168,18 +168,18 @@ class Scene:
         return body.is_first and body.frame in self._poses
 
     def _way_right(self, left: float, width: float) -> float:
-        """How far something has to go so that it is on the right of all that is placed."""
+        """Return how far something must move to stand on the right of everything that is placed."""
         gap = max(_BETWEEN_ISLANDS * width, 2 * _BETWEEN_PATCHES * FLAT_PITCH_M)
         return max(0.0, float(self._right + gap - left))
 
     def _arrange_flat(self, sizes: Mapping[str, tuple[float, float]]) -> dict[str, Pose]:
-        """(3,) for each driver: the upper left corner of what is laid out flat, beside all that has places."""
+        """Return (3,) for each driver: the upper left corner of its flat layout, beside everything with places."""
         gap = max([_BETWEEN_ISLANDS * width for width, _ in sizes.values()], default=0.0)
         gap = max(gap, 2 * _BETWEEN_PATCHES * FLAT_PITCH_M)
         corners = on_shelves(list(sizes.values()), gap)
         left = max(0.0, float(self._right + gap))
         top = 0.0
-        if np.isfinite(self._right):  # it stands beside the middle of what has places
+        if np.isfinite(self._right):  # beside the middle of everything with places
             high = max((height - up for (_, up), (_, height) in zip(corners, sizes.values(), strict=True)), default=0.0)
             top = (self._low + self._high + high) / 2
         return {name: np.array([left + right, top + up, 0.0]) for name, (right, up) in zip(sizes, corners, strict=True)}
@@ -207,7 +207,7 @@ class Scene:
 
 @dataclass(eq=False)
 class _Body:
-    """The drivers whose taxels are together in a coordinate frame, and the (n, 3) places of these, m."""
+    """The drivers whose taxels are together in a coordinate frame, and the (n, 3) places of their taxels, m."""
 
     frame: str
     is_first: bool
@@ -216,7 +216,7 @@ class _Body:
 
 
 def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
-    """All bodies; the drivers of each are in the order of their names."""
+    """Return all bodies; the drivers of each are in the order of their names."""
     found: dict[str, list[_Body]] = {}
     for driver, geometry in sorted(geometries.items()):
         for frame in _frames(geometry):
@@ -232,7 +232,7 @@ def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
 
 
 def _is_same(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> bool:
-    """Whether more than half of the smaller set of (n, 3) places are also in the other."""
+    """Return whether more than half of the smaller set of (n, 3) places are also in the other."""
     sets = [np.unique(np.round(at / _SAME_PLACE_M) + 0.0, axis=0) for at in (one, other)]
     common = sum(map(len, sets)) - len(np.unique(np.concatenate(sets), axis=0))
     return 2 * common > min(map(len, sets))
@@ -243,13 +243,13 @@ def _frames(geometry: Geometry) -> list[str]:
 
 
 def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
-    """(k, 3) float32, m: places of sensors side by side in the plane z = 0, module by module in their shapes.
+    """Return (k, 3) float32, m: places of sensors in the plane z = 0, module by module in their shapes.
 
     Modules of a patch are together, in lines; patches stand side by side on shelves. The upper left corner is at 0, 0.
 
     Args:
         structure: of the driver.
-        sensors: (k,) positions in a frame.
+        sensors: (k,) positions in a snapshot.
     """
     position = np.zeros((len(sensors), 3), np.float32)
     if not len(sensors):
@@ -281,14 +281,14 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
 
 
 def on_shelves(sizes: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
-    """The upper left corners of boxes that stand in lines in their order, so that all fit into a small window.
+    """Return the upper left corners of boxes that stand in lines in their order, so that all fit into a small window.
 
     Args:
         sizes: width and height of each.
         gap: between them.
 
     Returns:
-        How far each is to the right and up; the first is at 0, 0, and others are below it at negative heights.
+        The distance of each to the right and up; the first is at 0, 0, and lower ones have negative heights.
     """
     widths = np.cumsum([width + gap for width, _ in sizes]).tolist()
     shelves = (_shelves(sizes, gap, longest) for longest in widths)
@@ -306,18 +306,18 @@ def _shelves(sizes: Sequence[tuple[float, float]], gap: float, longest: float) -
 
 
 def _window(corners: Sequence[tuple[float, float]], sizes: Sequence[tuple[float, float]]) -> float:
-    """How high a window must be that shows all boxes."""
+    """Return the height of a window that shows all boxes."""
     wide = max(right + width for (right, _), (width, _) in zip(corners, sizes, strict=True))
     high = max(height - up for (_, up), (_, height) in zip(corners, sizes, strict=True))
     return max(wide / ASPECT, high)
 
 
 def _per_line(count: int, width: float, height: float) -> int:
-    """How many of some boxes of one size stand in a line, so that all fit into a small window."""
+    """Return the number of boxes of one size in a line, so that all fit into a small window."""
     return min(range(1, count + 1), key=lambda line: max(line * width / ASPECT, -(-count // line) * height))
 
 
 def _size(flat: Sequence[Places]) -> tuple[float, float]:
-    """Width and height of what is laid out, m."""
+    """Return width and height of flat layouts, m."""
     places = np.concatenate(flat)
     return float(places[:, 0].max()), -float(places[:, 1].min())

@@ -1,4 +1,4 @@
-"""The server of ``skin-view``: the page's files by HTTP, and its turns by a web socket at ``/live``."""
+"""Serve ``skin-view``: the page's files by HTTP, and its turns by a web socket at ``/live``."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from skinware.views import operations
 from skinware.views.access import Access, Refused
 from skinware.views.following import Follower
 from skinware.views.recording import Recording, ReplayControl
-from skinware.views.state import problem_of_all
+from skinware.views.tree import problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
 PAGE = Path(__file__).parent / "page"
-"""What the browser runs."""
+"""The files that the browser runs."""
 
 _TICK_S = 0.01
 _LONGEST_TURN_S = 0.5
 _MOST_VIEWERS = 32
 _LONGEST_OPERATION = 1 << 16
 _CLOSE_TIMEOUT_S = 1.0
-"""What a viewer that goes, or is sent away, may take for it."""
+"""Time for a viewer to close its connection."""
 _HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline';"
@@ -46,12 +46,12 @@ _TYPES = {".js": "text/javascript", ".html": "text/html", ".css": "text/css", ".
 
 
 class ViewServer:
-    """Shows what a follower follows to any number of viewers; each gets as much as it asks for.
+    """Show drivers to any number of viewers; each gets as much as it asks for.
 
     Args:
         follower: of the drivers; used in the event loop's thread only.
-        access: who may see it.
-        recording: that viewers may begin and end; None: they may not.
+        access: decides who may see them.
+        recording: that viewers may begin and end; None: they may not record.
         page: folder of the page's files.
     """
 
@@ -65,13 +65,10 @@ class ViewServer:
         self._server: Server | None = None
 
     async def start(self, host: str, port: int) -> int:
-        """Begin to listen.
-
-        Returns:
-            The port, which the system chooses if ``port`` is 0.
+        """Listen, and return the port, which the system chooses if ``port`` is 0.
 
         Raises:
-            OSError: nobody can listen there.
+            OSError: the address or port cannot be used.
         """
         self._server = await serve(
             self._attend,
@@ -86,7 +83,7 @@ class ViewServer:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     async def run(self) -> None:
-        """Follow the drivers for as long as somebody looks, without end."""
+        """Follow the drivers while there are viewers, without end."""
         while True:
             if self._viewers:
                 period_ns = round(NS_PER_S / max(viewer.look.fps for viewer in self._viewers))
@@ -98,18 +95,16 @@ class ViewServer:
             await asyncio.sleep(_TICK_S)
 
     async def close(self) -> None:
-        """Let go of all viewers, and end what they have begun."""
+        """Disconnect all viewers, and end the recording that they began."""
         if self._server is not None:
             self._server.close()
-            with contextlib.suppress(TimeoutError):  # of who connected and said nothing
+            with contextlib.suppress(TimeoutError):  # of connections that stay silent
                 await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
         if self._recording is not None:
             await self._recording.close()
 
-    # -- files --------------------------------------------------------------------------------------------------
-
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The answer to a request; None: go on to a web socket."""
+        """Return the answer to a request; None: it opens a web socket."""
         try:
             self._access.check_account(connection.remote_address[:2], connection.local_address[:2])
             self._access.check(request.path, request.headers)
@@ -119,7 +114,7 @@ class ViewServer:
             return self._file(path, request)
         except Refused as refused:
             return _response(refused.status, f"{refused}\n".encode(), "text/plain")
-        except ValueError:  # of what cannot be an address
+        except ValueError:  # the path cannot be an address
             return _response(HTTPStatus.BAD_REQUEST, b"", "text/plain")
 
     def _file(self, path: str, request: Request) -> Response:
@@ -135,8 +130,6 @@ class ViewServer:
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")
         return _response(HTTPStatus.OK, file.read_bytes(), _type_of(file))
 
-    # -- viewers ------------------------------------------------------------------------------------------------
-
     async def _attend(self, connection: ServerConnection) -> None:
         if len(self._viewers) >= _MOST_VIEWERS:
             await connection.close(1013, "too many viewers")
@@ -150,9 +143,9 @@ class ViewServer:
             self._viewers.discard(viewer)
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Hear what a viewer asks for, and tell it a turn for each time that it wants one."""
+        """Carry out the operations of a viewer, and send it a turn for each one that it asks for."""
         wanted = asyncio.Semaphore(0)
-        telling = asyncio.create_task(self._tell(viewer, connection, wanted))
+        sending = asyncio.create_task(self._send_turns(viewer, connection, wanted))
         try:
             async for text in connection:
                 try:
@@ -164,11 +157,11 @@ class ViewServer:
                     viewer.refuse(str(error))
                 self._wake()
         finally:
-            telling.cancel()
+            sending.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await telling
+                await sending
 
-    async def _tell(self, viewer: Viewer, connection: ServerConnection, wanted: asyncio.Semaphore) -> None:
+    async def _send_turns(self, viewer: Viewer, connection: ServerConnection, wanted: asyncio.Semaphore) -> None:
         loop = asyncio.get_running_loop()
         last_s = 0.0
         while True:
@@ -208,7 +201,7 @@ class ViewServer:
             case operations.Replay():
                 self._replay.act(operation.action, operation.value, viewer.refuse)
             case _:
-                raise ConfigurationError("nothing here can do that")
+                raise ConfigurationError("this server cannot do that")
 
     def _besides(self) -> dict[str, Any]:
         recording, replay = self._recording, self._replay.state
@@ -219,17 +212,17 @@ class ViewServer:
 
 
 async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
-    """Serve until told to stop.
+    """Serve until ``stop`` is set.
 
     Args:
-        server: it.
-        host: where to listen.
-        port: likewise; 0: any.
+        server: to run.
+        host: address to listen at.
+        port: to listen at; 0: any.
         ready: called with the port when browsers can connect.
         stop: set it to end.
 
     Raises:
-        OSError: nobody can listen there.
+        OSError: the address or port cannot be used.
     """
     found = await server.start(host, port)
     following, stopping = asyncio.create_task(server.run()), asyncio.create_task(stop.wait())

@@ -1,7 +1,7 @@
-"""What one viewer gets: turns of a header and arrays, with what is new for it since its last one.
+"""Make the turns that one viewer gets: a header and arrays, with everything that is new since its last turn.
 
-A turn is the length of its header (uint32, little endian), the header (JSON, padded with spaces so that what follows
-begins at a multiple of 8), and the blobs, each padded to 8 bytes; the header names each as ``[offset, length]``, in
+A turn is the length of its header (uint32, little endian), the header (JSON, padded with spaces so that the blobs
+begin at a multiple of 8), and the blobs, each padded to 8 bytes; the header names each as ``[offset, length]``, in
 bytes from the first one.
 """
 
@@ -16,11 +16,11 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.views import operations
-from skinware.views.beside import places_of
-from skinware.views.following import Followed, Follower
+from skinware.views.following import Follower, ShownDriver
+from skinware.views.live import places_of
 from skinware.views.looks import Look
 from skinware.views.scene import Scene
-from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
+from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
 
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
@@ -36,7 +36,7 @@ class Blobs:
         self._size = 0
 
     def add(self, array: npt.NDArray[Any], dtype: str) -> list[int]:
-        """Put an array in; where it is, as headers tell it."""
+        """Add an array, and return its place as headers name it."""
         data = np.ascontiguousarray(array, dtype).tobytes()
         at = [self._size, len(data)]
         padded = -len(data) % _ALIGNMENT
@@ -51,13 +51,13 @@ class Blobs:
 
 
 class Viewer:
-    """One viewer: what it looks at, what it has asked for, and what it was told so far.
+    """One viewer: its look, its questions, and what it has got so far.
 
     Args:
-        follower: of what is shown.
+        follower: of the drivers that are shown.
 
     Attributes:
-        look: how it looks.
+        look: its choices.
     """
 
     def __init__(self, follower: Follower) -> None:
@@ -74,10 +74,7 @@ class Viewer:
         self._questions: list[operations.Names | operations.Series] = []
         self._error: str | None = None
 
-    # -- what it asks for ---------------------------------------------------------------------------------------
-
     def choose(self, choice: operations.Choose) -> None:
-        """Look otherwise."""
         self.look.choose(choice.mode, choice.type, choice.scale, choice.fps)
         self._see_all_again()
 
@@ -90,7 +87,7 @@ class Viewer:
         self._see_all_again()
 
     def pin(self, sensors: list[tuple[int, int]]) -> None:
-        """Tell the values of these sensors, of drivers by number, as they are, in every turn."""
+        """Send the exact values of these sensors, pairs of driver and position, in every turn."""
         self._exact, self._asked = sensors, True
 
     def ask(self, question: operations.Names | operations.Series) -> None:
@@ -100,10 +97,8 @@ class Viewer:
             self._questions.append(question)
 
     def refuse(self, why: str) -> None:
-        """Tell in the next turn that something could not be done."""
+        """Report in the next turn why something could not be done."""
         self._error = why
-
-    # -- what it gets -------------------------------------------------------------------------------------------
 
     @property
     def has_news(self) -> bool:
@@ -116,10 +111,10 @@ class Viewer:
         )
 
     def turn(self, besides: dict[str, Any]) -> bytes:
-        """All that is new for this viewer.
+        """Return everything that is new for this viewer.
 
         Args:
-            besides: part of the state that the server knows; its ``problems`` come first among those as bad.
+            besides: the part of the state that the server knows; its ``problems`` precede others of the same severity.
         """
         self._number += 1
         blobs = Blobs()
@@ -130,7 +125,7 @@ class Viewer:
             self._see_all_again()
         self._add_pictures(header, blobs)
         if self._exact:
-            header["exact"] = [told for number, at in self._exact if (told := self._exactly(number, at)) is not None]
+            header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         self._asked = False
         for question in self._next_questions():
             header |= self._answer(question, blobs)
@@ -174,18 +169,18 @@ class Viewer:
             return
         header["pictures"] = pictures
         header["mode"] = self.look.mode
-        header["contacts"] = [told for driver in self._follower.drivers for told in self._contacts(driver)]
-        header["regions"] = [told for driver in self._follower.drivers for told in _regions(driver)]
+        header["contacts"] = [one for driver in self._follower.drivers for one in self._contacts(driver)]
+        header["regions"] = [one for driver in self._follower.drivers for one in _regions(driver)]
         wiped = self.look.wiped(self._follower.drivers)
         if wiped is not None:
             header["wipe"] = wiped._asdict()
 
-    def _picture(self, driver: Followed, blobs: Blobs) -> dict[str, Any] | None:
-        picture, frame = self.look.picture(driver), driver.frame
-        if picture is None or frame is None:
+    def _picture(self, driver: ShownDriver, blobs: Blobs) -> dict[str, Any] | None:
+        picture, newest = self.look.picture(driver), driver.newest
+        if picture is None or newest is None:
             return None
-        quantity = picture.quantity
-        told: dict[str, Any] = {
+        quantity, frame = picture.quantity, newest.frame
+        shown: dict[str, Any] = {
             "driver": driver.number,
             "type": quantity.name,
             "generation": str(driver.generation),
@@ -196,29 +191,30 @@ class Viewer:
             "levels": blobs.add(picture.levels, "u1"),
         }
         if picture.shear is not None:
-            told |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
-        contact_of = driver.contact_of(quantity)
+            shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
+        contact_of = newest.contact_of(quantity)
         if contact_of is not None and (contact_of >= 0).any():
-            told["contact_of"] = blobs.add(contact_of, "i1")
-        status, key = driver.status[quantity.where], (driver.number, quantity.name)
+            shown["contact_of"] = blobs.add(contact_of, "i1")
+        status, key = newest.status[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):
             self._status[key] = status
-            told["status"] = blobs.add(status, "u1")
-        return told
+            shown["status"] = blobs.add(status, "u1")
+        return shown
 
-    def _contacts(self, driver: Followed) -> list[dict[str, Any]]:
-        quantity, frame = self.look.quantity_of(driver), driver.contacts
+    def _contacts(self, driver: ShownDriver) -> list[dict[str, Any]]:
+        quantity, newest = self.look.quantity_of(driver), driver.newest
+        frame = None if newest is None else newest.contacts
         if quantity is None or frame is None or frame.source.type_name != quantity.type.name:
             return []
         laid_out = self._follower.scene.of(driver.name, quantity.name).position
-        told = []
+        contacts = []
         for contact, unit, sensor, _ in places_of(frame, driver.structure):
             pose = self._follower.scene.pose(driver.name, contact.frame)
             position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
-            if not np.isfinite(position).all():  # without places: in the middle of where its taxels are laid out
+            if not np.isfinite(position).all():  # without places: in the middle of its taxels as they are laid out
                 position = laid_out[contact.taxels].mean(axis=0, dtype=np.float64)
-            told.append(
+            contacts.append(
                 {
                     "id": contact.id,
                     "driver": driver.number,
@@ -234,10 +230,10 @@ class Viewer:
                     "taxels": contact.n,
                 }
             )
-        return told
+        return contacts
 
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:
-        """A sensor's value as it is; None for one that is not there (any more)."""
+        """Return the exact value of a sensor; None for one that does not exist (any more)."""
         driver = self._follower.get(number)
         if driver is None or driver.frame is None or position >= driver.structure.n_sensors:
             return None
@@ -257,7 +253,7 @@ class Viewer:
         }
 
     def _next_questions(self) -> list[operations.Names | operations.Series]:
-        """The first question of each kind, taken from those that wait."""
+        """Take the first question of each kind from those that wait."""
         firsts = list({type(question): question for question in reversed(self._questions)}.values())
         self._questions = [question for question in self._questions if question not in firsts]
         return firsts
@@ -279,32 +275,34 @@ class Viewer:
             problems = [*problems, problem_of_all(self._follower.problem)]
         drivers = []
         for driver in self._follower.drivers:
-            drivers.append(state_of(driver))
-            problems = problems + problems_of(driver, drivers[-1])
+            report = driver.report()
+            drivers.append(state_of(driver, report))
+            problems = problems + problems_of(driver, report)
         return {"drivers": drivers, "problems": worst_first(problems)}
 
 
-def _regions(driver: Followed) -> list[dict[str, Any]]:
-    if driver.motion is None:
+def _regions(driver: ShownDriver) -> list[dict[str, Any]]:
+    motion = None if driver.newest is None else driver.newest.motion
+    if motion is None:
         return []
     return [
         {
             "name": region.name,
             "driver": driver.number,
             "value": region.load,
-            "unit": driver.motion.source.unit,
+            "unit": motion.source.unit,
             "touched": region.contacts > 0,
             "speed": region.speed_m_s,
         }
-        for region in driver.motion
+        for region in motion
     ]
 
 
-def _seen(driver: Followed) -> tuple[int, int]:
+def _seen(driver: ShownDriver) -> tuple[int, int]:
     return driver.generation, driver.changes
 
 
-def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
+def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
     structure = driver.structure
     types = []
     for quantity in driver.quantities:
@@ -352,14 +350,14 @@ def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
     }
 
 
-def _names(driver: Followed, type_name: str) -> dict[str, Any]:
+def _names(driver: ShownDriver, type_name: str) -> dict[str, Any]:
     quantity = driver.quantity(type_name)
     if quantity is None:
         raise ConfigurationError(f"no {type_name!r} in driver {driver.name!r}")
     return {"driver": driver.number, "type": type_name, "of": driver.structure.sensor_names(quantity.type.name)}
 
 
-def _series(driver: Followed, position: int, blobs: Blobs) -> dict[str, Any]:
+def _series(driver: ShownDriver, position: int, blobs: Blobs) -> dict[str, Any]:
     structure = driver.structure
     if position >= structure.n_sensors:
         raise ConfigurationError(f"no sensor {position} in driver {driver.name!r}")

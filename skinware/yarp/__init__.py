@@ -1,1 +1,1 @@
-"""YARP, the middleware of iCub and its relatives, spoken without its library."""
+"""Speak YARP, the middleware of iCub and its relatives, without its library."""

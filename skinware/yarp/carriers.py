@@ -1,4 +1,4 @@
-"""Encode YARP's bottles and vectors, and begin connections of its carriers text, tcp and fast_tcp."""
+"""Encode YARP's lists and vectors, and begin connections of its carriers text, tcp and fast_tcp."""
 
 from __future__ import annotations
 
@@ -28,41 +28,43 @@ Value = int | str | Sequence["Value"]
 
 
 def in_text(values: Sequence[Value]) -> str:
-    return " ".join(map(_value_in_text, values))
-
-
-def _value_in_text(value: Value) -> str:
-    if isinstance(value, Word):
-        return f"[{value}]"
-    if isinstance(value, str):
-        return value if _PLAIN.fullmatch(value) else '"' + value.replace('"', "'") + '"'
-    return str(value) if isinstance(value, int) else f"({in_text(value)})"
+    """Return a list in text."""
+    texts = []
+    for value in values:
+        if isinstance(value, Word):
+            texts.append(f"[{value}]")
+        elif isinstance(value, str):
+            texts.append(value if _PLAIN.fullmatch(value) else '"' + value.replace('"', "'") + '"')
+        else:
+            texts.append(str(value) if isinstance(value, int) else f"({in_text(value)})")
+    return " ".join(texts)
 
 
 def of_text(line: str) -> list[str]:
-    """The words of a flat list in text, which may stand in quotes or, as commands do, in square brackets."""
+    """Return the words of a flat list in text; they may be in quotes or, as commands are, in square brackets."""
     words = ["".join(found) for found in _IN_TEXT.findall(line)]
     return [word[1:-1] if word.startswith("[") and word.endswith("]") else word for word in words]
 
 
 def packed(values: Sequence[Value]) -> bytes:
-    return struct.pack("<ii", _LIST, len(values)) + b"".join(map(_packed_value, values))
-
-
-def _packed_value(value: Value) -> bytes:
-    if isinstance(value, Word):
-        return struct.pack("<i4s", _WORD, value.encode())
-    if isinstance(value, str):
-        data = value.encode()
-        return struct.pack("<ii", _TEXT, len(data)) + data
-    return struct.pack("<ii", _INT32, value) if isinstance(value, int) else packed(value)
+    """Return a list in binary."""
+    parts = [struct.pack("<ii", _LIST, len(values))]
+    for value in values:
+        if isinstance(value, Word):
+            parts.append(struct.pack("<i4s", _WORD, value.encode()))
+        elif isinstance(value, str):
+            data = value.encode()
+            parts.append(struct.pack("<ii", _TEXT, len(data)) + data)
+        else:
+            parts.append(struct.pack("<ii", _INT32, value) if isinstance(value, int) else packed(value))
+    return b"".join(parts)
 
 
 def unpacked(data: bytes) -> list[Value]:
-    """The values of a list in binary.
+    """Return the values of a list in binary.
 
     Raises:
-        ValueError: the bytes are none, or the list has values of other types.
+        ValueError: it is malformed, or has values of other types.
     """
     try:
         (tag,) = struct.unpack_from("<i", data)
@@ -109,14 +111,13 @@ def _unpacked_value(data: bytes, at: int, kind: int, deepest: int) -> tuple[Valu
 
 _TCP, _ACKNOWLEDGED = 7777 + 3, 128
 _INDEX = 10
-_LIST = 256
 _DOUBLE = {3: 10, 4: 20}
 """How YARP marks float64, by its major version; to YARP 4, 10 is float32."""
 _DIGITS = 3
 
 
 READ = struct.pack("<2si2s", b"YA", _INDEX, b"RP") + b"\1\1" + b"\xff" * 8 + struct.pack("<iii4s", 8, 0, 0, b"~r\0\1")
-"""What asks a port, in a binary connection, to send its messages to whoever called."""
+"""Asks a port, in a binary connection, to send its messages to the caller."""
 
 
 class Carrier(Enum):
@@ -134,12 +135,12 @@ class Carrier(Enum):
 
     @classmethod
     def of_greeting(cls, begin: bytes) -> Carrier | None:
-        """The carrier that a connection begins with in these eight bytes; None if it is none of ours."""
+        """Return the carrier that begins a connection with these eight bytes; None: it is not known here."""
         texts = {b"CONNECT ": cls.TEXT, b"CONNACK ": cls.TEXT_ACK}
         return texts.get(begin) or {_TCP: cls.FAST_TCP, _TCP + _ACKNOWLEDGED: cls.TCP}.get(unframed(begin) or 0)
 
     def greeting(self, name: str) -> bytes:
-        """What a sender begins a connection with; the receiver of a binary one answers eight bytes."""
+        """Return the bytes that begin a connection; the receiver of a binary one answers with eight bytes."""
         if self.is_text:
             return f"{'CONNACK' if self.acknowledges else 'CONNECT'} {name}\r\n".encode()
         return (
@@ -148,13 +149,13 @@ class Carrier(Enum):
 
 
 class Message:
-    """A vector as it is sent; each form is made once, when the first reader wants it.
+    """A vector with its envelope; each form is made once, when the first reader needs it.
 
     Args:
         values: (n,) numbers.
-        count: of messages of the port.
+        count: number of the message of its port.
         time_s: since 1970.
-        yarp: major version of the YARP that reads binary carriers, 3 or 4.
+        yarp: major version of the YARP of binary readers, 3 or 4.
     """
 
     def __init__(self, values: npt.NDArray[np.floating], count: int, time_s: float, yarp: int = 4) -> None:
@@ -182,6 +183,6 @@ def framed(number: int) -> bytes:
 
 
 def unframed(data: bytes) -> int | None:
-    """The number of eight bytes; None if it is not marked as one."""
+    """Return the number in eight bytes; None if they are no frame of YARP's."""
     begin, number, end = struct.unpack("<2si2s", data)
     return int(number) if (begin, end) == (b"YA", b"RP") else None

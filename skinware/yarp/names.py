@@ -1,8 +1,8 @@
-"""A YARP name server, asked in text: where a port is, and that there is one.
+"""Register and look up ports at a name server of YARP, in text.
 
-Protocol: YARP's manual, "The name server protocol" and "YARP without YARP". A connection begins with ``CONNECT who``,
-to which the server says ``Welcome who``. A line ``d`` and a command follow; the answer is lines up to
-``*** end of message``, of which ``registration name N ip I port P type C`` is one for each port.
+Protocol: YARP's manual, "The name server protocol" and "YARP without YARP". A connection begins with ``CONNECT who``;
+the server says ``Welcome who``. A line ``d`` and a command follow. The answer has one line ``registration name N ip I
+port P type C`` for each port, and ends with ``*** end of message``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 DEFAULT_PORT = 10000
 WHO = "skinware"
-"""What we are called in connections; YARP cuts others of the same name only where it begins with a slash."""
+"""Our name in connections; YARP cuts other connections of one name only if it begins with a slash."""
 _END = b"*** end of message"
 _REGISTRATION = re.compile(
     rb"registration name (?P<name>\S+) ip (?P<host>\S+) port (?P<port>\d{1,5}) type (?P<carrier>\S+)"
@@ -28,13 +28,13 @@ _LONGEST_NAME = 200
 
 
 class Contact(NamedTuple):
-    """How a port is reached.
+    """Address of a port.
 
     Attributes:
         name: of the port.
         host: name or number.
         port: of TCP, 1 to 65535.
-        carrier: with which a connection begins; ``tcp`` for all ports that speak with everybody.
+        carrier: that begins a connection; ``tcp`` for all ordinary ports.
     """
 
     name: str
@@ -44,13 +44,13 @@ class Contact(NamedTuple):
 
 
 def is_port_name(name: str) -> bool:
-    """Whether YARP takes this as a port's name; one that could be taken for more than one word is none."""
+    """Return whether YARP accepts this as the name of a port, and reads it as one word."""
     is_plain = name.isascii() and name.isprintable() and not set(name) & set(" \"'()[]\\")
     return name.startswith("/") and not name.endswith("/") and is_plain and len(name) <= _LONGEST_NAME
 
 
 def configured_server(environment: Mapping[str, str] = os.environ) -> tuple[str, int]:
-    """Where YARP's own programs look for the name server: in ``yarp.conf``; this computer, unless it says another.
+    """Return host and port of the name server in ``yarp.conf``, as YARP's programs do; by default on this computer.
 
     Its folder is ``YARP_CONFIG_HOME``, or ``yarp`` in ``XDG_CONFIG_HOME`` (``~/.config``).
     """
@@ -67,12 +67,7 @@ def configured_server(environment: Mapping[str, str] = os.environ) -> tuple[str,
 
 
 class NameServer:
-    """A name server. Each call is a connection of its own, and takes at most some seconds.
-
-    Args:
-        host: name or number.
-        port: of TCP.
-    """
+    """A name server. Each call is a connection of its own, and takes at most some seconds."""
 
     def __init__(self, host: str, port: int = DEFAULT_PORT) -> None:
         self.host = host
@@ -82,34 +77,23 @@ class NameServer:
         return f"YARP's name server at {self.host}:{self.port}"
 
     def query(self, name: str) -> Contact | None:
-        """Where a port is; None: there is none of that name.
+        """Return the address of a port; None: there is none of that name.
 
         Raises:
-            OSError: it does not answer, or what answers is no name server; the same for the others.
-            ValueError: no port can have this name; the same for the others.
+            OSError: no name server answers; also in all other methods.
+            ValueError: no port can have this name; also in all other methods.
         """
         return self._ask(name, f"query {name}")
 
     def register(self, name: str, host: str, port: int) -> Contact:
-        """Tell that there is a port; what was known of one of that name is forgotten.
-
-        Args:
-            name: of the port.
-            host: how others reach it; ``...``: as the server sees us.
-            port: of TCP.
-        """
-        told = self._ask(name, f"register {name} tcp {host} {port}")
-        if told is None:
-            raise OSError(f"{self} did not take {name}")
-        return told
+        """Register a port in place of any other of that name; host ``...``: the address that the server sees."""
+        contact = self._ask(name, f"register {name} tcp {host} {port}")
+        if contact is None:
+            raise OSError(f"{self} did not register {name}")
+        return contact
 
     def describe(self, name: str, carriers: Collection[str]) -> None:
-        """Have the server keep in which carriers a port can be called, as ports of YARP do when they register.
-
-        Args:
-            name: of the port, which is registered.
-            carriers: that it speaks as sender and as receiver.
-        """
+        """Register the carriers that a port speaks as sender and as receiver, as ports of YARP do."""
         for key in ("offers", "accepts"):
             self._ask(name, f"set {name} {key} {' '.join(carriers)}")
 
@@ -128,7 +112,7 @@ class NameServer:
                     connection.settimeout(max(0.01, until_s - time.monotonic()))
                     more = connection.recv(4096)
                     if not more or len(answer) > _LONGEST_ANSWER or time.monotonic() > until_s:
-                        raise OSError("what answers there is no name server")
+                        raise OSError("the answer is not that of a name server")
                     answer += more
         except OSError as error:
             raise OSError(f"{self}: {error.strerror or error}") from None
@@ -137,7 +121,7 @@ class NameServer:
 
 
 def _contact(line: bytes) -> Contact | None:
-    """What a line of an answer says of a port; None if it says nothing of any."""
+    """Return the port that a line of an answer is about; None: it is about no port."""
     match = _REGISTRATION.fullmatch(line.strip())
     if match is None or not 0 < int(match["port"]) < 1 << 16:
         return None

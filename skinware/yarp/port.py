@@ -1,11 +1,11 @@
-"""An output port of YARP: whoever reads it gets the newest vector, as fast as each can; nobody is waited for.
+"""An output port of YARP: each reader gets the newest vector as fast as it can read, and none holds up another.
 
-A reader calls us and asks to read (the command ``r``), or has us call it (``yarp connect OURS ITS``, which is the
-command ``[add]`` to a port). Commands are taken in text, as ``yarp connect`` sends them, and in binary, as ``yarp admin
-rpc`` does; they are those of YARP's manual that a port cannot do without. All of it runs in one event loop.
+A reader connects and asks to read (the command ``r``), or makes the port connect to it (``yarp connect OURS ITS``: the
+command ``[add]``). Commands come in text from ``yarp connect`` and in binary from ``yarp admin rpc``; the port knows
+those of YARP's manual that it needs. All of it runs in one event loop.
 
-YARP 3 and YARP 4 mark a list of doubles differently, and a connection does not show which of them reads. Where the user
-has not named the version, binary readers are refused: none gets wrong numbers.
+YARP 3 and YARP 4 mark a list of doubles differently, and a connection does not show its version. Binary readers are
+refused unless the user gives the version, so that none gets wrong numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CONNECTING_S = 3.0
 _GREETING_S = 10.0
 _LONGEST_WHO = 80
 _MOST_BEHIND = 1 << 16
-"""Wanted of the kernel: bytes that may be on their way to a reader, so that what a slow one sees is not old."""
+"""Size of the send buffer, bytes: small, so that a slow reader gets no old vectors."""
 _ADDRESS = re.compile(r"(?:(?P<carrier>[a-z_]+):/)?(?P<name>/.*)")
 _INDEX = struct.Struct("<8sBB8x")
 _COMMAND = struct.Struct("<icc2x")
@@ -62,13 +62,11 @@ _ADMINISTRATION = (
 
 @dataclass(eq=False)
 class Receiver:
-    """Somebody who reads.
+    """A reader.
 
     Attributes:
-        name: as it calls itself, or of its port.
-        carrier: of the connection.
-        sent: messages that it was sent.
-        passed_over: messages that it did not get as it was not done with the one before.
+        sent: messages so far.
+        passed_over: messages that it missed because it had not finished the one before.
     """
 
     name: str
@@ -79,7 +77,7 @@ class Receiver:
     is_busy: bool = False
 
     def offer(self, message: Message) -> None:
-        """Send it, unless there is still something on its way."""
+        """Send a message, unless another is still on its way."""
         if self.is_busy or self.writer.transport.get_write_buffer_size():
             self.passed_over += 1
             return
@@ -89,12 +87,12 @@ class Receiver:
 
 
 class OutputPort:
-    """A port that is read; to be used in the event loop that :meth:`open` was called in.
+    """An output port; to be used in the event loop in which :meth:`open` was called.
 
     Args:
         name: of the port.
-        server: asked for the ports that it is to call.
-        yarp: major version of the YARP that reads in binary, 3 or 4; None: not known.
+        server: knows the ports to which it connects.
+        yarp: major version of the YARP of binary readers, 3 or 4; None: not known.
     """
 
     def __init__(self, name: str, server: NameServer, yarp: int | None = None) -> None:
@@ -108,7 +106,7 @@ class OutputPort:
         self._conversations: set[asyncio.Task[None]] = set()
 
     async def open(self, host: str) -> int:
-        """Listen, at any port that is free; gives which.
+        """Listen, and return the number of the TCP port.
 
         Raises:
             OSError: it cannot listen there.
@@ -118,19 +116,19 @@ class OutputPort:
         return self._number
 
     def send(self, message: Message) -> None:
-        """To all who read, as far as each can take it now; never waits."""
+        """Send a message to all readers that can take it now."""
         for receiver in self.receivers:
             receiver.offer(message)
 
     async def close(self) -> None:
-        """Hang up on everybody, and listen no more."""
+        """Close all connections."""
         if self._server is not None:
             self._server.close()
         for task in list(self._conversations):
             task.cancel()
         await asyncio.gather(*self._conversations, return_exceptions=True)
 
-    # -- who calls -------------------------------------------------------------------------------------------------
+    # -- incoming connections --------------------------------------------------------------------------------------
 
     async def _called(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -141,7 +139,7 @@ class OutputPort:
             if len(self._conversations) <= _MOST_CONNECTIONS:
                 await self._converse(reader, writer)
         except (OSError, EOFError, ValueError, asyncio.CancelledError):
-            pass  # it hung up, or says what no line of YARP's is
+            pass  # it hung up, or sent something that is not YARP
         finally:
             self._conversations.discard(task)
             writer.close()
@@ -174,11 +172,7 @@ class OutputPort:
                 writer.write(b"<ACK>\r\n")
 
     async def _greeted_in_binary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-        """Greet a caller in binary; gives its name.
-
-        Raises:
-            ValueError: it has none.
-        """
+        """Greet a caller in binary and return its name, or raise ValueError if it sends none."""
         size = int.from_bytes(await reader.readexactly(4), "little")
         if not 1 <= size <= _LONGEST_LINE:
             raise ValueError(f"a name of {size} bytes")
@@ -188,7 +182,7 @@ class OutputPort:
         return who[:_LONGEST_WHO] or "?"
 
     async def _converse_in_binary(self, caller: Receiver, reader: asyncio.StreamReader) -> None:
-        """Answer commands until the caller reads or goes; an answer is a list, without the head of a message."""
+        """Answer commands until the caller reads or goes; an answer is a list without the head of a message."""
         while True:
             command, data = await _binary_message(reader)
             if command == "r":
@@ -198,7 +192,7 @@ class OutputPort:
             answer = b""
             if command == "a":
                 answer = packed(await self._administer([str(value) for value in unpacked(data)]))
-            elif command[:1] == "d":  # of D no answer is expected
+            elif command[:1] == "d":  # D expects no answer
                 answer = packed([Word("fail"), _SENDS_ONLY])
             elif command.startswith(("/", "!/")):
                 await self._obey(command, reader)
@@ -208,7 +202,7 @@ class OutputPort:
                 return
 
     def _refusal(self, carrier: Carrier, who: str) -> str:
-        """Why a reader cannot be served in a carrier; empty if it can."""
+        """Return the reason why a carrier cannot be served; empty if it can."""
         if carrier.is_text or self._yarp is not None:
             return ""
         if not self._has_warned:
@@ -218,7 +212,7 @@ class OutputPort:
 
     async def _obey(self, command: str, reader: asyncio.StreamReader) -> list[str]:
         if command[:1] in ("d", "D"):
-            await _line(reader)  # data, of which we take none
+            await _line(reader)  # data, which are ignored
             return []
         if command == "a":
             return [in_text(await self._administer(of_text(await _line(reader))))]
@@ -247,7 +241,11 @@ class OutputPort:
             case ["list", "out"]:
                 return [receiver.name for receiver in self.receivers]
             case ["list", "out", name, *_]:
-                return next((self._described(each) for each in self.receivers if each.name == name), [])
+                to = next((each for each in self.receivers if each.name == name), None)
+                if to is None:
+                    return []
+                ways: list[Value] = [["from", self.name], ["to", name], ["carrier", to.carrier.title]]
+                return [*ways, ["connectionless", 0], ["push", 1]]
             case ["add", name]:
                 said = await self._add(name)
             case ["add", name, carrier, *_]:
@@ -258,20 +256,10 @@ class OutputPort:
                 return [Word("fail"), "send [help] for list of valid commands"]
         return [0 if said.startswith(("Added", "Removed")) else -1, said]
 
-    def _described(self, receiver: Receiver) -> list[Value]:
-        carrier = receiver.carrier.title
-        return [
-            ["from", self.name],
-            ["to", receiver.name],
-            ["carrier", carrier],
-            ["connectionless", 0],
-            ["push", 1],
-        ]
-
-    # -- whom we call ----------------------------------------------------------------------------------------------
+    # -- outgoing connections --------------------------------------------------------------------------------------
 
     async def _add(self, text: str) -> str:
-        """Call a port, and serve it until it hangs up; gives what YARP says of that."""
+        """Connect to a port and serve it until it hangs up; return YARP's answer to the command."""
         match = _ADDRESS.fullmatch(text)
         name = match["name"] if match else text
         carrier = next((each for each in Carrier if match and each.title == (match["carrier"] or "tcp")), None)
@@ -302,7 +290,7 @@ class OutputPort:
         try:
             writer.write(carrier.greeting(self.name))
             if not carrier.is_text and unframed(await reader.readexactly(_ANSWER)) is None:
-                raise OSError("what answers there is no port of YARP")
+                raise OSError("the answer is not that of a port of YARP")
         except BaseException:
             writer.close()
             raise
@@ -317,16 +305,14 @@ class OutputPort:
         for receiver in gone:
             self.receivers.remove(receiver)
             receiver.writer.transport.abort()
-        return (
-            f"Removed connection from {self.name} to {name}"
-            if gone
-            else f"Could not find an outgoing connection to {name}"
-        )
+        if gone:
+            return f"Removed connection from {self.name} to {name}"
+        return f"Could not find an outgoing connection to {name}"
 
-    # -- who reads -------------------------------------------------------------------------------------------------
+    # -- readers ---------------------------------------------------------------------------------------------------
 
     async def _serve(self, receiver: Receiver, reader: asyncio.StreamReader) -> None:
-        """Send vectors until the receiver hangs up; all it can say is that it has got one."""
+        """Send vectors until the receiver hangs up; it can only acknowledge them."""
         connection = receiver.writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_BEHIND)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -345,18 +331,13 @@ class OutputPort:
                     await reader.readexactly(size)
                 receiver.is_busy = False
         finally:
-            receiver.writer.transport.abort()  # what it has not read yet is for nobody
+            receiver.writer.transport.abort()  # unread vectors are of no use
             if receiver in self.receivers:
                 self.receivers.remove(receiver)
 
 
 async def _line(reader: asyncio.StreamReader) -> str:
-    """The next line.
-
-    Raises:
-        EOFError: there is none any more.
-        ValueError: it is too long.
-    """
+    """Return the next line; raise EOFError at the end, ValueError if it is too long."""
     line = await reader.readline()
     if not line.endswith(b"\n"):
         raise EOFError("hung up")
@@ -364,11 +345,11 @@ async def _line(reader: asyncio.StreamReader) -> str:
 
 
 async def _binary_message(reader: asyncio.StreamReader) -> tuple[str, bytes]:
-    """The next message in binary: its command, and what follows that.
+    """Return the next message in binary: its command, and the data after it.
 
     Raises:
-        EOFError: there is none any more.
-        ValueError: it is none, or too long.
+        EOFError: the connection ended.
+        ValueError: it is malformed, or too long.
     """
     begin, n_blocks, n_answers = _INDEX.unpack(await reader.readexactly(_INDEX.size))
     if unframed(begin) != _INDEX_NUMBER or n_blocks + n_answers > _MOST_BLOCKS:

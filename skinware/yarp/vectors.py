@@ -1,4 +1,4 @@
-"""A driver's sensors in the order of a robot's port, and their values as its programs expect them: 0 to 255."""
+"""Order the sensors of a driver as a robot's port does, and scale their values to 0 to 255, as its programs expect."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinware.structure import Structure
 from skinware.tactile.regions import Region, Regions
 
 FULL = 255.0
-"""What a sensor at its full scale becomes: iCub's compensated ports have 0 at rest and at most this."""
+"""The value of a sensor at full scale: values of iCub's compensated ports lie between 0 at rest and this."""
 _OF_A_BOARD, _OF_A_TRIANGLE = 192, 12
 _BUS_SHIFT, _BOARD_SHIFT, _TRIANGLE_SHIFT = 32, 16, 8
 
@@ -22,14 +22,13 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Vector:
-    """A port's vector.
+    """The vector of a port.
 
     Attributes:
         sensors: (n,) index of sensors in a frame.
-        places: (n,) where each has its value.
-        length: values of the vector; those without a sensor are 0.
-        scale: of raw values, to physical ones.
-        offset: likewise.
+        places: (n,) index of their values in the vector.
+        length: of the vector; values without a sensor are 0.
+        scale, offset: from raw values to physical ones.
         full: physical value that becomes 255.
     """
 
@@ -41,17 +40,17 @@ class Vector:
     full: float
 
     def of(self, values: npt.NDArray[np.generic], status: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-        """(length,) of a frame; 0 where there is no good value.
+        """Return (length,) the vector of a frame; 0 for values that are not good.
 
         Args:
             values: (n_sensors,) raw values.
-            status: (n_sensors,) of each; 0 is good.
+            status: (n_sensors,) their status; 0 is good.
         """
-        told = np.zeros(self.length)
+        vector = np.zeros(self.length)
         good = status[self.sensors] == 0
         numbers = values[self.sensors[good]].astype(np.float64) * self.scale + self.offset
-        told[self.places[good]] = np.clip(np.nan_to_num(numbers * FULL / self.full), 0.0, FULL)
-        return told
+        vector[self.places[good]] = np.clip(np.nan_to_num(numbers * FULL / self.full), 0.0, FULL)
+        return vector
 
 
 def vectors_of(
@@ -63,30 +62,30 @@ def vectors_of(
     full_scale: float | None = None,
     regions: Sequence[Region] = (),
 ) -> dict[str, Vector]:
-    """The ports of a driver, by the last part of their names: one for each region of it, or one for all.
+    """Return the vectors of a driver, by the last part of the names of their ports: one for each region, or one.
 
-    The order is that of iCub's ports where it is known: drivers of the type ``roboskin`` have 192 places for each
-    board, in the order of their configuration, of which the boards of the last bus come first; drivers of the type
-    ``yarp`` a port for each that they read, with its places; where these are boards, up to the end of the last one.
-    Sensors of others stand in the order of the structure.
+    The order is that of iCub's ports where it is known. A driver of the type ``roboskin`` has 192 places for each
+    board, in configured order, with the boards of the last bus first. A driver of the type ``yarp`` has a port for each
+    that it reads, with the same places; if these are boards, up to the end of the last board. Sensors of other drivers
+    have the order of the structure.
 
     Args:
         name: of the driver.
-        structure: of it.
-        driver_type: as the driver tells it.
+        structure: of the driver.
+        driver_type: of the driver.
         type_name: of sensors.
-        full_scale: physical value that becomes 255; None: the type's greatest.
-        regions: body parts.
+        full_scale: physical value that becomes 255; None: the maximum of the type.
+        regions: that have a port each.
 
     Raises:
-        ConfigurationError: it has no such sensors, or nobody says what their full scale is.
+        ConfigurationError: it has no such sensors, or their full scale is not known.
     """
     if type_name not in [kind.name for kind in structure.types]:
         raise ConfigurationError(f"driver {name} has no sensors of the type {type_name!r}")
     kind = structure.type(type_name)
     full = kind.maximum if full_scale is None else full_scale
     if not 0 < full < np.inf:
-        raise ConfigurationError(f"driver {name}: what is 255? Its {type_name} has no greatest value: say --full-scale")
+        raise ConfigurationError(f"driver {name}: what is 255? Its {type_name} has no maximum: give --full-scale")
     of_type = np.arange(structure.n_sensors)[structure.index(type_name)]
     vectors = {}
     for part, sensors in _parts(name, structure, driver_type, of_type, type_name, regions).items():
@@ -103,19 +102,17 @@ def _parts(
         bus = structure.sensor_uid[of_type].astype(np.int64) >> _BUS_SHIFT
         numbers = np.unique(bus).tolist()
         own = [name] if len(numbers) == 1 else [f"{name}_{number}" for number in numbers]
-        names = [_port_of(structure.buses[number]) or other for number, other in zip(numbers, own, strict=True)]
+        names = []
+        for number, other in zip(numbers, own, strict=True):
+            port = structure.buses[number].partition("?")[0]
+            last = port.rpartition("/")[2] if port.startswith("yarp://") else ""
+            names.append(last or other)
         return {each: of_type[bus == number] for each, number in zip(names, numbers, strict=True)}
     if not of_driver:
         return {name: of_type}
     index = Regions(regions).of(structure, type_name)
     parts = {region.name: of_type[index[region.name]] for region in of_driver if region.name in index}
     return {part: sensors for part, sensors in parts.items() if len(sensors)}
-
-
-def _port_of(bus: str) -> str:
-    """The last part of a port's name, of the name of its bus; empty: it is not called after a port."""
-    last = bus.partition("?")[0].rpartition("/")[2]
-    return last if bus.startswith("yarp://") else ""
 
 
 def _places(structure: Structure, driver_type: str, sensors: Indices) -> tuple[Indices, int]:

@@ -1,5 +1,19 @@
-"""CAN: buses, the adapter that drivers of CAN devices subclass, and the drivers of skins that hang on CAN."""
+"""CAN: the adapter that drivers of CAN devices subclass, the buses, and the drivers themselves."""
 
-from skinware_drivers.can.adapter import CanAdapter
+from __future__ import annotations
+
+from typing import ClassVar
+
+from skinware_drivers.adapter import Adapter
+from skinware_drivers.options import OptionsT
 
 __all__ = ["CanAdapter"]
+
+
+class CanAdapter(Adapter[OptionsT]):
+    """One CAN bus of a driver; see :class:`skinware_drivers.adapter.Adapter`.
+
+    Identifiers have 11 bits, or 29 with ``EXTENDED_FLAG``.
+    """
+
+    medium: ClassVar[str] = "can"

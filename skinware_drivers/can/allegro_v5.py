@@ -1,24 +1,22 @@
-"""Wonik Allegro hand V5: the air pressure of its fingertips (4F, Plus), or sixteen pads (Sense). Only heard.
+"""Wonik Allegro hand V5: the air pressure of its fingertips (4F, Plus), or sixteen pads (Sense). Listens only.
 
 Wire format: the maker's allegro_hand_ros2_v5 and allegro_hand_ros2_V5_Sense, and a user's allegro_hand_v5_plus_python.
-The hand sends by itself once its own program has set the period and switched the servos on; this driver sends nothing,
-ever.
+The hand sends by itself once its own program has set the period and switched the servos on. This driver never sends.
 
 On CAN, 1 Mbit/s, little-endian, identifier = number of the message << 2:
 
-* 4F, Plus: message 0F0: index and middle fingertip, 0F2: ring finger and thumb; an int32 in Pa each. The manual calls
-  them 050 and 052: both are known here. The manual has 0 at the pressure of the air; a published program has that
-  pressure itself, 101,325. The option ``zero_pa`` says which.
-* Sense: message 054: palm, thumb 1, 2 and tip, index finger 1, 2, 3 and tip; 055: middle and ring finger likewise. A
-  byte each, in 0.4 kPa; FF: no value. The maker's program for CAN does not divide the palm's by ten, the one for UDP
-  does: the option ``palm`` says whether its unit is that of the others. Messages 056 and 057 of older firmware are not
-  read.
+* 4F, Plus: message 0F0 has the index and middle fingertip, 0F2 the ring finger and thumb; an int32 in Pa each. The
+  manual calls the messages 050 and 052: both pairs are read. Zero is the pressure of the air in the manual, and a
+  vacuum (101,325 at rest) in a published program: option ``zero_pa``.
+* Sense: message 054 has palm, thumb 1, 2 and tip, index finger 1, 2, 3 and tip; 055 the middle and ring finger in the
+  same order. A byte each, in 0.4 kPa; FF: no value. The maker's program for CAN does not divide the palm's value by
+  ten, the program for UDP does: option ``palm``. Messages 056 and 057 of older firmware are not read.
 
 Sense over UDP, from its port 7000 to port 8000, every 3 ms, little-endian: ``56 35 42 32``, version 1, type, length
-u16, number u32, ms u32; of type 2 follow 164 bytes: number of the sample u32, position and current of 16 joints
+u16, number u32, ms u32. Type 2 continues with 164 bytes: number of the sample u32, position and current of 16 joints
 (int16), the sixteen pads (u16, 0.1 kPa), velocity of the joints (int32). The length counts the bytes behind the header
-(tcpdef.h in Wonikrobotics-git/allegro_hand_ros2_V5_Sense db81588, 2026-05-27); datagrams of type 2 that have not 180
-bytes are not shown. No source says which value means that there is none: 65535, which is no pressure, is suspect.
+(tcpdef.h in Wonikrobotics-git/allegro_hand_ros2_V5_Sense db81588, 2026-05-27); only datagrams of 180 bytes are
+decoded. No source names a value that means "none"; 65535, which is no pressure, is marked as suspect.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, Values
@@ -68,14 +66,14 @@ _PAD_FRAMES = [
     Frame(name, [Identifier(one)], [8], Values(0, "u1", 8), module=one, flags=_PAD_FLAGS) for name, one in PADS.items()
 ]
 _ENDS = 0xFF00
-"""That is added to the two ends of a byte where values are more than a byte."""
+"""Offset of the two special values FE and FF where values are wider than a byte."""
 _PA_IN_A_BYTE, _PA_OVER_UDP = 400.0, 100.0
 _AIR_PA = range(60_000, 150_000)
-"""From the highest towns to the sea, where somebody presses."""
+"""Pressure of the air, from the highest towns to the sea, with a press added."""
 _FROM_PAD_TO_PAD_M = 0.02
 _LONGEST_DATAGRAM = 1472
 _TWICE = 1.5
-"""Times a period's messages that are taken for those of two hands."""
+"""Messages per period above which two hands are assumed."""
 
 
 class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -83,7 +81,7 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     model: Annotated[
         Literal["auto", "tips", "sense"],
-        msgspec.Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: as the frames tell"),
+        msgspec.Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: by the frames"),
     ] = "auto"
     zero_pa: Annotated[
         int, msgspec.Meta(description="what an untouched fingertip sends, Pa: 0, or 101325 for the pressure of the air")
@@ -91,13 +89,13 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side: Annotated[Literal["right", "left"], msgspec.Meta(description="which hand it is, for the places")] = "right"
     palm: Annotated[
         Literal["alike", "tenfold"],
-        msgspec.Meta(description="on CAN, the unit of a Sense's palm: that of its other pads, or ten times that"),
+        msgspec.Meta(description="on CAN, the unit of a Sense's palm: the unit of the other pads, or ten times that"),
     ] = "alike"
     period_ms: Annotated[
         Annotated[int, msgspec.Meta(ge=1)] | None,
         msgspec.Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
     ] = None
-    learn_s: Annotated[float, msgspec.Meta(description="how long is heard which model it is, s", gt=0)] = 0.5
+    learn_s: Annotated[float, msgspec.Meta(description="time of listening for the model, s", gt=0)] = 0.5
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -130,7 +128,6 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Hands that tell nothing but 0."""
         return ZeroWatch(tables)
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
@@ -149,10 +146,10 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     patches: Sequence[Patch]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The hand of the option ``model``, or as its frames tell.
+        """Return the hand of the option ``model``, or of the frames that are heard.
 
         Raises:
-            BusError: none is heard.
+            BusError: no hand is heard, or two.
         """
         model = self.options.model
         of_tips = [Match(one) for ids in TIPS.values() for one in ids]
@@ -172,7 +169,7 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             self._take_pads()
         else:
             raise HandshakeTimeout(
-                f"{link.bus_name}: nothing is heard of the hand's skin; its own program has to set a period and to"
+                f"{link.bus_name}: no frames of the hand's skin are heard; its own program has to set a period and to"
                 " switch the servos on"
             )
         return self.patches
@@ -185,28 +182,23 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Modules that tell nothing but 0."""
         return ZeroWatch(tables)
 
     def _refuse_two(self, link: Link, counted: Counter[int]) -> None:
-        """Hands say no number: of two on a bus, values go to the same sensors by turns.
-
-        Raises:
-            BusError: two hands that send different identifiers are heard.
-        """
+        """Refuse two hands of different identifiers on one bus, and warn of two alike: their frames have no number."""
         tips, pads = set(counted) & {one for ids in TIPS.values() for one in ids}, set(counted) & set(PADS.values())
         doubled = [name for name, ids in TIPS.items() if set(ids) <= tips]
         if (tips and pads) or doubled:
             what = " and ".join(f"{one:03X}" for one in sorted(tips | pads))
             raise BusError(
-                f"{link.bus_name}: {what} are heard, which no single hand sends: two hands on one bus cannot be told"
-                " apart; give each a bus of its own"
+                f"{link.bus_name}: {what} are heard, which no single hand sends: the values of two hands on one bus"
+                " mix; give each a bus of its own"
             )
         most = max((counted[one] for one in tips | pads), default=0)
         if most > _TWICE * self.options.learn_s / self.period_s + 1:
             log.warning(
-                "%s: a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix,"
-                " as nothing tells them apart: give each a bus of its own; if there is one, say its period_ms",
+                "%s: a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix:"
+                " give each a bus of its own; if there is one hand, set its period_ms",
                 link.bus_name,
                 1e3 * self.options.learn_s / most,
                 1e3 * self.period_s,
@@ -219,7 +211,9 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             Module(taxels(2, first_uid=2 * at), ids[0], "tips", name) for at, (name, ids) in enumerate(TIPS.items())
         ]
         self.patches = [Patch("hand", modules)]
-        self.geometry = _places_of_tips(self.options.side)
+        hand, tip = Hand(self.options.side), Grid(1, 1)
+        places = [hand.down(part, [tip])[0] for part in ("index", "middle", "ring", "thumb")]
+        self.geometry = Geometry.joined([tip.at(place, ["pressure"], [uid]) for uid, place in enumerate(places)])
 
     def _take_pads(self) -> None:
         factor = 10 if self.options.palm == "tenfold" else 1
@@ -239,37 +233,28 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         self.geometry = _places_of_pads(self.options.side)
 
     def _judge_zero(self, frames: Sequence[Reply]) -> None:
-        """Tell if most fingertips seem to send the pressure of the air, and nobody said so."""
+        """Warn if most fingertips seem to send the pressure of the air, and the option does not say so."""
         payloads = b"".join(frame.payload for frame in frames if len(frame.payload) == 8)
-        told = np.frombuffer(payloads, "<i4")
-        if len(told) and int(np.median(told)) - self.options.zero_pa in _AIR_PA:
+        values = np.frombuffer(payloads, "<i4")
+        if len(values) and int(np.median(values)) - self.options.zero_pa in _AIR_PA:
             log.warning(
                 "the fingertips send about %.0f Pa, as if it were the pressure of the air: give zero_pa=%d, if nothing"
                 " touches them",
-                *(2 * [float(np.median(told))]),
+                *(2 * [float(np.median(values))]),
             )
 
 
 def _expand(
     payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8], factor: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint16]]:
-    told = payload[:, :8].astype(np.uint16)
-    value = told * np.array([factor] + 7 * [1], np.uint16)
+    sent = payload[:, :8].astype(np.uint16)
+    value = sent * np.array([factor] + 7 * [1], np.uint16)
     row, channel = np.divmod(np.arange(8 * len(length)), 8)
-    return row, channel, np.where(told >= _MOST, told + np.uint16(_ENDS), value).ravel()
-
-
-def _places_of_tips(side: Literal["right", "left"]) -> Geometry:
-    """Nominal; one tip on each finger."""
-    tip = Grid(1, 1)
-    parts = ("index", "middle", "ring", "thumb")
-    return Geometry.joined(
-        [tip.at(Hand(side).down(part, [tip])[0], ["pressure"], [uid]) for uid, part in enumerate(parts)]
-    )
+    return row, channel, np.where(sent >= _MOST, sent + np.uint16(_ENDS), value).ravel()
 
 
 def _places_of_pads(side: Literal["right", "left"]) -> Geometry:
-    """Nominal; pads are numbered from the root of a finger to its tip (allegro_node.cpp:266, same commit)."""
+    """Return nominal places; pads count from the root of a finger to its tip (allegro_node.cpp:266, same commit)."""
     pad, uids = Grid(1, 1, _FROM_PAD_TO_PAD_M), iter(range(N_PADS))
     counts = {"palm": 1, "thumb": 3, "index": 4, "middle": 4, "ring": 4}
     return Geometry.joined(

@@ -2,19 +2,18 @@
 
 Wire format: owd ``openwam/CANbus.cc`` (github.com/personalrobotics/owd, 126b940, 2015-11-13), which drives real hands.
 1 Mbit/s (CANbus.cc:240). Identifiers: bit 10: to a group, bits 9 to 5: sender, bits 4 to 0: receiver or group; the host
-is 0, the hand's pucks are nodes 11 to 14, and all of them are group 5. Set a property: ``80 | property, 00, value``
-(four bytes, little-endian) to the node; ask for one: ``property`` to the node or group. A set or a question about TACT
-is answered with data.
+is 0, the hand's pucks are nodes 11 to 14, and group 5 is all of them. Set a property: ``80 | property, 00, value``
+(four bytes, little-endian) to the node; ask for one: ``property`` to the node or group. The answer to a set or a
+question of TACT is data; the answer about another property has bit 7 of the property set.
 
 * TACT = 2, full: five frames to group 9 (``identifier & 0x41F == 0x409``), each with its number 0 to 4 in the first
-  four bits and then five values of 12 bits (the last of frame 4 is unused), in 1/256 N/cm2. CANbus.cc stores
-  each by its number, whatever the order; here they are shown if they come from 0 to 4, and not with one lost.
+  four bits and then five values of 12 bits (the last of frame 4 is unused), in 1/256 N/cm2. CANbus.cc stores each by
+  its number, in any order; this driver publishes a set whose frames came from 0 to 4, all five.
 * TACT = 1, top 10: one frame to group 8 (``== 0x408``): a map of 24 bits (the first bit is cell 0) of which ten are
-  set, and the values of these ten cells in ascending order, four bits each, in N/cm2. Of the other cells the device
-  says nothing but that they are weaker: they are shown as 0.
+  set, and the values of these ten cells in ascending order, four bits each, in N/cm2. The other cells are weaker;
+  they are published as 0.
 
 The number of TACT depends on the firmware; 106 is counted from the list in CANbus.cc for the firmware that has it.
-It answers a question about another property with that property's bit 7 set, as CANbus.cc reads answers.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Packed, Values
 from skinware_drivers.link import Link, Match
@@ -58,7 +57,7 @@ _FULL = tuple(
 def _spread_top_10(
     payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]:
-    """The map and the ten values, as values of all 24 cells; those that are not in the map are 0."""
+    """Return values of all 24 cells from the map and the ten values; cells outside the map are 0."""
     del length
     listed = np.unpackbits(np.ascontiguousarray(payload[:, :3]), axis=1).astype(bool)
     rank = np.cumsum(listed, axis=1) - 1
@@ -93,9 +92,9 @@ class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BarrettDriver(CanAdapter[BarrettOptions]):
-    """The hand's tactile cells. Sensor uid = node << 8 | cell.
+    """The hand's tactile cells, a patch for each node; uid = node << 8 | cell.
 
-    Values are raw: 1/256 N/cm2 in full format, N/cm2 in the other; the type's scale makes pascals of them.
+    Values are raw: 1/256 N/cm2 in the format ``full``, N/cm2 in ``top10``; the scale of the type converts to pascals.
     """
 
     dtype: npt.DTypeLike = np.uint16
@@ -124,22 +123,21 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         return (Poll(HAND_GROUP, bytes([self.options.tact]), self.period_s),)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The nodes of the options, if at least one of them answers; a listener believes them."""
+        """Return the nodes of the options, if at least one of them answers; a listener does not ask."""
         if not link.listen_only and not any([await self._answers(link, node) for node in self.options.nodes]):
             raise HandshakeTimeout(f"none of the nodes {', '.join(map(str, self.options.nodes))} answers")
         return self.patches
 
     async def configure(self, link: Link) -> None:
-        """Choose the format. Each node answers that with data."""
+        """Choose the format; each node answers with data."""
         for patch in self.patches:
             await self.revive(link, patch)
 
     async def start(self, link: Link) -> None:
-        """Wait for a period: the data with which they answered must not be taken for those of the first question."""
+        """Wait for a period, so that the answers to ``configure`` are not taken for those to the first question."""
         await link.sleep(self.period_s)
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask a node that sends no data for its version."""
         return await self._answers(link, patch.key)
 
     async def revive(self, link: Link, patch: Patch) -> None:

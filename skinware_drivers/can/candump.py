@@ -1,4 +1,4 @@
-"""The CAN frames of a batch as text (:func:`skinware.candump.candump_line`)."""
+"""Write the CAN frames of a batch as text (:func:`skinware.candump.candump_line`)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _FD_FLAGS = 0x03
 
 @dataclass(frozen=True)
 class TextFrame:
-    """One frame.
+    """One CAN frame.
 
     Attributes:
-        time_us: when it was heard, microseconds since 1970.
+        time_us: time of receipt, microseconds since 1970.
         identifier: 11 or 29 bits.
-        extended: 29 bits.
-        fd: flags of a CAN FD frame, None for a classic one.
+        extended: whether the identifier has 29 bits.
+        fd: flags of a CAN FD frame; None: a classic frame.
         payload: its data.
     """
 
@@ -32,7 +32,7 @@ class TextFrame:
     payload: bytes
 
     def line(self, channel: str) -> str:
-        """The line of it, without an end.
+        """Return the line of the frame, without its end.
 
         Args:
             channel: name of the interface; see :func:`skinware.candump.channel_name`.
@@ -42,11 +42,11 @@ class TextFrame:
 
 
 def text_frames(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[TextFrame]:
-    """The frames of a batch.
+    """Yield the frames of a batch.
 
     Args:
-        batch: of CAN frames.
-        epoch_offset_ns: what must be added to CLOCK_MONOTONIC for the time since 1970.
+        batch: CAN frames.
+        epoch_offset_ns: time since 1970 minus CLOCK_MONOTONIC, ns.
     """
     rows = slice(batch.start, batch.stop)
     wire = batch.wire[rows]

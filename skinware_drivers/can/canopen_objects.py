@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -22,9 +22,13 @@ from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
 from skinware_drivers.link import Link, Match
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 REPLY_S = 0.2
 _COMMAND, _SEGMENT_BYTES, _FRAME_BYTES = 0xE0, 7, 8
 _MOST_BYTES = 1 << 16
+_NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
+"""Bits of a COB-ID (CiA 301): the TPDO is not in use; its identifier has 29 bits."""
 
 
 class SdoAborted(BusError):
@@ -40,7 +44,7 @@ class SdoAborted(BusError):
 
 
 class SdoClient:
-    """One device's object dictionary. Only one transfer at a time goes on, the others wait.
+    """Access to one device's object dictionary; one transfer at a time.
 
     Args:
         link: the bus.
@@ -53,70 +57,54 @@ class SdoClient:
         self._busy = asyncio.Lock()
 
     async def read(self, index: int, subindex: int = 0) -> bytes:
-        """The bytes of an object.
+        """Return the bytes of an object.
 
         Raises:
-            SdoAborted: the device does not give it.
+            SdoAborted: the device refuses.
             HandshakeTimeout: no answer.
             BusSendError: as ``Link.send``.
         """
+        target = struct.pack("<HB", index, subindex)
         async with self._busy:
-            return await self._read(_Object(self.node, index, subindex))
+            answer = await self._ask(target, bytes([sdo.REQUEST_UPLOAD]) + target + bytes(4), sdo.RESPONSE_UPLOAD)
+            if answer[0] & sdo.EXPEDITED:
+                unused = answer[0] >> 2 & 3 if answer[0] & sdo.SIZE_SPECIFIED else 0
+                return answer[4 : _FRAME_BYTES - unused]
+            data, toggle = b"", 0
+            while len(data) < _MOST_BYTES:
+                request = bytes([sdo.REQUEST_SEGMENT_UPLOAD | toggle]).ljust(_FRAME_BYTES, b"\0")
+                answer = await self._ask(target, request, sdo.RESPONSE_SEGMENT_UPLOAD, toggle)
+                data += answer[1 : _FRAME_BYTES - (answer[0] >> 1 & 7)]
+                if answer[0] & sdo.NO_MORE_DATA:
+                    return data
+                toggle ^= sdo.TOGGLE_BIT
+        raise SdoAborted(f"{self._name(target)} has more than {_MOST_BYTES} bytes", sdo.ABORT_OUT_OF_MEMORY)
 
     async def read_number(self, index: int, subindex: int = 0) -> int:
-        """An unsigned number; raises what ``read`` does."""
+        """Return an object as an unsigned number; raises what ``read`` does."""
         return int.from_bytes(await self.read(index, subindex), "little")
 
     async def write(self, index: int, subindex: int, data: bytes) -> None:
         """Set the bytes of an object; raises what ``read`` does."""
+        target = struct.pack("<HB", index, subindex)
         async with self._busy:
-            await self._write(_Object(self.node, index, subindex), data)
+            if 1 <= len(data) <= 4:
+                command = sdo.REQUEST_DOWNLOAD | sdo.EXPEDITED | sdo.SIZE_SPECIFIED | (4 - len(data)) << 2
+                await self._ask(target, bytes([command]) + target + data.ljust(4, b"\0"), sdo.RESPONSE_DOWNLOAD)
+                return
+            head = bytes([sdo.REQUEST_DOWNLOAD | sdo.SIZE_SPECIFIED]) + target
+            await self._ask(target, head + struct.pack("<I", len(data)), sdo.RESPONSE_DOWNLOAD)
+            toggle = 0
+            for at in range(0, max(1, len(data)), _SEGMENT_BYTES):
+                part = data[at : at + _SEGMENT_BYTES]
+                last = sdo.NO_MORE_DATA if at + _SEGMENT_BYTES >= len(data) else 0
+                command = sdo.REQUEST_SEGMENT_DOWNLOAD | toggle | (_SEGMENT_BYTES - len(part)) << 1 | last
+                request = bytes([command]) + part.ljust(_SEGMENT_BYTES, b"\0")
+                await self._ask(target, request, sdo.RESPONSE_SEGMENT_DOWNLOAD, toggle)
+                toggle ^= sdo.TOGGLE_BIT
 
-    async def _read(self, target: _Object) -> bytes:
-        answer = await self._ask(target, target.head(sdo.REQUEST_UPLOAD) + bytes(4), sdo.RESPONSE_UPLOAD)
-        if answer[0] & sdo.EXPEDITED:
-            unused = answer[0] >> 2 & 3 if answer[0] & sdo.SIZE_SPECIFIED else 0
-            return answer[4 : _FRAME_BYTES - unused]
-        data, toggle = b"", 0
-        while len(data) < _MOST_BYTES:
-            request = bytes([sdo.REQUEST_SEGMENT_UPLOAD | toggle]).ljust(_FRAME_BYTES, b"\0")
-            answer = await self._ask(target, request, sdo.RESPONSE_SEGMENT_UPLOAD, toggle)
-            data += answer[1 : _FRAME_BYTES - (answer[0] >> 1 & 7)]
-            if answer[0] & sdo.NO_MORE_DATA:
-                return data
-            toggle ^= sdo.TOGGLE_BIT
-        raise SdoAborted(f"{target} has more than {_MOST_BYTES} bytes", sdo.ABORT_OUT_OF_MEMORY)
-
-    async def _write(self, target: _Object, data: bytes) -> None:
-        if 1 <= len(data) <= 4:
-            command = sdo.REQUEST_DOWNLOAD | sdo.EXPEDITED | sdo.SIZE_SPECIFIED | (4 - len(data)) << 2
-            await self._ask(target, target.head(command) + data.ljust(4, b"\0"), sdo.RESPONSE_DOWNLOAD)
-            return
-        size = struct.pack("<I", len(data))
-        await self._ask(target, target.head(sdo.REQUEST_DOWNLOAD | sdo.SIZE_SPECIFIED) + size, sdo.RESPONSE_DOWNLOAD)
-        toggle = 0
-        for at in range(0, max(1, len(data)), _SEGMENT_BYTES):
-            part = data[at : at + _SEGMENT_BYTES]
-            last = sdo.NO_MORE_DATA if at + _SEGMENT_BYTES >= len(data) else 0
-            command = sdo.REQUEST_SEGMENT_DOWNLOAD | toggle | (_SEGMENT_BYTES - len(part)) << 1 | last
-            request = bytes([command]) + part.ljust(_SEGMENT_BYTES, b"\0")
-            await self._ask(target, request, sdo.RESPONSE_SEGMENT_DOWNLOAD, toggle)
-            toggle ^= sdo.TOGGLE_BIT
-
-    async def _ask(self, target: _Object, request: bytes, response: int, toggle: int | None = None) -> bytes:
-        """Send a request; the answer to it. Other frames of the device's server are passed over."""
-
-        def is_answer(payload: bytes) -> bool:
-            if payload[0] & _COMMAND != response:
-                return False
-            return payload[0] & sdo.TOGGLE_BIT == toggle if toggle is not None else payload[1:4] == target.address
-
-        payload = await self._exchange(target, request, is_answer)
-        if payload[0] == sdo.RESPONSE_ABORTED:
-            raise SdoAborted(str(target), int.from_bytes(payload[4:], "little"))
-        return payload
-
-    async def _exchange(self, target: _Object, request: bytes, is_answer: Callable[[bytes], bool]) -> bytes:
+    async def _ask(self, target: bytes, request: bytes, response: int, toggle: int | None = None) -> bytes:
+        """Send a request for an object and return the answer to it; other frames of the device's server are skipped."""
         with self._link.follow(Match(0x580 + self.node)) as frames:
             await self._link.send(0x600 + self.node, request)
             try:
@@ -125,44 +113,27 @@ class SdoClient:
                         payload = (await frames.get()).payload
                         if len(payload) != _FRAME_BYTES:
                             continue
-                        is_abort = payload[0] == sdo.RESPONSE_ABORTED and payload[1:4] == target.address
-                        if is_abort or is_answer(payload):
+                        if payload[0] == sdo.RESPONSE_ABORTED and payload[1:4] == target:
+                            raise SdoAborted(self._name(target), int.from_bytes(payload[4:], "little"))
+                        is_ours = payload[1:4] == target if toggle is None else payload[0] & sdo.TOGGLE_BIT == toggle
+                        if payload[0] & _COMMAND == response and is_ours:
                             return payload
             except TimeoutError:
-                raise HandshakeTimeout(f"{self._link.bus_name}: no answer from {target} within {REPLY_S:g} s") from None
+                why = f"no answer from {self._name(target)} within {REPLY_S:g} s"
+                raise HandshakeTimeout(f"{self._link.bus_name}: {why}") from None
 
-
-class _Object:
-    """Where an object is."""
-
-    def __init__(self, node: int, index: int, subindex: int) -> None:
-        self._name = f"object {index:04X}:{subindex} of node {node}"
-        self.address = struct.pack("<HB", index, subindex)
-
-    def head(self, command: int) -> bytes:
-        return bytes([command]) + self.address
-
-    def __str__(self) -> str:
-        return self._name
-
-
-log: logging.Logger = logging.getLogger("skinware.driver")
-
-_NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
+    def _name(self, target: bytes) -> str:
+        index, subindex = struct.unpack("<HB", target)
+        return f"object {index:04X}:{subindex} of node {self.node}"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One mapped object: where it is in the object dictionary, and its length."""
+    """One mapped object: its place in the object dictionary, and its length in bits."""
 
     index: int
     subindex: int
     bits: int
-
-    @staticmethod
-    def from_number(number: int) -> Entry:
-        """Of an entry of 0x1A00 ff.: index << 16 | subindex << 8 | bits."""
-        return Entry(number >> 16, number >> 8 & 0xFF, number & 0xFF)
 
 
 @dataclass(frozen=True)
@@ -171,9 +142,9 @@ class Tpdo:
 
     Attributes:
         number: from 1.
-        identifier: of its frames, with ``EXTENDED_FLAG`` if that has 29 bits.
+        identifier: of its frames, with ``EXTENDED_FLAG`` if it has 29 bits.
         transmission: transmission type: 0 to 240 upon SYNC, 254 and 255 by event or event timer.
-        entries: what is mapped, in order.
+        entries: the mapped objects, in order.
     """
 
     number: int
@@ -183,21 +154,24 @@ class Tpdo:
 
     @staticmethod
     def make(number: int, cob_id: int, transmission: int, entries: Iterable[int]) -> Tpdo | None:
-        """Of the numbers in the object dictionary; None if it is not in use."""
-        mapped = tuple(Entry.from_number(entry) for entry in entries)
+        """Return the TPDO of numbers in the object dictionary; None if it is not in use.
+
+        Args:
+            number: from 1.
+            cob_id: 0x1800 + number - 1, subindex 1.
+            transmission: the same object, subindex 2.
+            entries: 0x1A00 + number - 1: index << 16 | subindex << 8 | bits.
+        """
+        mapped = tuple(Entry(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries)
         if cob_id & _NOT_IN_USE or not mapped:
             return None
         extended = bool(cob_id & _IS_EXTENDED)
         identifier = cob_id & 0x1FFF_FFFF | EXTENDED_FLAG if extended else cob_id & 0x7FF
         return Tpdo(number, identifier, transmission, mapped)
 
-    @property
-    def length(self) -> int:
-        return -(-sum(entry.bits for entry in self.entries) // 8)
-
 
 def default_tpdos(dictionary: ObjectDictionary) -> list[Tpdo]:
-    """The TPDOs of a device that nobody has changed, as its EDS says."""
+    """Return the TPDOs of a device in its original state, by its EDS."""
 
     def number(index: int, subindex: int) -> int:
         variable = dictionary.get_variable(index, subindex)
@@ -213,7 +187,7 @@ def default_tpdos(dictionary: ObjectDictionary) -> list[Tpdo]:
 
 
 def tpdo_numbers(dictionary: ObjectDictionary) -> list[int]:
-    """Which TPDOs a device can have, from 1."""
+    """Return the numbers of the TPDOs that a device can have, from 1."""
     return [i + 1 for i in range(512) if 0x1800 + i in dictionary and 0x1A00 + i in dictionary]
 
 
@@ -221,21 +195,22 @@ class PdoMap:
     """The frames, types and patches of all nodes of a bus.
 
     Args:
-        dictionary: what the mapped objects are; of any node.
+        dictionary: the object dictionary, of any node.
         nodes: TPDOs by node id.
-        default_type: what an object is whose name says no type.
+        default_type: type of objects whose name contains none.
 
     Attributes:
-        layout, types, dtype, patches: as an adapter has them.
+        layout, types, dtype, patches: for an adapter.
 
     Raises:
-        ConfigurationError: nothing that is mapped is a number, or sensors of one type differ in scale.
+        ConfigurationError: no mapped object is a number, or sensors of one type differ in scale.
     """
 
     def __init__(self, dictionary: ObjectDictionary, nodes: Mapping[int, Sequence[Tpdo]], default_type: str) -> None:
         self._dictionary = dictionary
         self._default_type = default_type
-        self._sensors = {entry: self._variable(entry) for entry in _all_entries(nodes)}
+        every = (entry for tpdos in nodes.values() for tpdo in tpdos for entry in tpdo.entries)
+        self._sensors = {entry: self._variable(entry) for entry in dict.fromkeys(every)}
         known = [variable for variable in self._sensors.values() if variable is not None]
         if not known:
             raise ConfigurationError("none of the objects that are mapped into TPDOs is a number that the EDS knows")
@@ -248,7 +223,7 @@ class PdoMap:
         )
 
     def _variable(self, entry: Entry) -> ODVariable | None:
-        """The sensor behind a mapped object; None for what is no sensor."""
+        """Return the sensor behind a mapped object; None if it is no sensor."""
         variable = self._dictionary.get_variable(entry.index, entry.subindex)
         if variable is not None and entry.bits <= 32 and variable.data_type in datatypes.NUMBER_TYPES:
             return variable
@@ -284,7 +259,7 @@ class PdoMap:
         return Module(channels, key=tpdo.number, kind="tpdo")
 
     def _frames(self, nodes: Mapping[int, Sequence[Tpdo]]) -> Iterable[Frame]:
-        """One kind of frame for all nodes whose TPDO is alike and follows the predefined identifiers, else each own."""
+        """Yield one kind of frame for all nodes with one TPDO at predefined identifiers, else one for each node."""
         alike: dict[tuple[Any, ...], list[int]] = {}
         bases: dict[int, set[tuple[Any, ...]]] = {}
         for node, tpdos in nodes.items():
@@ -294,25 +269,24 @@ class PdoMap:
                 alike.setdefault(key, []).append(node)
                 bases.setdefault(base, set()).add(key)
         for (base, number, entries), of_nodes in alike.items():
-            tpdo = Tpdo(number, base, 0, entries)
+            length, values = -(-sum(entry.bits for entry in entries) // 8), tuple(self._runs(number, entries))
             if base & 0x7F == 0 and base < EXTENDED_FLAG and len(bases[base]) == 1:
-                yield self._frame(tpdo, f"TPDO {number}", Identifier(base, 0x780), Bits(0, 7))
+                when = (Identifier(base, 0x780),)
+                yield Frame(f"TPDO {number}", when, (length,), values, patch=Bits(0, 7), module=number)
                 continue
             for node in of_nodes:
-                yield self._frame(tpdo, f"TPDO {number} of node {node}", Identifier(base + node), node)
+                name, when = f"TPDO {number} of node {node}", (Identifier(base + node),)
+                yield Frame(name, when, (length,), values, patch=node, module=number)
 
-    def _frame(self, tpdo: Tpdo, name: str, identifier: Identifier, patch: Bits | int) -> Frame:
-        return Frame(name, (identifier,), (tpdo.length,), tuple(self._runs(tpdo)), patch=patch, module=tpdo.number)
-
-    def _runs(self, tpdo: Tpdo) -> Iterable[Values]:
-        """Entries of one format that follow each other; little-endian, as CiA 301 packs them."""
+    def _runs(self, number: int, entries: Sequence[Entry]) -> Iterable[Values]:
+        """Yield runs of entries of one format; little-endian, as CiA 301 packs them."""
         bit, channel = 0, 0
-        for (bits, kind), group in groupby(tpdo.entries, key=lambda entry: (entry.bits, self._kind(entry))):
+        for (bits, kind), group in groupby(entries, key=lambda entry: (entry.bits, self._kind(entry))):
             count = len(list(group))
             if kind:
                 to = tuple(range(channel, channel + count))
                 if kind == "f" and (bit % 8 or bits != 32):
-                    raise ConfigurationError(f"TPDO {tpdo.number}: a REAL32 must begin with a byte")
+                    raise ConfigurationError(f"TPDO {number}: a REAL32 must begin with a byte")
                 if bit % 8 == 0 and bits in (8, 16, 32):
                     yield Values(bit // 8, f"<{kind}{bits // 8}", count, to)
                 else:
@@ -320,7 +294,7 @@ class PdoMap:
             bit, channel = bit + bits * count, channel + count
 
     def _kind(self, entry: Entry) -> str:
-        """Kind of numpy dtype; empty for what is no sensor."""
+        """Return the kind of numpy dtype; empty if the object is no sensor."""
         variable = self._sensors[entry]
         if variable is None:
             return ""
@@ -329,12 +303,8 @@ class PdoMap:
         return "i" if variable.data_type in datatypes.SIGNED_TYPES else "u"
 
 
-def _all_entries(nodes: Mapping[int, Sequence[Tpdo]]) -> list[Entry]:
-    return list(dict.fromkeys(entry for tpdos in nodes.values() for tpdo in tpdos for entry in tpdo.entries))
-
-
 def _capacity(variable: ODVariable) -> tuple[float, float]:
-    """Least and greatest raw value of a data type."""
+    """Return the least and greatest raw value of a data type."""
     if variable.data_type in datatypes.FLOAT_TYPES:
         return -np.inf, np.inf
     bits = len(variable)
@@ -344,15 +314,15 @@ def _capacity(variable: ODVariable) -> tuple[float, float]:
 
 
 def _limits(variable: ODVariable) -> tuple[float, float]:
-    """Least and greatest raw value: the EDS' limits, else what the data type can hold."""
+    """Return the least and greatest raw value: the limits in the EDS, else of the data type."""
     low, high = _capacity(variable)
     return low if variable.min is None else variable.min, high if variable.max is None else variable.max
 
 
 def _common_dtype(variables: Sequence[ODVariable]) -> np.dtype[Any]:
-    """The smallest dtype of a service that holds whatever they may send, limits or not.
+    """Return the smallest dtype of a service for all values that these can send, within the limits of the EDS or not.
 
-    Only UNSIGNED32 is taken by its limits, as a service has no such dtype; without any it becomes float32, which is
+    Only for UNSIGNED32, which a service does not have, do the limits count; without any it becomes float32, which is
     exact to 24 bits.
     """
     ranges = [_limits(v) if v.data_type == datatypes.UNSIGNED32 else _capacity(v) for v in variables]

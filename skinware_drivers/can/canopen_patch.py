@@ -1,8 +1,8 @@
 """Any CANopen skin patch (CiA 301), by its EDS: configured over SDO, read from its TPDOs.
 
-``canopen`` reads the EDS; the TPDO mapping is read once from each node (0x1800 ff., 0x1A00 ff.) and becomes a layout,
-so that nothing of CANopen runs per frame. Identifiers, states and commands: CiA 301, with the predefined connection
-set: NMT 0x000, SYNC 0x080, EMCY 0x080 + node, SDO 0x600/0x580 + node, heartbeat 0x700 + node.
+The package ``canopen`` parses the EDS. The TPDO mapping is read once from each node (0x1800 ff., 0x1A00 ff.) and
+becomes a layout, so that no CANopen code runs per frame. Identifiers, states and commands: CiA 301, with the predefined
+connection set: NMT 0x000, SYNC 0x080, EMCY 0x080 + node, SDO 0x600/0x580 + node, heartbeat 0x700 + node.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
@@ -37,7 +37,7 @@ FIRST_NODE, LAST_NODE = 1, 127
 _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
 _BOOT_UP, _OPERATIONAL = 0, 5
 _LAST_SYNCHRONOUS = 240
-_MOST_ERRORS_TOLD = 10
+_MOST_ERRORS_LOGGED = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
 
@@ -53,7 +53,7 @@ class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         int, msgspec.Meta(description="time between two heartbeats of a patch, ms; 0: none", ge=0, le=60_000)
     ] = 100
     type: Annotated[str, msgspec.Meta(description="type of sensors whose name in the EDS contains none")] = "pressure"
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns which modules send, s", gt=0)] = 1.0
+    learn_s: Annotated[float, msgspec.Meta(description="time in which a listener learns the nodes, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -68,14 +68,13 @@ class MappingChanged(BusError):
 
 
 class CanopenDriver(CanAdapter[CanopenOptions]):
-    """CANopen patches. See this module's docstring for the wire, and ``CanopenOptions`` for the options.
+    """CANopen patches: a node is a patch, each of its TPDOs a module, each mapped number a sensor.
 
-    A node is a patch, each of its TPDOs a module, each mapped number a sensor: uid = node << 24 | index << 8 |
-    subindex, type by its name in the EDS (one that contains ``temperature`` is of that type, and so on). Factor and
-    Unit of the EDS, if it has them, are scale and unit.
+    uid = node << 24 | index << 8 | subindex. The type of a sensor is the type whose name its name in the EDS contains;
+    Factor and Unit of the EDS, if it has them, are scale and unit.
 
     Attributes:
-        expects_heartbeat_of: nodes that took the heartbeat period of the options; others are not missed.
+        expects_heartbeat_of: nodes that accepted the heartbeat period of the options; others are not missed.
     """
 
     payload_size = 8
@@ -93,15 +92,15 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """SYNC, if a TPDO waits for it; so often that the slowest is sent once a period."""
+        """SYNC, if a TPDO waits for it: often enough for the slowest TPDO to be sent once a period."""
         types = (tpdo.transmission for tpdos in self._tpdos.values() for tpdo in tpdos)
         every = [max(1, type_) for type_ in types if type_ <= _LAST_SYNCHRONOUS]  # so many SYNCs
         return (Poll(0x080, b"", self.period_s / max(every)),) if every else ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The nodes of the options, or all that answer; their TPDOs as they say themselves.
+        """Return the nodes of the options, or all that answer, with the TPDOs that they report.
 
-        Of a listener, and of nodes that do not answer while others do, they are taken to be as the EDS says.
+        The TPDOs of the EDS are assumed by a listener, and for named nodes that do not answer while others do.
         """
         if link.listen_only:
             heard = self.options.nodes or _nodes_heard(await link.listen(self.options.learn_s))
@@ -122,7 +121,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         return self.patches
 
     async def configure(self, link: Link) -> None:
-        """Heartbeat and event timers of all nodes; those that do not answer are left for ``probe`` to find."""
+        """Set heartbeat and event timers of all nodes; nodes that do not answer are left to ``probe``."""
         results = await asyncio.gather(*(self._configure(link, node) for node in self._tpdos), return_exceptions=True)
         failures = [result for result in results if isinstance(result, BaseException)]
         for failure in failures:
@@ -130,17 +129,16 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
                 raise failure
 
     async def start(self, link: Link) -> None:
-        """NMT: start every node."""
         for node in self._tpdos:
             await link.send(0x000, bytes((_START, node)))
 
     async def stop(self, link: Link) -> None:
-        """NMT: every node back to pre-operational, in which it sends no TPDO."""
+        """Return every node to pre-operational, in which it sends no TPDO."""
         for node in self._tpdos:
             await link.send(0x000, bytes((_ENTER_PRE_OPERATIONAL, node)))
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask a silent node for its device type, after getting it out of ``stopped``, in which it answers nothing."""
+        """Take a silent node out of ``stopped``, in which it answers no question, and ask for its device type."""
         await link.send(0x000, bytes((_ENTER_PRE_OPERATIONAL, patch.key)))
         return await self._is_there(patch.key)
 
@@ -148,7 +146,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         """Set up and start one node.
 
         Raises:
-            MappingChanged: its TPDOs are others than before.
+            MappingChanged: its TPDOs have changed.
         """
         if await self._read_tpdos(patch.key) != self._tpdos[patch.key]:
             log.error("%s: the TPDOs of %s have changed: start the driver again", link.bus_name, patch.name)
@@ -157,9 +155,8 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         await link.send(0x000, bytes((_START, patch.key)))
 
     async def attend(self, link: Link) -> None:
-        """Boot-up, heartbeat and EMCY of all nodes."""
-        patches = {patch.key: patch for patch in self.patches}
-        nodes = {node: _NodeState(patch, self.tell) for node, patch in patches.items()}
+        """Follow boot-up, heartbeat and EMCY of all nodes."""
+        nodes = {patch.key: _NodeState(patch, self.tell) for patch in self.patches}
         matches = [Match(base + node) for node in nodes for base in (0x700, 0x080)]
         loss_s = max(_LOST_HEARTBEATS * self.options.heartbeat_ms / 1e3, _LEAST_HEARTBEAT_LOSS_S)
         with link.follow(*matches) as frames:
@@ -168,7 +165,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
                     async with asyncio.timeout(loss_s / 2):
                         frame = await frames.get()
                     nodes[frame.identifier & 0x7F].hear(frame)
-                if frames.empty():  # what was heard comes before what was not
+                if frames.empty():  # received heartbeats are judged before missing ones
                     for node in self.expects_heartbeat_of & nodes.keys():
                         nodes[node].look(asyncio.get_running_loop().time(), loss_s)
 
@@ -214,7 +211,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
 
 
 class _NodeState:
-    """What a node has said of itself."""
+    """The state of a node, by its messages."""
 
     def __init__(self, patch: Patch, tell: Callable[[Patch, Notice], None]) -> None:
         self._patch = patch
@@ -224,14 +221,14 @@ class _NodeState:
         self._errors: set[int] = set()
 
     def hear(self, frame: Reply) -> None:
-        """A heartbeat, a boot-up message, or an EMCY."""
+        """Take a heartbeat, a boot-up message, or an EMCY."""
         if frame.identifier < 0x700:
             self._hear_emergency(frame.payload)
         elif len(frame.payload) == 1:
             self._hear_state(frame.payload[0] & 0x7F)
 
     def look(self, time_s: float, loss_s: float) -> None:
-        """Is the heartbeat overdue? It must have been heard once."""
+        """Report the node as lost if its heartbeat is overdue; a heartbeat must have been heard before."""
         if self._heard_s is not None and time_s - self._heard_s > loss_s:
             self._heard_s = None
             self._is_operational = False
@@ -256,7 +253,7 @@ class _NodeState:
             self._errors.clear()
             self._tell(self._patch, Notice.SOUND)
             return
-        if code not in self._errors and len(self._errors) < _MOST_ERRORS_TOLD:  # each once, until they are over
+        if code not in self._errors and len(self._errors) < _MOST_ERRORS_LOGGED:  # each once, until they are over
             self._errors.add(code)
             text = EmcyError(code, payload[2], payload[3:], 0).get_desc() or "unknown error"
             log.warning("%s reports an error: %s (code %04X)", self._patch.name, text, code)
@@ -269,12 +266,12 @@ def _read_eds(path: str, node: int) -> ObjectDictionary:
         return canopen.import_od(source, node)
     except OSError as error:
         raise ConfigurationError(f"EDS {source}: {error.strerror}") from None
-    except Exception as error:  # noqa: BLE001 - the parser raises whatever it stumbles over
+    except Exception as error:  # noqa: BLE001 - the exceptions of the parser are not documented
         raise ConfigurationError(f"EDS {source} cannot be read: {error}") from None
 
 
 def _nodes_heard(heard: Counter[Heard]) -> set[int]:
-    """Node ids in heartbeats and in TPDOs of the predefined connection set."""
+    """Return the node ids in heartbeats and in TPDOs of the predefined connection set."""
     functions = (0x700, 0x180, 0x280, 0x380, 0x480)
     identifiers: Iterable[int] = (frame.identifier for frame in heard)
     return {i & 0x7F for i in identifiers if i < 0x800 and i & 0x780 in functions and i & 0x7F}

@@ -1,13 +1,11 @@
 """CPM finger with CySkin technology on CAN: sixteen taxels in four frames.
 
-Wire format: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino`` (github.com/wngfra/can2wifi2ros, Apache-2.0). 1
-Mbit/s. Identifiers 0x405, 0x407, 0x409, 0x40B in this order, eight bytes each: four little-endian uint16. The i-th
-value of a set belongs to taxel ``ORDER[i]``. (Other programs of that author use the same table so; only a calibration
-script of his uses it the other way round.) A set is complete with 0x40B.
+Wire format: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino`` (github.com/wngfra/can2wifi2ros, Apache-2.0).
+1 Mbit/s. Identifiers 0x405, 0x407, 0x409, 0x40B in this order, eight bytes each: four little-endian uint16. The i-th
+value of a set belongs to taxel ``ORDER[i]``, as in the other programs of that author; one of his calibration scripts
+reads the table the other way round. The finger sends by itself: no program of that author sends a command.
 
-Nothing numbers the sets and nothing is checked above CAN, so one lost frame loses the set: it is not shown, and sets
-are told apart by time alone. No program of that author sends a command: the finger sends by
-itself.
+The frames carry no number and no checksum, so one lost frame loses its set, and sets are separated by time alone.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, Values
 from skinware_drivers.options import check_options
@@ -43,7 +41,7 @@ class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
-    """One finger on each bus. Sensor uid = taxel; raw counts, of which hosts take a baseline themselves."""
+    """One finger on each bus; uid = taxel. Values are raw counts, without a baseline."""
 
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
     dtype: npt.DTypeLike = np.uint16

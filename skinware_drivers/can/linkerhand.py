@@ -1,12 +1,12 @@
 """LinkerHand L6, L7, L10, L20, G20, L21, L25 and O6 on CAN: matrices or values of touch at each finger.
 
-Wire format: the maker's linkerhand-python-sdk, and linkerhand-ros2-sdk with its table of commands. Classic CAN, 1
-Mbit/s. A hand has one identifier, a right one 0x27 and a left one 0x28, for all that is said to it and by it. Byte 0 is
-a command; alone it is a question, which the hand answers with the same byte and data within a millisecond. What it does
-not know it ignores.
+Wire format: the maker's linkerhand-python-sdk, and linkerhand-ros2-sdk with its table of commands. Classic CAN,
+1 Mbit/s. All frames to and from a hand have one identifier, 0x27 for a right hand and 0x28 for a left one. Byte 0 is a
+command; alone it is a question, which the hand answers with the same byte and data within a millisecond. It ignores
+unknown questions.
 
-* ``B0``: kind of touch (0 none, 1 values of each finger, 2 to 4 matrices, 5 and 7 those of the whole hand, 6 not over
-  CAN).
+* ``B0``: kind of touch (0 none, 1 values of each finger, 2 to 4 matrices, 5 and 7 matrices of the whole hand, 6 not
+  over CAN).
 * ``C0``: serial number, in frames ``C0 k`` with six characters each.
 * ``B1 C6`` to ``B5 C6``, thumb to little finger, ``B6 C6`` the palm: twelve rows of six, a frame each: ``B1 r0`` with r
   the row, and its values. ``A4`` instead of ``C6``: ten rows of four. A hand knows one of the two.
@@ -15,8 +15,8 @@ not know it ignores.
 * ``20`` to ``23`` (L21, L25: ``90`` to ``93``): normal force, tangential force, its direction (255: none), proximity,
   of the five fingers.
 
-Nothing numbers the frames. A matrix is shown if all its rows came, in order and soon after each other, whoever asked
-for them. Usually the hand's own program does, and this driver sends nothing.
+The frames carry no number. A matrix is published if all its rows came, in order and soon after each other, whichever
+program asked for them. Usually the hand's own program asks, and this driver sends nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
 from skinware_drivers.conditions import Identifier
 from skinware_drivers.description import Patch, SkinTables
@@ -65,7 +65,7 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """Options of the driver."""
 
     hands: Annotated[
-        tuple[int, ...], msgspec.Meta(description="identifiers of the hands; default: 0x27 and 0x28, as far as there")
+        tuple[int, ...], msgspec.Meta(description="identifiers of the hands; default: 0x27 and 0x28, if present")
     ] = ()
     touch: Annotated[
         Literal["auto", "12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],
@@ -80,10 +80,10 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     period_ms: Annotated[
         Annotated[int, msgspec.Meta(ge=20, le=2000)] | None,
         msgspec.Meta(
-            description="time between two updates, ms; default: learnt by a listener, else 50, of the whole hand 100"
+            description="time between two updates, ms; default: learnt by a listener, else 50, for the whole hand 100"
         ),
     ] = None
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns who is there, s", gt=0)] = 1.0
+    learn_s: Annotated[float, msgspec.Meta(description="time in which a listener learns the hands, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -92,19 +92,14 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 class _Found(NamedTuple):
-    """A hand.
-
-    Attributes:
-        touch: how it tells of touch.
-        parts: what of it does.
-    """
+    """A hand: the name of its kind of touch in ``TOUCH``, and its parts that have touch."""
 
     touch: str
     parts: Sequence[str]
 
 
 class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
-    """Hands on one bus, a patch each. Sensor uid = identifier << 16 | part << 12 | taxel, parts in the order of PARTS.
+    """Hands on one bus, a patch each; uid = identifier << 16 | part << 12 | taxel, parts in the order of ``PARTS``.
 
     Values are raw, larger for more force.
     """
@@ -129,20 +124,20 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """All parts of all hands, each when the reply before has ended; nothing, if another program asks."""
+        """Questions for all parts of all hands, each after the reply to the one before; none without ``ask``."""
         if not self.options.ask:
             return ()
         return [
-            Poll(hand, one.payload, self.period_s, _end_of_answer(hand, one), min(one.patience_s, self.period_s))
+            Poll(hand, one.payload, self.period_s, one.end(hand), min(one.patience_s, self.period_s))
             for hand, questions in self._questions.items()
             for one in questions
         ]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The hands that answer, or those that are heard to tell of touch.
+        """Return the hands that answer, or whose touch is heard.
 
         Raises:
-            BusError: there is none, none has touch that can be read, or the hands differ.
+            BusError: there is no hand, no touch that can be read, or the hands differ.
         """
         found = await self._find(link, self._wanted)
         if not found:
@@ -150,8 +145,8 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
             raise HandshakeTimeout(
                 f"{link.bus_name}: no hand with touch answers at {names}"
                 if self._asks(link)
-                else f"{link.bus_name}: no hand tells of touch at {names}, as if no program asked for it; if this"
-                " driver is to ask, give it ask=yes"
+                else f"{link.bus_name}: no hand sends touch at {names}, as if no program asked for it; to let this"
+                " driver ask, set ask=yes"
             )
         self._take(found)
         return self.patches
@@ -162,18 +157,18 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return self.patches
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Nothing: a silent hand is asked for its touch all the time, by somebody."""
+        """Send nothing: a silent hand is asked for its touch all the time, by this or another program."""
         return False
 
     async def attend(self, link: Link) -> None:
-        """Hear what else is said on the hands' identifiers, and tell if somebody else asks for touch, too."""
+        """Follow the other frames of the hands, so that they do not count as unused; warn if another program asks."""
         questions = {question.payload for questions in self._questions.values() for question in questions}
-        told = not self._asks(link)
+        has_warned = not self._asks(link)
         with link.follow(*(Match(patch.key) for patch in self.patches)) as others:
             while True:
                 frame = await others.get()
-                if not told and frame.payload in questions:
-                    told = True
+                if not has_warned and frame.payload in questions:
+                    has_warned = True
                     log.warning(
                         "%s: another program asks %s for its touch, too: answers to both get mixed up, and questions"
                         " collide with answers; leave out ask=yes, and this driver shows what the other one asks for",
@@ -183,26 +178,33 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Fingers that tell nothing but 0."""
         return ZeroWatch(tables)
 
     @operation(looks=True)
     async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:
-        return {patch.name: await self._serial_number(link, patch.key) for patch in patches}
+        """Return the serial numbers of the hands."""
+        found = {}
+        for patch in patches:
+            reply = Match(patch.key, prefix=bytes([_SERIAL_NUMBER]), shortest=3)
+            frames = await link.collect(patch.key, bytes([_SERIAL_NUMBER]), reply, duration_s=_SERIAL_S)
+            pieces = {frame.payload[1]: frame.payload[2:] for frame in frames}
+            text = b"".join(pieces[number] for number in sorted(pieces)).decode("ascii", "replace")
+            found[patch.name] = text.strip("\0 ")
+        return found
 
     def _asks(self, link: Link) -> bool:
         return self.options.ask and not link.listen_only
 
     def _take(self, found: Mapping[int, _Found]) -> None:
-        """These are the hands.
+        """Describe these hands.
 
         Raises:
-            BusError: they tell of touch in different ways.
+            BusError: they have different kinds of touch.
         """
         if len({of.touch for of in found.values()}) > 1:
-            told = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
+            kinds = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
             raise BusError(
-                f"hands of different touch on one bus ({told}): run a driver for each, with its option hands"
+                f"hands of different touch on one bus ({kinds}): run a driver for each, with its option hands"
             )
         touch = TOUCH[next(iter(found.values())).touch]
         self._found = dict(found)
@@ -212,32 +214,28 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
             self.period_s = self._round_s or touch.period_s
         self.layout = touch.layout(Identifier.covering(list(found)))
         self.patches = [Patch(_name(hand), touch.modules(hand, of.parts), hand) for hand, of in found.items()]
-        self.geometry = Geometry.joined([touch.geometry(hand, of.parts, _side(hand)) for hand, of in found.items()])
+        sides = {hand: Hand("left" if hand == LEFT else "right") for hand in found}
+        self.geometry = Geometry.joined([touch.geometry(hand, of.parts, sides[hand]) for hand, of in found.items()])
 
     async def _find(self, link: Link, wanted: Sequence[int]) -> dict[int, _Found]:
-        """Of these hands, those that are there; a listener believes what it was told of them."""
+        """Return those of these hands that are on the bus; a listener believes the options about them."""
         if self._asks(link):
             return {hand: of for hand in wanted if (of := await self._ask_hand(link, hand)) is not None}
         if self.options.hands and self.options.touch != "auto":
             return {hand: _Found(self.options.touch, FINGERS) for hand in wanted}
         heard = await link.listen(self.options.learn_s)
         found = self._heard(heard, wanted)
-        self._round_s = self._round(heard, found) or self._round_s
-        return found
-
-    def _round(self, heard: Counter[Heard], found: Mapping[int, _Found]) -> float | None:
-        """How long a program takes from one question to the same one again, s; None if it was asked too seldom."""
         asked = [
             heard[Heard(hand, question.payload[0], len(question.payload))]
             for hand, of in found.items()
             for question in TOUCH[of.touch].questions(of.parts)
         ]
-        if max(asked, default=0) < _FEWEST_ROUNDS:
-            return None
-        return min(max(self.options.learn_s / max(asked), _SHORTEST_ROUND_S), _LONGEST_ROUND_S)
+        if (rounds := max(asked, default=0)) >= _FEWEST_ROUNDS:
+            self._round_s = min(max(self.options.learn_s / rounds, _SHORTEST_ROUND_S), _LONGEST_ROUND_S)
+        return found
 
     def _heard(self, heard: Counter[Heard], wanted: Sequence[int]) -> dict[int, _Found]:
-        """The hands that told of touch; of one that told of it in several ways, what was told most."""
+        """Return the hands whose touch was heard, each with the kind of touch that most of its frames fit."""
         found = {}
         for hand in wanted:
             frames = {(one.first_byte, one.length): n for one, n in heard.items() if one.identifier == hand}
@@ -249,7 +247,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return found
 
     async def _ask_hand(self, link: Link, hand: int) -> _Found | None:
-        """What this hand has, as far as it answers.
+        """Return the kind of touch for which this hand answers; None if it does not answer.
 
         Raises:
             BusError: it has no touch that can be read.
@@ -265,7 +263,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return None
 
     async def _likely(self, link: Link, hand: int) -> Sequence[str]:
-        """In which ways it may tell of touch, by what it says of itself."""
+        """Return the kinds of touch that the hand may have, by its answer to ``B0``."""
         reply = Match(hand, prefix=bytes([_KIND_OF_TOUCH]), shortest=2)
         try:
             frame = await link.request(hand, bytes([_KIND_OF_TOUCH]), reply, timeout_s=_ANSWER_S, tries=_TRIES)
@@ -278,30 +276,15 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
             )
         return _CANDIDATES.get(kind, tuple(TOUCH))
 
-    @staticmethod
-    async def _serial_number(link: Link, hand: int) -> str:
-        reply = Match(hand, prefix=bytes([_SERIAL_NUMBER]), shortest=3)
-        frames = await link.collect(hand, bytes([_SERIAL_NUMBER]), reply, duration_s=_SERIAL_S)
-        pieces = {frame.payload[1]: frame.payload[2:] for frame in frames}
-        return b"".join(pieces[number] for number in sorted(pieces)).decode("ascii", "replace").strip("\0 ")
-
 
 async def _answers(link: Link, hand: int, question: Question) -> bool:
-    last, timeout_s = _end_of_answer(hand, question), max(_ANSWER_S, question.patience_s)
+    timeout_s = max(_ANSWER_S, question.patience_s)
     try:
-        await link.request(hand, question.payload, last, timeout_s=timeout_s, tries=_TRIES)
+        await link.request(hand, question.payload, question.end(hand), timeout_s=timeout_s, tries=_TRIES)
     except HandshakeTimeout:
         return False
     return True
 
 
-def _end_of_answer(hand: int, question: Question) -> Match:
-    return Match(hand, prefix=question.last, shortest=question.shortest)
-
-
 def _name(hand: int) -> str:
     return {RIGHT: "right hand", LEFT: "left hand"}.get(hand, f"hand {identifier_text(hand)}")
-
-
-def _side(hand: int) -> Hand:
-    return Hand("left" if hand == LEFT else "right")

@@ -1,6 +1,6 @@
-"""What LinkerHands tell of touch, in each generation: which modules, in which frames, and how they are asked for.
+"""The touch of LinkerHands of each generation: its modules, its frames, and the questions for it.
 
-All that is said to a hand and by it has one identifier; byte 0 tells what it is.
+All frames to and from a hand have one identifier; byte 0 is the command. Sources: see ``linkerhand``.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Sensor, taxels
-from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
 from skinware_drivers.layout import Bits, Byte, Condition, Cycle, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.link import Match
 
 PARTS = (*FINGERS, "palm")
 Beginnings = Mapping[tuple[int, int], int]
-"""How many frames of a hand begin with this byte and have this length."""
+"""Number of a hand's frames by first byte and length."""
 MATRIX = 0xB1
 """Command for the thumb's matrix; the next ones are for the others of ``PARTS``."""
 _SATURATED = Sentinel(Status.OUT_OF_RANGE, 255)
-"""The end of every range; of the direction of a force: there is none."""
+"""The end of every range; for the direction of a force: there is none."""
 _HAND, _COMMAND = Bits(0, 11), Bits(0, 8, byte=0)
 _LONGEST_REPLY_S, _LONGEST_RUNS_S, _RUNS_WAIT_S = 0.008, 0.02, 0.05
 _RUN, _SUMS, _ASKS_FOR_RUNS = 5, 0xFF, 4
@@ -39,9 +40,9 @@ class Question(NamedTuple):
 
     Attributes:
         payload: of the question.
-        last: how the last frame of the reply begins.
-        shortest: bytes of that frame, at least: more than other programs' questions have.
-        patience_s: how long the reply is waited for.
+        last: first bytes of the last frame of the reply.
+        shortest: least bytes of that frame: more than other programs' questions have.
+        patience_s: how long to wait for the reply.
     """
 
     payload: bytes
@@ -49,9 +50,13 @@ class Question(NamedTuple):
     shortest: int
     patience_s: float = 0.02
 
+    def end(self, hand: int) -> Match:
+        """Return the match for the last frame of the reply of a hand."""
+        return Match(hand, prefix=self.last, shortest=self.shortest)
+
 
 class Touch(ABC):
-    """One way in which hands tell of touch.
+    """One kind of touch.
 
     Attributes:
         types: of the sensors.
@@ -63,27 +68,54 @@ class Touch(ABC):
 
     @abstractmethod
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        """The modules of a hand that has these parts; ``hand`` is its identifier."""
+        """Return the modules of a hand that has these parts; ``hand`` is its identifier."""
 
     @abstractmethod
     def layout(self, identifier: Identifier) -> Layout:
-        """What the frames of hands with such identifiers mean."""
+        """Return the layout of the frames of hands with such identifiers."""
 
     @abstractmethod
     def questions(self, parts: Sequence[str]) -> list[Question]:
-        """What has to be asked to know it all, in order."""
+        """Return the questions for these parts, in order."""
 
     @abstractmethod
     def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        """Nominal places of a hand's sensors."""
+        """Return nominal places of a hand's sensors."""
 
     @abstractmethod
     def known(self, heard: Beginnings) -> int:
-        """How many of a hand's frames are told in this way."""
+        """Return how many of a hand's frames fit this kind of touch."""
+
+
+class _OfMatrices(Touch):
+    """A matrix for each part."""
+
+    types = (FORCE,)
+    pitch_m = PITCH_M
+
+    @abstractmethod
+    def size(self, part: str) -> tuple[int, int]:
+        """Return rows and columns of a part's matrix."""
+
+    def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
+        found = []
+        for part in parts:
+            rows, columns = self.size(part)
+            sensors = taxels(rows * columns, first_uid=_uid(hand, part))
+            found.append(Module(sensors, MATRIX + PARTS.index(part), f"{rows}x{columns}", part))
+        return found
+
+    def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
+        found = []
+        for part in parts:
+            grid, first = Grid(*self.size(part), self.pitch_m), _uid(hand, part)
+            uids = range(first, first + grid.rows * grid.columns)
+            found.append(grid.at(side.down(part, [grid])[0], [FORCE.name], uids))
+        return Geometry.joined(found)
 
 
 @dataclass(frozen=True)
-class Matrices(Touch):
+class Matrices(_OfMatrices):
     """A matrix for each part, one frame for each of its rows, in order (second generation).
 
     Attributes:
@@ -93,17 +125,12 @@ class Matrices(Touch):
 
     rows: int
     columns: int
-    types = (FORCE,)
 
-    def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        count = self.rows * self.columns
-        return [
-            Module(taxels(count, first_uid=_uid(hand, part)), MATRIX + PARTS.index(part), self._kind, part)
-            for part in parts
-        ]
+    def size(self, part: str) -> tuple[int, int]:  # noqa: ARG002
+        return self.rows, self.columns
 
     def layout(self, identifier: Identifier) -> Layout:
-        """A matrix is shown when all its rows have come, the first one first."""
+        """Return a layout that publishes a matrix when all its rows have come, the first one first."""
         rows = [
             Frame(
                 f"row {row} of {self.rows}",
@@ -123,96 +150,70 @@ class Matrices(Touch):
         size, last = self.rows << 4 | self.columns, self.rows - 1 << 4
         return [Question(bytes((command, size)), bytes((command, last)), 2 + self.columns) for command in commands]
 
-    def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        grid = Grid(self.rows, self.columns)
-        uids = [range(_uid(hand, part), _uid(hand, part) + self.rows * self.columns) for part in parts]
-        centres = [side.down(part, [grid])[0] for part in parts]
-        return Geometry.joined([grid.at(c, [FORCE.name], uid) for c, uid in zip(centres, uids, strict=True)])
-
     def known(self, heard: Beginnings) -> int:
-        """Rows; none if a program asks for runs, which look like rows of six."""
+        """Return the number of rows; 0 if a program asks for runs, which look like rows of six."""
         return 0 if _of_matrices(heard, _ASKS_FOR_RUNS) else _of_matrices(heard, 2 + self.columns)
-
-    @property
-    def _kind(self) -> str:
-        return f"{self.rows}x{self.columns}"
 
 
 @dataclass(frozen=True)
-class RunMatrices(Touch):
+class RunMatrices(_OfMatrices):
     """A matrix for each part, in runs of five values that go on from one row to the next (third generation, G20).
 
     Attributes:
-        finger: rows and columns of a finger's.
-        palm: rows and columns of the palm's.
+        finger: rows and columns of a finger's matrix.
+        palm: rows and columns of the palm's matrix.
     """
 
     finger: tuple[int, int]
     palm: tuple[int, int]
-    types = (FORCE,)
     period_s = 0.1
+    pitch_m = _DENSE_PITCH_M
 
-    def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        found = []
-        for part in parts:
-            rows, columns = self._size(part)
-            sensors = taxels(rows * columns, first_uid=_uid(hand, part))
-            found.append(Module(sensors, MATRIX + PARTS.index(part), f"{rows}x{columns}", part))
-        return found
+    def size(self, part: str) -> tuple[int, int]:
+        return self.palm if part == "palm" else self.finger
 
     def layout(self, identifier: Identifier) -> Layout:
-        """A matrix is shown when all its runs have come, the first one first. Frames of sums are passed over."""
+        """Return a layout that publishes a matrix when all its runs have come, in order; sums are skipped."""
         is_palm = Byte(0, MATRIX + PARTS.index("palm"))
-        fingers = self._runs("finger", [identifier], *self.finger)
-        palm = self._runs("palm", [identifier, is_palm], *self.palm)
+        fingers = _runs("finger", [identifier], *self.finger)
+        palm = _runs("palm", [identifier, is_palm], *self.palm)
         of_finger = Cycle([run.name for run in fingers], _LONGEST_RUNS_S)
         of_palm = Cycle([run.name for run in palm], 2 * _LONGEST_RUNS_S)
         return Layout([_other(identifier), *fingers, *palm], of_finger, [of_palm])
 
     def questions(self, parts: Sequence[str]) -> list[Question]:
-        """One for each part, with the byte that makes the hand end its answer with sums."""
+        """Return one question for each part, with the byte that makes the hand end its answer with sums."""
         questions = []
         for part in parts:
             command = MATRIX + PARTS.index(part)
-            questions.append(Question(bytes((command, *self._size(part), 1)), bytes((command, _SUMS)), 4, _RUNS_WAIT_S))
+            questions.append(Question(bytes((command, *self.size(part), 1)), bytes((command, _SUMS)), 4, _RUNS_WAIT_S))
         return questions
 
-    def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        found = []
-        for part in parts:
-            rows, columns = self._size(part)
-            grid, first = Grid(rows, columns, _DENSE_PITCH_M), _uid(hand, part)
-            found.append(grid.at(side.down(part, [grid])[0], [FORCE.name], range(first, first + rows * columns)))
-        return Geometry.joined(found)
-
     def known(self, heard: Beginnings) -> int:
-        """Runs, if they are about as many for each question as those of a finger; a sum may look like a question."""
+        """Return the number of runs, if it fits the number of questions; a sum may look like a question."""
         runs, questions = _of_matrices(heard, 3 + _RUN), _of_matrices(heard, _ASKS_FOR_RUNS)
         of_finger = self.finger[0] * self.finger[1] // _RUN
         return runs if 0.4 * of_finger * questions <= runs <= 1.1 * of_finger * questions else 0
 
-    def _size(self, part: str) -> tuple[int, int]:
-        return self.palm if part == "palm" else self.finger
 
-    @staticmethod
-    def _runs(name: str, when: Sequence[Condition], rows: int, columns: int) -> list[Frame]:
-        count = rows * columns
-        found = []
-        for first in range(0, count, _RUN):
-            row, column = divmod(first, columns)
-            values = Values(3, "u1", min(_RUN, count - first), to=range(first, min(first + _RUN, count)))
-            at = Byte(1, row), Byte(2, column)
-            what = f"{name} {row}, {column}"
-            found.append(Frame(what, [*when, *at], [values.end], values, _HAND, _COMMAND, [_SATURATED]))
-        return found
+def _runs(name: str, when: Sequence[Condition], rows: int, columns: int) -> list[Frame]:
+    count = rows * columns
+    found = []
+    for first in range(0, count, _RUN):
+        row, column = divmod(first, columns)
+        values = Values(3, "u1", min(_RUN, count - first), to=range(first, min(first + _RUN, count)))
+        at = Byte(1, row), Byte(2, column)
+        what = f"{name} {row}, {column}"
+        found.append(Frame(what, [*when, *at], [values.end], values, _HAND, _COMMAND, [_SATURATED]))
+    return found
 
 
 @dataclass(frozen=True)
 class FingerValues(Touch):
-    """Four values for each finger, of which a frame has one of all fingers (first generation).
+    """Four values for each finger; a frame has one of them for all fingers (first generation).
 
     Attributes:
-        command: that asks for the first of them; the next ones ask for the others.
+        command: question for the first of them; the next commands are for the others.
     """
 
     command: int
@@ -226,7 +227,7 @@ class FingerValues(Touch):
         ]
 
     def layout(self, identifier: Identifier) -> Layout:
-        """Frames that stand alone. A sixth value, which some hands send, is dropped."""
+        """Return a layout of frames that stand alone. A sixth value, which some hands send, is dropped."""
         is_reply = identifier, Byte(len(FINGERS), 0, mask=0)  # long enough
         lengths, values = (1 + len(FINGERS), 2 + len(FINGERS)), Values(1, "u1", len(FINGERS))
         what = f"values {self.command:X}"
@@ -256,30 +257,29 @@ TOUCH: dict[str, Touch] = {
     "hand_23x9": RunMatrices((23, 9), (28, 20)),
     "hand_12x6": RunMatrices((12, 6), (14, 16)),
 }
-"""By the names of the option ``touch``."""
+"""By the values of the option ``touch``."""
 
 
 def every_layout(identifier: Identifier) -> Layout:
-    """All frames that make a hand known, whatever its touch is like: to hold against what is heard, not to decode."""
+    """Return all frames by which a hand is recognized, whatever its touch: to compare with a bus, not to decode."""
     layouts = [touch.layout(identifier) for touch in TOUCH.values() if not isinstance(touch, RunMatrices)]
     frames = [frame for layout in layouts for frame in layout.frames[1:]]
     return Layout([_other(identifier), *frames], None, [cycle for layout in layouts for cycle in layout.cycles])
 
 
-def _of_matrices(heard: Beginnings, length: int) -> int:
-    """How many frames of this length are about the matrices of fingers."""
-    return sum(heard.get((MATRIX + at, length), 0) for at in range(len(FINGERS)))
-
-
 def parts_heard(touch: Touch, commands: Collection[int]) -> list[str]:
-    """The parts that a hand has, of which frames with these first bytes were heard."""
+    """Return the parts of a hand that sent frames with these first bytes; its fingers in any case."""
     if isinstance(touch, FingerValues):
         return list(FINGERS)
     return [part for at, part in enumerate(PARTS) if part in FINGERS or MATRIX + at in commands]
 
 
+def _of_matrices(heard: Beginnings, length: int) -> int:
+    return sum(heard.get((MATRIX + at, length), 0) for at in range(len(FINGERS)))
+
+
 def _other(identifier: Identifier) -> Frame:
-    """Questions, motion, and whatever else is said to a hand and by it: half of a command names no module."""
+    """Return a frame for questions, motion and everything else: half of a command names no module."""
     return Frame("other", [identifier], range(9), Values(0, "u1", 0), patch=_HAND, module=Bits(4, 4, byte=0))
 
 

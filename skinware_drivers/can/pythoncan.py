@@ -1,4 +1,4 @@
-"""Every other CAN interface, through python-can: a thread takes its messages one by one into a queue."""
+"""Every other CAN interface, through python-can: a thread puts its messages one by one into a queue."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
 _MOST_FAILURES = 50
-"""Calls of ``recv`` that may fail with no message between them; then the interface counts as failed, and is opened
-again: python-can's slcan, for example, keeps bytes that it cannot decode, and fails with every frame after them."""
+"""Calls of ``recv`` that may fail in a row before the interface counts as failed and is opened again: python-can's
+slcan, for example, keeps bytes that it cannot decode, and fails with every frame after them."""
 _SWITCHED, _PASSIVE = 0x01, 0x02
 """Flags of a CAN FD frame: bit rate switched, sender error passive."""
 _CLOSE_S = 0.8
-"""How long an interface may take to be closed; a driver ends within a second or so, whatever its interfaces do."""
-_NUMBERS = (int, float)
+"""Time that closing an interface may take; a driver ends within about a second, whatever its interfaces do."""
 _LISTENING: dict[str, dict[str, Any]] = {
     "cantact": {"monitor": True},
     "kvaser": {"driver_mode": False},
@@ -40,10 +39,10 @@ _LISTENING: dict[str, dict[str, Any]] = {
     "slcan": {"listen_only": True},
     "vector": {"listen_only": True},
 }
-"""What makes an interface's controller only listen: it does not even acknowledge frames. By python-can's sources."""
+"""Arguments that put an interface's controller into listen-only mode, without acknowledging (python-can's sources)."""
 _WITHOUT_CONTROLLER = ("udp_multicast", "virtual")
 _ECHOING = ("udp_multicast",)
-"""Interfaces that hear what they send themselves, which cannot be switched off."""
+"""Interfaces that always receive the frames that they send."""
 _ECHO_NS = NS_PER_S
 """An echo that has not come by then was lost."""
 
@@ -51,11 +50,11 @@ _ECHO_NS = NS_PER_S
 class PythonCanBus(Bus):
     """A bus of one of python-can's interfaces (``slcan``, ``udp_multicast``, ``kvaser``, ``pcan`` ...).
 
-    What these interfaces and the libraries below them raise is not documented, and changes: whatever it is, the bus has
-    failed and is opened again.
+    The exceptions of these interfaces and the libraries below them are not documented, and change: after any of them
+    the bus has failed and is opened again.
 
-    Frames are stamped when they arrive here, as most interfaces' own stamps are on no clock that we know. The options
-    are those of the interface's class.
+    Frames are stamped when they arrive here, as the clock of most interfaces' own stamps is unknown. The options are
+    those of the interface's class.
 
     Args:
         interface: python-can's name of the interface.
@@ -79,14 +78,14 @@ class PythonCanBus(Bus):
         self._bus: can.BusABC | None = None
         self._messages: _Messages | None = None
         self._was_open = False
-        self._echoes: deque[tuple[int, int, bytes]] = deque()  # of what was sent: when, identifier, payload
+        self._echoes: deque[tuple[int, int, bytes]] = deque()  # of sent frames: time, identifier, payload
 
     def open(self) -> None:
         """Open the interface and start taking its messages.
 
         Raises:
-            ConfigurationError: the interface does not take one of the options (at the first time only).
-            BusNotAvailable: the interface's library, adapter or channel is not there.
+            ConfigurationError: the interface refuses one of the options (the first time only).
+            BusNotAvailable: the interface's library, adapter or channel is missing.
         """
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
         if self.payload_size > 8:
@@ -110,11 +109,11 @@ class PythonCanBus(Bus):
             return ""
         return (
             f"bus {self.interface}:{self.channel}: nothing is sent, but its controller acknowledges the frames that it"
-            " hears: this interface cannot be told to only listen"
+            " hears: this interface has no listen-only mode"
         )
 
     def check(self) -> None:
-        """Whether messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
+        """Check that messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is not None and messages.failure is not None and not messages.queue:
             why = f"bus {self.interface}:{self.channel} failed: {messages.failure}"
@@ -125,7 +124,7 @@ class PythonCanBus(Bus):
         return self._messages.fd if self._messages is not None else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the messages that wait; see :class:`skinware_drivers.bus.Bus`."""
+        """Append the queued messages; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
@@ -176,7 +175,7 @@ class PythonCanBus(Bus):
             self.tap.keep_frame(sent_ns, identifier, payload, is_sent=True)
 
     def _is_echo(self, time_ns: int, identifier: int, payload: bytes) -> bool:
-        """Whether a message is one of our own, each of which comes back once."""
+        """Return whether a message is one of our own, each of which comes back once."""
         while self._echoes and time_ns - self._echoes[0][0] > _ECHO_NS:
             self._echoes.popleft()
         for index, echo in enumerate(self._echoes):
@@ -188,7 +187,7 @@ class PythonCanBus(Bus):
     def close(self) -> None:
         """Stop taking messages and shut the interface down. Idempotent.
 
-        An interface that hangs in it is left to itself after 0.8 s, which is logged.
+        An interface that hangs is left to itself after 0.8 s, and a warning is logged.
         """
         messages, self._bus, self._messages = self._messages, None, None
         self._echoes.clear()
@@ -197,17 +196,17 @@ class PythonCanBus(Bus):
 
 
 class _Messages:
-    """The messages of one opened interface, taken by a thread, which also shuts the interface down: both may hang.
+    """The messages of one opened interface. A thread takes them and shuts the interface down, as both may hang.
 
     Args:
         bus: the interface.
         name: of the bus, for messages.
-        counters: the bus' own.
+        counters: of the bus.
 
     Attributes:
-        queue: of each that waits: time of its arrival, identifier (with its flags), payload, flags of CAN FD.
-        failure: why no more come; None as long as they may.
-        fd: an eventfd that was written to whenever one of the two changed; the thread's, until it ends.
+        queue: time of arrival, identifier (with its flags), payload and flags of CAN FD of each message.
+        failure: why no more messages come; None as long as they may.
+        fd: an eventfd that is written when one of the two changes; the thread owns and closes it.
     """
 
     def __init__(self, bus: can.BusABC, name: str, counters: BusCounters) -> None:
@@ -239,10 +238,10 @@ class _Messages:
         os.close(self.fd)
 
     def _take_all(self) -> None:
-        """Take messages; one that the library cannot take costs itself, unless all that follow are like it.
+        """Take messages. One that the library refuses is counted, unless all that follow are refused, too.
 
         Raises:
-            Exception: whatever the library raises when its interface has failed.
+            Exception: of the library, when its interface has failed.
         """
         failures = 0
         while not self._closing.is_set():
@@ -272,21 +271,18 @@ class _Messages:
         ):
             identifier |= flag if is_so else 0
         payload = b"" if message.is_remote_frame else bytes(message.data)
-        self.queue.append((now_ns(), identifier, payload, _fd_flags(message)))
+        flags = IS_FD if message.is_fd else 0
+        if message.is_fd:
+            flags |= (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)
+        self.queue.append((now_ns(), identifier, payload, flags))
         os.eventfd_write(self.fd, 1)
 
 
-def _fd_flags(message: can.Message) -> int:
-    if not message.is_fd:
-        return 0
-    return IS_FD | (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)
-
-
 def _typed(text: str) -> int | float | bool | str:
-    """An option as python-can's constructors want it: numbers and truth values are not texts."""
+    """Return an option as python-can's constructors expect it: numbers and truth values are not texts."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
-    for number in _NUMBERS:
+    for number in (int, float):
         with contextlib.suppress(ValueError):
             return number(text)
     return text

@@ -1,4 +1,4 @@
-"""``recvmmsg``: all datagrams that have arrived, straight into the rows of a batch, with one system call."""
+"""Receive all datagrams that have arrived into the rows of a batch, with one system call (``recvmmsg``)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from skinware_drivers.bus import FrameBatch
 
 CONTROL_WORDS = 8
-"""8-byte words of ancillary data kept of each datagram: a header (2 words), then one ``timespec`` or three."""
+"""8-byte words of ancillary data kept for each datagram: a header (2 words), then one ``timespec`` or three."""
 _MMSGHDR = np.dtype(
     [
         ("name", np.uint64),
@@ -34,18 +34,18 @@ _recvmmsg.restype = ctypes.c_int
 
 
 _CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
-"""``struct can_frame`` and ``struct canfd_frame``: the kernel hands out a CAN FD frame as the whole of the latter."""
+"""``struct can_frame`` and ``struct canfd_frame``; the kernel always hands out the whole of the latter."""
 
 
 class Rows:
-    """What ``recvmmsg`` needs to put frames straight into the rows of one batch; see ``rows_of``.
+    """The arguments of ``recvmmsg`` for the rows of one batch; see ``rows_of``.
 
-    The end of a CAN FD frame may lie beyond a row that was made for shorter payloads; it goes where nobody looks.
+    The end of a CAN FD frame that is longer than a row goes into a scratch buffer.
 
     Attributes:
-        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, what was left
-            from before (see ``forget``).
-        headers_address: of the ``mmsghdr`` of the first row.
+        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row. Where the kernel writes none, an earlier
+            frame's data remains (see ``forget``).
+        headers_address: address of the ``mmsghdr`` of the first row.
     """
 
     def __init__(self, batch: FrameBatch) -> None:
@@ -68,27 +68,27 @@ class Rows:
         self.headers_address: int = self._headers.ctypes.data
 
     def receive(self, fd: int, free: slice) -> int:
-        """Fill free rows of the batch; returns how many were filled, -1 on an error (errno)."""
+        """Fill free rows of the batch; return how many were filled, -1 on an error (errno)."""
         self._control_length[free] = 8 * CONTROL_WORDS  # the kernel wrote what it used
         address = self.headers_address + _MMSGHDR.itemsize * free.start
         count: int = _recvmmsg(fd, address, free.stop - free.start, socket.MSG_DONTWAIT, None)
         return count
 
     def forget(self, rows: slice) -> None:
-        """Before receiving, where a frame can come without ancillary data: let none seem to have an older one's."""
+        """Clear ancillary data before frames are received that may have none of their own."""
         self.control[rows] = 0
 
     def any_cut(self, rows: slice) -> bool:
-        """Whether one of these was longer than a frame can be: an FD frame where the layout knows none."""
+        """Return whether a datagram was longer than its row: an FD frame, though the layout has none."""
         return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
 
     def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which of them were."""
+        """Return (n,) bool: the datagrams that were longer than their row."""
         found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
         return found
 
     def are_fd(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which of them came as CAN FD frames, whatever their flags say; only right after receiving."""
+        """Return (n,) bool: the CAN FD frames, whatever their flags say; valid right after receiving only."""
         found: npt.NDArray[np.bool_] = (self._length[rows] & np.uint64(0xFFFF_FFFF)) == _FD_FRAME_BYTES
         return found | self.cut(rows)
 
@@ -97,7 +97,7 @@ _rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()
 
 
 def rows_of(batch: FrameBatch) -> Rows:
-    """Made once for a batch: all buses that fill it share them, as they share its rows."""
+    """Return the arguments for a batch, made once: all buses that fill the batch share them."""
     rows = _rows.get(batch)
     if rows is None:
         rows = _rows[batch] = Rows(batch)

@@ -1,8 +1,8 @@
 """ROBOSKIN / iCub skin: MTB3 and MTB4 boards on CAN, sixteen modules of twelve channels each, and inertial sensors.
 
-What frames mean is in ``roboskin_layout``, what boards are told in ``roboskin_setup``, what a user can say in
-``roboskin_options``. Further sources: robotology/icub-main CanBusSkin.cpp; robotology/icub-firmware
-embot_app_application_theSkin.cpp.
+``roboskin_layout`` has the frames, ``roboskin_setup`` the messages to the boards, ``roboskin_options`` the options, and
+``roboskin_boards`` addresses and firmware. Further sources: robotology/icub-main CanBusSkin.cpp;
+robotology/icub-firmware embot_app_application_theSkin.cpp.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
-from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.can.roboskin_boards import BoardOperations
+from skinware_drivers.can import CanAdapter
+from skinware_drivers.can.roboskin_boards import BOARD_TYPES, MTB3_TYPE, BoardOperations, discover, read_version
 from skinware_drivers.can.roboskin_layout import (
     HEAD_BYTE,
     INERTIAL,
@@ -44,31 +44,33 @@ from skinware_drivers.can.roboskin_options import (
     runs_text,
     usual_kind,
 )
-from skinware_drivers.can.roboskin_setup import START, STOP, BaselineWatch, BoardSetUp, tell_of_chips, tell_what_fits
+from skinware_drivers.can.roboskin_setup import (
+    START,
+    STOP,
+    BaselineWatch,
+    BoardSetUp,
+    warn_of_full_bus,
+    warn_of_uneven_triangles,
+)
 from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
-from skinware_drivers.link import Heard, Link, Match
+from skinware_drivers.link import Heard, Link
 from skinware_drivers.operations import operation
 from skinware_drivers.polling import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-_DISCOVERY_S = 0.3
-_REPLY_S = 0.2
 _AFTER_CONFIGURATION_S = 0.5
 _BETWEEN_SPECIALS_S = 0.01
 _OLD_CALIBRATION_PERIODS = 4
-"""For so long an MTB3 that was set up the old way sends nothing, at the most."""
-_MTB3_TYPE = 5
-_SKIN_BOARD_TYPES = (_MTB3_TYPE, 11, 16, 20)
-"""Board types in answers: mtb (MTB3), mtb4, mtb4w, mtb4c (icub-firmware embot_prot_can.h)."""
+"""Periods after the old set-up in which an MTB3 sends nothing, at most."""
 
 
 class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
-    """MTB3 and MTB4 boards. See this package's ``roboskin_layout`` for the wire, and ``RoboskinOptions``.
+    """MTB3 and MTB4 boards, a patch each; uid = board << 16 | triangle << 8 | channel.
 
-    Sensor uid = board << 16 | triangle << 8 | channel. Non-tactile channels (thermal pads) are of type temperature.
-    Triangles that the configuration leaves switched off are not part of the structure.
+    Channels that do not measure touch (thermal pads) are of type temperature. Triangles that the configuration leaves
+    switched off are not part of the structure.
     """
 
     options: RoboskinOptions
@@ -82,7 +84,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         self._boards: tuple[int, ...] = options.boards
         self._board_type: dict[int, int] = {}
         self._disabled: set[int] = set()  # patch keys
-        self._told = False
+        self._has_warned = False
         self.types = make_types(options)
         if options.all_inertial:
             self.dtype = np.int16
@@ -93,28 +95,28 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The boards that were named, or else those that answer; a listener learns them from their data.
+        """Return the boards that were named, or all that answer; a listener learns them from their data.
 
-        Discovery (identifier 70F) silences an MTB3 that is sending, so it is only used before anything was started.
+        Discovery (identifier 70F) silences an MTB3 that is sending, so it is only used before any board is started.
         """
         if link.listen_only:
             return self.patches_heard(await link.listen(self.options.learn_s), ())
         if self.options.boards:
-            await self._name_missing(link)
+            await self._ask_named(link)
         else:
-            answers = await link.collect(0x70F, b"\xff", Match(0x700, 0x70F, b"\xff"), duration_s=_DISCOVERY_S)
-            # five bytes: the application answers; four: the boot loader, which has no skin
-            self._take_found(link, {a.identifier >> 4 & 0xF: a.payload[1] for a in answers if len(a.payload) >= 5})
-        if not self._told:
-            self._tell_what_is_odd(link)
-            tell_what_fits(link.bus_name, self._set_ups(self._boards))
-            tell_of_chips(link.bus_name, self._set_ups(self._boards))
-        self._told = bool(self._boards)
+            self._take_found(link, {b.address: b.board_type for b in await discover(link) if not b.is_loader})
+        if not self._has_warned:
+            set_ups = self._set_ups(self._boards)
+            for set_up in set_ups:
+                self._warn(link, set_up)
+            warn_of_full_bus(link.bus_name, set_ups)
+            warn_of_uneven_triangles(link.bus_name, set_ups)
+        self._has_warned = bool(self._boards)
         self._fit_boards()
         return self.patches_set_up(self._boards)
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
-        """A listener adds what it hears now; a driver that sends must be started again to find new boards."""
+        """Add the boards that a listener hears now; a driver that sends must be started again to find new boards."""
         if not link.listen_only:
             return known
         return self.patches_heard(await link.listen(self.options.learn_s), known)
@@ -137,10 +139,10 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             await _send(link, set_up.board, set_up.inertial_stop())
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask for the version by unicast: a silent board that answers has restarted, if it should not be silent."""
+        """Ask for the version: a silent board that answers has restarted, unless it was switched off."""
         if patch.key in self._disabled:
             return False
-        await self._version(link, board_of(patch))
+        await read_version(link, board_of(patch))
         return True
 
     async def revive(self, link: Link, patch: Patch) -> None:
@@ -151,7 +153,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     @operation(sets_up=True)
     async def rebaseline(self, link: Link, patches: Sequence[Patch]) -> None:
-        """Make the boards take the present load as no load; nobody may touch the skin for about a second."""
+        """Make the boards take the present load as no load; do not touch the skin for about a second."""
         skin = [patch for patch in patches if not is_inertial(patch)]
         await self._configure(link, [board_of(patch) for patch in skin], inertial=False)
         for patch in skin:
@@ -190,13 +192,11 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     def watch(cls, tables: SkinTables) -> Watch:
         return BaselineWatch(tables)
 
-    # What boards are told
-
     def _set_ups(self, boards: Iterable[int]) -> list[BoardSetUp]:
         return [BoardSetUp(self.options, board, is_mtb4=self._is_mtb4(board)) for board in boards]
 
     def _is_mtb4(self, board: int) -> bool:
-        return self._board_type.get(board, _MTB3_TYPE if self.options.old_style else 0) != _MTB3_TYPE
+        return self._board_type.get(board, MTB3_TYPE if self.options.old_style else 0) != MTB3_TYPE
 
     def _fit_boards(self) -> None:
         boards = self._boards or range(FIRST_BOARD, LAST_BOARD + 1)
@@ -235,8 +235,9 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         else:
             await _send(link, set_up.board, [START if on else STOP])
 
-    async def _name_missing(self, link: Link) -> None:
-        answers = await asyncio.gather(*(self._version(link, board) for board in self._boards), return_exceptions=True)
+    async def _ask_named(self, link: Link) -> None:
+        """Learn the types of the named boards; at least one must answer."""
+        answers = await asyncio.gather(*(read_version(link, board) for board in self._boards), return_exceptions=True)
         missing = []
         for board, answer in zip(self._boards, answers, strict=True):
             if isinstance(answer, HandshakeTimeout):
@@ -249,12 +250,12 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             raise HandshakeTimeout(f"none of the boards {', '.join(map(str, self._boards))} answers")
 
     def _take_found(self, link: Link, board_types: Mapping[int, int]) -> None:
-        """Take the boards that answered and have skin; others are left alone, as START makes a strain board send."""
+        """Take the boards that have skin; others are left alone, as START makes a strain board send."""
         known = self._board_type
         self._board_type = {
             board: board_types[board] for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in board_types
         }
-        self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in _SKIN_BOARD_TYPES)
+        self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
         for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
             log.warning(
                 "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
@@ -263,47 +264,43 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 self._board_type[board],
             )
 
-    async def _version(self, link: Link, board: int) -> bytes:
-        """GET_FW_VERSION by unicast (an MTB3 ignores the broadcast); eight bytes: 1C type major minor build ..."""
-        reply = Match(0x200 | board << 4, 0x7FF, b"\x1c")
-        return (await link.request(0x200 | board, b"\x1c\x02\x00", reply, timeout_s=_REPLY_S)).payload
-
-    def _tell_what_is_odd(self, link: Link) -> None:
-        for set_up in self._set_ups(self._boards):
-            where = f"{link.bus_name}: board {set_up.board}"
-            off = set(range(TRIANGLES)) - set_up.enabled
-            if set_up.wiped:
-                log.warning(
-                    "%s: triangles %s are off: its special configuration switched them off,"
-                    " and nothing switches them on again",
-                    where,
-                    runs_text(set_up.wiped),
-                )
-            if off - set_up.wiped:
-                log.info("%s: triangles %s are off, as configured", where, runs_text(off - set_up.wiped))
-            known = self._board_type.get(set_up.board)
-            kind = "mtb3" if known == _MTB3_TYPE else "mtb4"
-            if set_up.inertial and known is not None and kind != self.options.inertial_scale:
-                log.warning(
-                    "%s: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
-                    where,
-                    kind.upper(),
-                    self.options.inertial_scale.upper(),
-                )
-
-    # What there is
+    def _warn(self, link: Link, set_up: BoardSetUp) -> None:
+        """Log triangles that are off, and inertial sensors of another kind than the options say."""
+        where = f"{link.bus_name}: board {set_up.board}"
+        off = set(range(TRIANGLES)) - set_up.enabled
+        if set_up.wiped:
+            log.warning(
+                "%s: triangles %s are off: its special configuration switched them off,"
+                " and nothing switches them on again",
+                where,
+                runs_text(set_up.wiped),
+            )
+        if off - set_up.wiped:
+            log.info("%s: triangles %s are off, as configured", where, runs_text(off - set_up.wiped))
+        known = self._board_type.get(set_up.board)
+        kind = "mtb3" if known == MTB3_TYPE else "mtb4"
+        if set_up.inertial and known is not None and kind != self.options.inertial_scale:
+            log.warning(
+                "%s: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
+                where,
+                kind.upper(),
+                self.options.inertial_scale.upper(),
+            )
 
     def patches_set_up(self, boards: Iterable[int]) -> list[Patch]:
+        """Return the patches of these boards, as the options set them up."""
         patches = []
         for set_up in self._set_ups(sorted(boards)):
             is_old = self.options.old_style and not self._is_mtb4(set_up.board)
             if set_up.enabled:
-                patches.append(self._patch(set_up, sorted(set_up.enabled), OLD_SKIN if is_old else SKIN))
+                modules = [self._module(set_up, triangle) for triangle in sorted(set_up.enabled)]
+                patches.append(skin_patch(set_up.board, modules, OLD_SKIN if is_old else SKIN))
             if set_up.inertial:
                 patches.append(inertial_patch(set_up.board, set_up.inertial))
         return patches
 
     def patches_heard(self, heard: Counter[Heard], known: Sequence[Patch]) -> list[Patch]:
+        """Return the patches of known boards and of those whose frames were heard."""
         skin: dict[tuple[int, int], set[int]] = {
             (board_of(p), p.key >> 4): {m.key for m in p.modules} for p in known if not is_inertial(p)
         }
@@ -319,16 +316,14 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 inertial.add(board)
         patches = []
         for set_up in self._set_ups(sorted({board for board, _ in skin} | inertial)):
-            # a board sends one class; strain boards may say something that looks like skin in the other
+            # a board sends one class; frames of strain boards can look like skin in the other
             message_class = SKIN if (set_up.board, SKIN) in skin else OLD_SKIN
             if triangles := skin.get((set_up.board, message_class)):
-                patches.append(self._patch(set_up, sorted(triangles), message_class))
+                modules = [self._module(set_up, triangle) for triangle in sorted(triangles)]
+                patches.append(skin_patch(set_up.board, modules, message_class))
             if set_up.board in inertial and set_up.inertial:
                 patches.append(inertial_patch(set_up.board, set_up.inertial))
         return patches
-
-    def _patch(self, set_up: BoardSetUp, triangles: Iterable[int], message_class: int) -> Patch:
-        return skin_patch(set_up.board, [self._module(set_up, t) for t in triangles], message_class)
 
     def _module(self, set_up: BoardSetUp, triangle: int) -> Module:
         options = self.options

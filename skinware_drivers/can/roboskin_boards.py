@@ -1,8 +1,8 @@
-"""ROBOSKIN boards as such, whatever skin is on them: who is there, which firmware, and their addresses.
+"""Find ROBOSKIN boards, whatever skin is on them, read their firmware, and change their addresses.
 
-Sources: robotology/icub-firmware embot_app_application_theCANparserBasic.cpp (what applications answer, and that a new
+Sources: robotology/icub-firmware embot_app_application_theCANparserBasic.cpp (the answers of applications; a new
 address is stored and holds at once, without a reply), embot_prot_can_bootloader.cpp and embot_prot_can.cpp (the
-bytes); robotology/icub-firmware-shared iCubCanProto_types.h (board types).
+bytes), embot_prot_can.h and robotology/icub-firmware-shared iCubCanProto_types.h (board types).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 
 ADDRESSES = range(FIRST_BOARD, LAST_BOARD + 1)
-BOARD_TYPES = {5: "mtb", 11: "mtb4", 16: "mtb4w", 20: "mtb4c"}
+MTB3_TYPE = 5
+BOARD_TYPES = {MTB3_TYPE: "mtb", 11: "mtb4", 16: "mtb4w", 20: "mtb4c"}
 """Types of boards that carry skin."""
 
 _DISCOVERY = b"\xff"
@@ -33,14 +34,14 @@ _ADDRESS_CHECKS, _BETWEEN_CHECKS_S = 10, 0.1
 
 @dataclass(frozen=True)
 class Board:
-    """What a board told.
+    """A board, by its answers.
 
     Attributes:
-        address: its address.
+        address: 1 to 14.
         board_type: number of its type.
         firmware: ``1.25.0``; without the third number from a boot loader.
         protocol: version of the CAN protocol, ``2.0``; empty if it was not asked.
-        is_loader: its boot loader answered, not its application: there is no skin to be had from it.
+        is_loader: its boot loader answered, which has no skin, not its application.
     """
 
     address: int
@@ -55,6 +56,7 @@ class Board:
         return BOARD_TYPES.get(self.board_type, f"type {self.board_type}")
 
     def as_data(self) -> dict[str, Any]:
+        """Return the board for JSON, without its address."""
         return {
             "type": self.type_name,
             "runs": "boot loader" if self.is_loader else "application",
@@ -68,7 +70,9 @@ class Board:
 
 
 async def discover(link: Link) -> list[Board]:
-    """Everybody who hears a discovery, boot loaders too. It silences every MTB3 that is sending.
+    """Return the boards that answer a discovery, boot loaders too. It silences every MTB3 that is sending.
+
+    An answer is FF type major minor from a boot loader; the application adds its build.
 
     Raises:
         BusSendError: the bus is down, or opened to listen only.
@@ -76,14 +80,29 @@ async def discover(link: Link) -> list[Board]:
     answers = await link.collect(0x70F, _DISCOVERY, Match(0x700, 0x70F, _DISCOVERY), duration_s=_DISCOVERY_S)
     found = {}
     for answer in answers:
-        if len(answer.payload) >= 4:
-            board = _from_discovery(answer.identifier, answer.payload)
-            found[board.address] = board
+        address, payload = answer.identifier >> 4 & 0xF, answer.payload
+        if len(payload) >= 4:
+            firmware = ".".join(map(str, payload[2:5]))
+            found[address] = Board(address, payload[1], firmware, is_loader=len(payload) == 4)
     return [found[address] for address in sorted(found)]
 
 
+async def read_version(link: Link, address: int) -> bytes:
+    """Return the answer of an application to GET_FW_VERSION: 1C type major minor build ..., usually eight bytes.
+
+    It is asked by unicast, as an MTB3 ignores the broadcast, and does no harm to a board that sends.
+
+    Raises:
+        HandshakeTimeout: no answer.
+        BusSendError: the bus is down, or opened to listen only.
+    """
+    reply = Match(0x200 | address << 4, 0x7FF, bytes((_GET_FW_VERSION,)))
+    request = bytes((_GET_FW_VERSION, 2, 0))
+    return (await link.request(0x200 | address, request, reply, timeout_s=_REPLY_S)).payload
+
+
 async def ask_versions(link: Link, addresses: Iterable[int] = ADDRESSES) -> list[Board]:
-    """The applications that answer, one by one: harmless to whatever they are doing.
+    """Return the boards whose applications answer; see :func:`read_version`.
 
     Raises:
         BusSendError: the bus is down, or opened to listen only.
@@ -93,12 +112,12 @@ async def ask_versions(link: Link, addresses: Iterable[int] = ADDRESSES) -> list
 
 
 async def move_board(link: Link, old: int, new: int) -> Board:
-    """Give a board another address, which it stores, and make sure that it took it.
+    """Give a board another address, which it stores, and check that it took it.
 
     Raises:
-        ConfigurationError: the address cannot be one, or belongs to another board; nothing was sent.
+        ConfigurationError: the address is impossible, or belongs to another board; nothing was sent.
         HandshakeTimeout: the board does not answer, before or afterwards.
-        BusError: it answers under its old address still.
+        BusError: it still answers at its old address.
     """
     if new not in ADDRESSES:
         raise ConfigurationError(f"address {new}: boards have 1 to 14 (0 is the host, 15 everybody)")
@@ -133,11 +152,11 @@ async def move_board(link: Link, old: int, new: int) -> Board:
 
 
 class BoardOperations:
-    """What ``skin-config`` can do with boards; a part of the driver."""
+    """The operations of ``skin-config`` on boards; a part of the driver."""
 
     @operation(looks=True)
     async def versions(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:
-        """Type, firmware and protocol of the boards, by address; null for one that does not answer."""
+        """Return type, firmware and protocol of the boards, by address; null for a board that does not answer."""
         asked = sorted({board_of(patch) for patch in patches}) or list(ADDRESSES)
         found: dict[str, Any] = {str(address): None for address in asked} if patches else {}
         for board in await ask_versions(link, asked):
@@ -157,24 +176,17 @@ class BoardOperations:
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:
-        """Boards by discovery where nothing is sending, else by asking each address for its version."""
+        """Find boards by discovery on an idle bus, else by asking each address for its version."""
         boards = await (discover(link) if idle else ask_versions(link))
         return f"ROBOSKIN: {', '.join(map(str, boards))}" if boards else None
 
 
 async def _ask_version(link: Link, address: int) -> Board | None:
-    """GET_FW_VERSION by unicast (an MTB3 ignores the broadcast); its answer: 1C type major minor build ..."""
-    reply = Match(0x200 | address << 4, 0x7FF, bytes((_GET_FW_VERSION,)))
     try:
-        answer = await link.request(0x200 | address, bytes((_GET_FW_VERSION, 2, 0)), reply, timeout_s=_REPLY_S)
+        answer = await read_version(link, address)
     except HandshakeTimeout:
         return None
-    if len(answer.payload) < 7:
+    if len(answer) < 7:
         return None
-    _, board_type, major, minor, build, protocol_major, protocol_minor = answer.payload[:7]
+    _, board_type, major, minor, build, protocol_major, protocol_minor = answer[:7]
     return Board(address, board_type, f"{major}.{minor}.{build}", f"{protocol_major}.{protocol_minor}")
-
-
-def _from_discovery(identifier: int, payload: bytes) -> Board:
-    """FF type major minor from a boot loader; the application adds its build."""
-    return Board(identifier >> 4 & 0xF, payload[1], ".".join(map(str, payload[2:5])), is_loader=len(payload) == 4)

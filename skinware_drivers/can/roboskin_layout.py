@@ -1,4 +1,4 @@
-"""What ROBOSKIN frames mean, and the sensor types of ROBOSKIN boards.
+"""The frames and sensor types of ROBOSKIN boards.
 
 Skin: robotology/icub-firmware embot_prot_can_skin_periodic.{h,cpp}; robotology/icub-main SkinDiagnostics.h. Two
 frames a period and triangle. HEAD: ``40``, channels 0 to 6. TAIL: ``C0``, channels 7 to 11, two bytes of diagnostics
@@ -10,7 +10,7 @@ little-endian. ``503 | board << 4``: sequence, sensor {0 accelerometer, 1 magnet
 Scales: an MTB3 has an LIS331DLH of 2 g and an L3G4200D of 250 deg/s (robotology/icub-main pull request 543); an MTB4 a
 BNO055, whose numbers it sends as they are (1/100 m/s2, 1/16 deg/s, 1/16 uT: its data sheet).
 
-The patch key is the message class and the board's address together; the inertial sensors of a board are a patch of
+The key of a patch is the message class and the board's address together. The inertial sensors of a board are a patch of
 their own, as they have a rate of their own, and may send between the two halves of a triangle.
 """
 
@@ -59,13 +59,13 @@ _INERTIAL_UID = 0x1000
 
 
 def make_layout(options: RoboskinOptions, shortest_period_s: float) -> Layout:
-    """The layout of a bus. A tail belongs to the very frame before it from the same board, or to none.
+    """Return the layout of a bus. A tail belongs to the frame right before it from the same board, or to none.
 
     Args:
         options: of the bus.
         shortest_period_s: of all boards; head and tail are at most half of it apart.
     """
-    # set up the old way, an MTB3 sends class 3 and an MTB4 class 4: the keys of the patches tell which
+    # set up the old way, an MTB3 sends class 3 and an MTB4 class 4: the keys of the patches distinguish them
     of_class = () if options.old_style else (Identifier(SKIN << 8, mask=0x700),)
     head = Frame(
         "head",
@@ -97,7 +97,7 @@ def _inertial_frames(options: RoboskinOptions) -> list[Frame]:
     frames = []
     if any(sensor not in _IMU_CODES for sensor in sent):
         for name, low in (("gyroscope", 0), ("accelerometer", 1)):
-            # an MTB3's accelerometer has 12 bits, left-justified: it says -1 only where there is none
+            # an MTB3's accelerometer has 12 bits, left-justified: -1 means that there is none
             absent = (Sentinel(Status.NOT_CONNECTED, -1),) if (options.inertial_scale, low) == ("mtb3", 1) else ()
             frames.append(
                 Frame(
@@ -138,37 +138,31 @@ def make_types(options: RoboskinOptions) -> tuple[SensorType, ...]:
     return (*SKIN_TYPES, *found.values())
 
 
-def patch_key(message_class: int, board: int) -> int:
-    """How frames name the sensors of a board."""
-    return message_class << 4 | board
-
-
 def board_of(patch: Patch) -> int:
     return patch.key & 0xF
 
 
 def is_inertial(patch: Patch) -> bool:
-    """Whether a patch is the inertial sensors of a board."""
     return patch.key >> 4 == INERTIAL
 
 
 def inertial_patch(board: int, inertial: Inertial) -> Patch:
-    """The inertial sensors of a board; uid = board << 16 | 1000 hex, for all axes of all of them."""
+    """Return the inertial sensors of a board; uid = board << 16 | 0x1000, for all axes of all of them."""
     modules = []
     for sensor in inertial:
         kind, types = _KINDS[sensor]
         low = 0 if kind == "gyroscope" else 1
         key = _IMU_CODES.get(sensor, INERTIAL << 8 | board << 4 | low)
         modules.append(Module([Sensor(t.name, board << 16 | _INERTIAL_UID) for t in types], key=key, kind=kind))
-    return Patch(f"board {board} inertial", modules, key=patch_key(INERTIAL, board))
+    return Patch(f"board {board} inertial", modules, key=INERTIAL << 4 | board)
 
 
 def skin_patch(board: int, modules: Sequence[Module], message_class: int) -> Patch:
-    return Patch(f"board {board}", modules, key=patch_key(message_class, board))
+    return Patch(f"board {board}", modules, key=message_class << 4 | board)
 
 
 def triangle_module(board: int, triangle: int, kind: str, thermal: Sequence[int]) -> Module:
-    """A triangle; uid = board << 16 | triangle << 8 | channel."""
+    """Return a triangle; uid = board << 16 | triangle << 8 | channel."""
     uid = board << 16 | triangle << 8
     names = ["temperature" if channel in thermal else "pressure" for channel in range(CHANNELS)]
     channels = [Sensor(name, uid | channel) for channel, name in enumerate(names)]

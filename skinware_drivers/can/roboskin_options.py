@@ -1,4 +1,4 @@
-"""What a user says of ROBOSKIN boards: options for a bus, and tables of the boards and triangles that differ."""
+"""Options of ROBOSKIN boards: for a bus, and tables of the boards and triangles that differ."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ FIRST_BOARD, LAST_BOARD = 1, 14
 TRIANGLES = 16
 CHANNELS = 12
 NON_TACTILE: dict[str, tuple[int, ...]] = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
-"""Channels of each kind of module that feel no touch."""
+"""Channels of each kind of module that do not measure touch."""
 _TRIANGLE_SKIN_TYPES = (0, 2, 8)
 ERGO_HAND = 3
 """Type of skin of the ergoCub's hand."""
 _FINGERTIPS_OF_ERGO_HAND = 5
 LONGEST_OLD_PERIOD_MS = 209
-"""What the timer of the old set-up can count to: 65535 ticks of 3.2 us."""
+"""The longest period of the old set-up: its timer counts to 65535 ticks of 3.2 us."""
 
 InertialSensor = Literal[
     "accelerometer", "external_accelerometer", "gyroscope", "imu_accelerometer", "imu_magnetometer", "imu_gyroscope"
 ]
-"""An inertial sensor of a board; those of an ``imu`` come in other messages (MTB4 only)."""
+"""An inertial sensor of a board; the sensors of an ``imu`` (MTB4 only) send other messages."""
 
 Inertial = tuple[InertialSensor, ...]
 
 
 def usual_kind(skin_type: int, triangle: int) -> str:
-    """The kind of a module, as long as no option says otherwise.
+    """Return the kind of a module that no option names.
 
     The ergoCub's hand has fingertips as its modules 0 to 4 and triangles with thermal pads as 5 to 15:
     robotology/icub-firmware b42992119 (2026-06-17), embot_app_application_theSkin.cpp, computedrift.
@@ -41,13 +41,13 @@ def usual_kind(skin_type: int, triangle: int) -> str:
 
 
 class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a range of triangles of a board is, where it differs from the rest. Of several, the last one counts.
+    """A range of triangles of a board that differ from the rest. If several name a triangle, the last one counts.
 
     Attributes:
         board: address.
-        triangles: which of its triangles.
+        triangles: numbers of the triangles.
         kind: ``triangle``, ``fingertip`` or ``palm``; empty: by the board's type of skin.
-        thermal: channels that are not tactile, if others than the kind's own.
+        thermal: channels that are not tactile; None: those of the kind.
         enabled: switched on or off in the board; None: as the rest of the board.
         shift: resolution of the board's arithmetic (SET_TRIANG_CFG); None: as the rest.
         cdc_offset: offset register of the capacitance converter (SET_TRIANG_CFG); None: as the rest.
@@ -63,20 +63,20 @@ class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def sets_triangles(self) -> bool:
-        """Whether the board has to be told something, rather than only our tables."""
+        """Whether something is sent to the board; ``kind`` and ``thermal`` are for the driver alone."""
         return not (self.enabled is None and self.shift is None and self.cdc_offset is None)
 
 
 class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Boards that are set up in another way than the rest of the bus. What is not given is as on the rest.
+    """Boards that are set up in another way than the rest of the bus. Attributes that are None are as for the rest.
 
-    A period, type of skin or no-load value of their own is sent in a second SET_BRD_CFG, with which the firmware
-    switches all triangles of the board off: those that are wanted must be switched on again in ``modules``.
+    A period, type of skin or no-load value of their own is sent in a second SET_BRD_CFG, upon which the firmware
+    switches all triangles of the board off: the wanted ones must be switched on again in ``modules``.
 
     Attributes:
         boards: their addresses.
         period_ms: time between two updates.
-        skin_type: type of skin that they are told.
+        skin_type: type of skin that is sent to them.
         no_load: value of an idle taxel.
         inertial: inertial sensors that they send.
     """
@@ -121,7 +121,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     old_style: Annotated[
         bool, msgspec.Meta(description="configure boards with the old commands 4C and 4E; skin data in message class 3")
     ] = False
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns which modules send, s", gt=0)] = 1.0
+    learn_s: Annotated[float, msgspec.Meta(description="time in which a listener learns the modules, s", gt=0)] = 1.0
     special_boards: Annotated[
         tuple[SpecialBoards, ...], msgspec.Meta(description="boards that differ (configuration file only)")
     ] = ()
@@ -146,7 +146,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def all_inertial(self) -> list[Inertial]:
-        """The sets of inertial sensors that some board sends."""
+        """The sets of inertial sensors that boards send."""
         own = [special.inertial for special in self.special_boards if special.inertial is not None]
         return [inertial for inertial in (self.inertial, *own) if inertial]
 
@@ -193,7 +193,7 @@ def _check_old_style(options: RoboskinOptions) -> None:
 
 
 def runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
-    """First and last of every run of consecutive numbers."""
+    """Return the first and last of every run of consecutive numbers."""
     found: list[tuple[int, int]] = []
     for number in sorted(set(numbers)):
         if found and found[-1][1] == number - 1:
@@ -204,5 +204,5 @@ def runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
 
 
 def runs_text(numbers: Iterable[int]) -> str:
-    """Numbers as people write them: ``0-4, 7``."""
+    """Return numbers as people write them: ``0-4, 7``."""
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs(numbers))

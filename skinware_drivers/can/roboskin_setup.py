@@ -1,4 +1,4 @@
-"""Set up ROBOSKIN boards, and watch for boards that may have moved their baseline."""
+"""The set-up of ROBOSKIN boards, and a watch for boards that may have moved their baseline."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 OLD_MTB4_PERIOD_MS = 40
 START, STOP = b"\x07\x00", b"\x07\x01"
-"""SET_TXMODE; the polarity is as odd as it looks."""
+"""SET_TXMODE: 0 starts, 1 stops."""
 
 _TICKS_PER_MS = 312.5
 _FRAMES_OF_A_TRIANGLE, _FRAME_MS = 2, 0.13
-"""In a period; each of 8 bytes under 11 bits, at 1 Mbit/s with an ordinary number of stuff bits."""
+"""Per period; a frame of 8 bytes and an 11-bit identifier, at 1 Mbit/s with an ordinary number of stuff bits."""
 _OWN_TIMER = 3
 _COMPENSATED = 0x08
 _NOT_COMPENSATED_TYPE = 2
@@ -40,7 +40,7 @@ _INERTIAL_BITS = {"accelerometer": 0x02, "gyroscope": 0x04, "external_accelerome
 _IMU_BITS = {"imu_accelerometer": 0x01, "imu_magnetometer": 0x02, "imu_gyroscope": 0x04}
 _FUSION = 1
 _AREA_SHIFTS, _LAST_OF_4E = 0x22, 0x0A
-"""What CanBusSkin.cpp always sends; of the areas that boards can average over, nothing is used here."""
+"""As CanBusSkin.cpp always sends them; the areas that boards can average over are not used here."""
 
 
 class BoardSetUp:
@@ -53,14 +53,14 @@ class BoardSetUp:
 
     Attributes:
         board: address.
-        first: messages that every board gets, in order; of each, all boards before the next.
+        first: messages for every board, in order; each goes to all boards before the next.
         special_board: messages after the first wait.
         special_triangles: messages after the second wait.
         enabled: triangles that are switched on in the end.
-        wiped: triangles that were switched on at first and are off in the end, though nobody switched them off: a
-            special board configuration did.
+        wiped: triangles that a special board configuration switched off, though no option does.
         period_ms: of its skin data.
-        skin_type: what it was told.
+        skin_type: as sent to it.
+        is_uneven: its triangles have different shifts or converter offsets.
         inertial: its inertial sensors.
     """
 
@@ -86,13 +86,14 @@ class BoardSetUp:
         self.enabled: frozenset[int] = frozenset(self._on)
         named_off = {t for module in modules if module.enabled is False for t in module.triangles}
         self.wiped: frozenset[int] = frozenset(wanted - self._on - named_off)
+        self.is_uneven: bool = len({*zip(self._shift, self._cdc_offset, strict=True)}) > 1
 
     def inertial_set_up(self) -> list[bytes]:
         mask = self._imu_mask
         return [bytes((0x33, mask, 0, _FUSION, 0, 0, 0, 0))] if mask else []
 
     def inertial_start(self) -> list[bytes]:
-        """What makes the board send inertial data: ACC_GYRO_SETUP or IMU_TRANSMIT."""
+        """Return the messages that start inertial data: ACC_GYRO_SETUP or IMU_TRANSMIT."""
         if self._imu_mask:
             return [bytes((0x35, self._inertial_period_ms))]
         mask = sum(_INERTIAL_BITS[sensor] for sensor in self.inertial)
@@ -112,15 +113,8 @@ class BoardSetUp:
         self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
         self._no_load = self._no_load if special.no_load is None else special.no_load
 
-    @property
-    def is_uneven(self) -> bool:
-        """Whether its triangles have different shifts or converter offsets."""
-        return len({*zip(self._shift, self._cdc_offset, strict=True)}) > 1
-
-    # The new way
-
     def _set_up_new(self, options: RoboskinOptions, modules: Iterable[Kind]) -> set[int]:
-        """Returns the triangles that somebody switched on at some time."""
+        """Return the triangles that were switched on at some time."""
         self.first.append(self._board_configuration())
         self.first.append(self._triangles(0, TRIANGLES - 1, options.enabled))
         wanted = set(self._on)
@@ -139,7 +133,7 @@ class BoardSetUp:
         return wanted
 
     def _board_configuration(self) -> bytes:
-        """SET_BRD_CFG: 4D, type of skin, period, no load."""
+        """Return SET_BRD_CFG: 4D, type of skin, period, no load."""
         self._on.clear()
         return bytes((0x4D, self.skin_type & 0x0F, self.period_ms, self._no_load))
 
@@ -151,23 +145,18 @@ class BoardSetUp:
                 self._cdc_offset[triangle] = module.cdc_offset
         on = {t for t in module.triangles if (t in self._on if module.enabled is None else module.enabled)}
         for enabled, triangles in ((True, on), (False, set(module.triangles) - on)):
-            for first, last in self._alike(triangles):
+            alike: dict[tuple[int, int], list[int]] = {}
+            for triangle in triangles:
+                alike.setdefault((self._shift[triangle], self._cdc_offset[triangle]), []).append(triangle)
+            for first, last in sorted(run for same in alike.values() for run in runs(same)):
                 self.special_triangles.append(self._triangles(first, last, enabled))
 
-    def _alike(self, triangles: Iterable[int]) -> list[tuple[int, int]]:
-        settings: dict[tuple[int, int], list[int]] = {}
-        for triangle in sorted(set(triangles)):
-            settings.setdefault((self._shift[triangle], self._cdc_offset[triangle]), []).append(triangle)
-        return sorted(run for alike in settings.values() for run in runs(alike))
-
     def _triangles(self, first: int, last: int, enabled: bool) -> bytes:
-        """SET_TRIANG_CFG: 50, first, last, shift, enable, converter offset (little-endian)."""
+        """Return SET_TRIANG_CFG: 50, first, last, shift, enable, converter offset (little-endian)."""
         touched = range(first, last + 1)
         (self._on.update if enabled else self._on.difference_update)(touched)
         offset = self._cdc_offset[first]
         return bytes((0x50, first, last, self._shift[first], enabled, offset & 0xFF, offset >> 8))
-
-    # The old way
 
     def _set_up_old(self, options: RoboskinOptions, modules: Iterable[Kind], is_mtb4: bool) -> None:
         for special in options.special_boards:
@@ -193,12 +182,12 @@ class BoardSetUp:
             self.period_ms = OLD_MTB4_PERIOD_MS
 
 
-def tell_of_chips(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
-    """Warn where a second set-up can land on other triangles.
+def warn_of_uneven_triangles(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
+    """Warn if a second set-up can reach other triangles than the first.
 
     With the type of the ergoCub's hand, the firmware stores shifts and offsets by triangle at first, and by chip after
-    its first data: what a set-up without a power cycle says of triangles 1 to 15 goes to others (trianglesOrder in
-    embot_app_application_theSkin.cpp, robotology/icub-firmware b42992119, 2026-06-17).
+    its first data: in a second set-up without a power cycle, the settings of triangles 1 to 15 go to others
+    (trianglesOrder in embot_app_application_theSkin.cpp, robotology/icub-firmware b42992119, 2026-06-17).
     """
     uneven = [str(board.board) for board in set_ups if board.skin_type == ERGO_HAND and board.is_uneven]
     if uneven:
@@ -210,7 +199,7 @@ def tell_of_chips(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
         )
 
 
-def tell_what_fits(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
+def warn_of_full_bus(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
     """Warn if the boards send more than their wire can carry: the lowest address wins, the highest starves."""
     shares = [_FRAMES_OF_A_TRIANGLE * len(board.enabled) * _FRAME_MS / board.period_ms for board in set_ups]
     needed = sum(shares)
@@ -237,11 +226,11 @@ _ZERO, _ALL = 1, (1 << _RECALIBRATION_CYCLES) - 1
 class BaselineWatch(Watch):
     """Marks boards that may have moved their baseline.
 
-    When they have, the flag of the channel goes away. What they send from then on is measured from an unknown baseline,
-    until they are set up again.
+    A board moves its baseline after five cycles in which a channel did not acknowledge, and the flag of the channel
+    goes away. Until it is set up again, its values are measured from an unknown baseline.
 
-    What a board has counted is not always known: whether one that was set up anew had restarted, it does not say. So
-    all counts that are possible are followed, as bits, and one that may have reached the fifth is marked.
+    The count of a board is not always known: a board that was set up again does not say whether it had restarted. So
+    all possible counts are followed, as bits, and a board that may have reached the fifth is marked.
     """
 
     def __init__(self, tables: SkinTables) -> None:
@@ -249,8 +238,8 @@ class BaselineWatch(Watch):
         self._counts: npt.NDArray[np.int64] = np.full(tables.structure.n_patches, _ZERO)  # bit k: it may be at k
 
     def look(self, updates: Updates) -> None:
-        """Count what was not acknowledged, per board; see :class:`skinware_drivers.adapter.Watch`."""
-        status = updates.status[:, 0]  # these flags are of all sensors of a triangle
+        """Count the cycles without acknowledgement of each board; see :class:`skinware_drivers.polling.Watch`."""
+        status = updates.status[:, 0]  # these flags are those of all sensors of a triangle
         silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
         if not silent.any():
             return
@@ -262,6 +251,6 @@ class BaselineWatch(Watch):
         self.module_status[moved[module_patch]] |= np.uint8(Status.SUSPECT)
 
     def forget(self, patch: int) -> None:
-        """The board was set up anew, so its baseline is known again; it goes on counting, unless it had restarted."""
+        """Trust a board that was set up again: its baseline is known. It goes on counting, unless it had restarted."""
         super().forget(patch)
         self._counts[patch] |= _ZERO

@@ -1,6 +1,6 @@
-"""SocketCAN in batches: one ``recvmmsg`` moves all that has arrived straight into the rows of a batch.
+"""SocketCAN in batches: one ``recvmmsg`` moves all frames that have arrived into the rows of a batch.
 
-Every frame comes with the kernel's own time stamp; what the kernel had to drop is known exactly.
+Every frame carries the kernel's own time stamp, and the kernel counts the frames that it drops.
 """
 
 from __future__ import annotations
@@ -18,21 +18,13 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import (
-    ERROR_FLAG,
-    REMOTE_FLAG,
-    Filter,
-    FrameBatch,
-    identifier_text,
-)
-from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
-from skinware_drivers.can.interface import NO_CAN, read_controller, wire_bits
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, identifier_text
+from skinware_drivers.can.controller import CONTROLLER_STATES, NO_CAN, ControllerHealth, read_controller, wire_bits
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
 from skinware_drivers.native.kernel_bus import KernelBus
@@ -60,11 +52,11 @@ _FLAGS_AT = 5  # in struct canfd_frame
 _SMALL_BUFFER = 1 << 17  # it may be full before so many frames wait that C asks for losses
 
 WANTED_BUFFER_BYTES = 8 << 20
-"""Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
+"""Requested receive buffer: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
 
 
 class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What can be said behind a CAN interface's name: ``can0?buffer=100000``."""
+    """Options behind the name of a CAN interface: ``can0?buffer=100000``."""
 
     buffer: Annotated[int, msgspec.Meta(description="receive buffer, bytes", ge=1)] = WANTED_BUFFER_BYTES
     timestamps: Annotated[
@@ -127,7 +119,7 @@ class SocketCanBus(KernelBus):
                 f"bus {self.channel}: cannot open a CAN socket ({error.strerror})", reason=BusReason.REFUSED
             ) from None
         try:
-            # also where the layout has none: that there are FD frames on the bus explains why no others are heard
+            # also if the layout has none: FD frames on the bus explain why no others are heard
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
             if self._filters:
@@ -160,7 +152,7 @@ class SocketCanBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """A receive buffer that is smaller than was asked for, a controller that stays off; and what to do about it."""
+        """Advice on a receive buffer smaller than requested, missing stamps, and a controller that stays off."""
         notes = []
         if self._socket and self.granted_buffer < self._wanted.buffer:
             notes.append(
@@ -178,15 +170,15 @@ class SocketCanBus(KernelBus):
         return "\n".join(notes)
 
     def narrow(self, filters: Sequence[Filter]) -> None:
-        """Set the kernel's filters; see :class:`skinware_drivers.bus.Bus`. More than it takes are as none."""
+        """Set the kernel's filters; see :class:`skinware_drivers.bus.Bus`. More than it takes count as none."""
         filters = filters if len(filters) <= MOST_FILTERS else ()
         if filters != self._filters and self._socket is not None:
-            with contextlib.suppress(OSError):  # the interface is gone, which receiving will tell
+            with contextlib.suppress(OSError):  # the interface is gone: ``receive`` reports it
                 _set_filters(self._socket, filters)
         self._filters = filters
 
     def check(self) -> None:
-        """Ask the kernel for the interface's and its controller's state; see :class:`skinware_drivers.bus.Bus`."""
+        """Ask the kernel for the state of interface and controller; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None or not self._is_bound:
             return
         name = str(self._socket.getsockname()[0])
@@ -208,7 +200,7 @@ class SocketCanBus(KernelBus):
         return self._socket.fileno() if self._socket else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append what has arrived; see :class:`skinware_drivers.bus.Bus`."""
+        """Append the frames that have arrived; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
         if not batch.free:
@@ -235,11 +227,11 @@ class SocketCanBus(KernelBus):
 
     @property
     def reads_natively(self) -> bool:
-        """Whether frames have the kernel's stamps; a controller's clock is followed in Python."""
+        """Whether frames have the kernel's stamps; the clock of a controller is followed in Python."""
         return not self._stamper.hardware
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Tell C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Describe to C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)
@@ -263,7 +255,10 @@ class SocketCanBus(KernelBus):
     def send(self, identifier: int, payload: bytes) -> None:
         """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         sock = self.may_send_by(self._socket)
-        frame = _classic_frame(identifier, payload) if len(payload) <= 8 else self._fd_frame(identifier, payload)
+        if len(payload) <= 8:
+            frame = struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")
+        else:
+            frame = self._fd_frame(identifier, payload)
         sent_ns = now_ns()  # not later than an answer
         try:
             sock.send(frame)
@@ -294,18 +289,15 @@ class SocketCanBus(KernelBus):
         if controller is None:
             return
         self._restarts_itself = controller.restart_ms > 0
-        self.bit_rate = 0 if self.narrows else controller.bit_rate  # of filtered frames nothing is known
+        self.bit_rate = 0 if self.narrows else controller.bit_rate  # filtered frames cannot be counted
         if controller.bit_rate and controller.data_bit_rate:
             self._speed_up = controller.data_bit_rate / controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
-            self._count_health()
-
-    def _count_health(self) -> None:
-        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
+            self.counters.bus_offs = self._health.bus_offs
 
     def nothing_received(self, number: int) -> int:
-        """What an error of the kernel in the place of frames means.
+        """Interpret an error of the kernel in the place of frames; return 0 if more frames may come.
 
         Raises:
             BusNotAvailable: the interface went down or away.
@@ -318,7 +310,7 @@ class SocketCanBus(KernelBus):
         raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
     def sort_out(self, batch: FrameBatch, new: slice) -> int:
-        """Take what is no data frame of this layout out of new rows of a batch; returns how many are left."""
+        """Remove rows that are no data frames of this layout from new rows of a batch; return how many are left."""
         rows, wire, first = rows_of(batch), batch.wire[new], new.start
         identifier = wire["identifier"]
         is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new)
@@ -331,28 +323,19 @@ class SocketCanBus(KernelBus):
         self.counters.errors += int(np.count_nonzero(is_error))
         self.counters.refused += int(np.count_nonzero(other))
         self.samples.take(Unused.REFUSED, wire[other])
-        good = np.flatnonzero(~(is_error | other))
-        self._take_errors(np.flatnonzero(is_error), good, identifier, wire["payload"])
-        self._count_health()
+        good, errors = np.flatnonzero(~(is_error | other)), np.flatnonzero(is_error)
+        if len(errors):
+            self._health.take(identifier[errors], wire["payload"][errors], now_ns())
+        if len(good) and (not len(errors) or good[-1] > errors[-1]):
+            self._health.heard_data()
+        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]
         return len(good)
 
-    def _take_errors(
-        self,
-        errors: npt.NDArray[np.int64],
-        good: npt.NDArray[np.int64],
-        identifier: npt.NDArray[np.uint32],
-        payload: npt.NDArray[np.uint8],
-    ) -> None:
-        if len(errors):
-            self._health.take(identifier[errors], payload[errors], now_ns())
-        if len(good) and (not len(errors) or good[-1] > errors[-1]):
-            self._health.heard_data()
-
     def _read_memory(self) -> None:
-        """What the kernel says of the receive buffer: how full it still is, and what did not fit."""
+        """Read how full the receive buffer is, and how many frames did not fit."""
         if self._socket is not None:
             data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
             words = array.array("I", data)
@@ -361,13 +344,13 @@ class SocketCanBus(KernelBus):
 
 
 def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:
-    everything = (Filter(0, 0),)  # none at all would let nothing through
+    everything = (Filter(0, 0),)  # an empty list would let nothing through
     packed = b"".join(struct.pack("=II", *one) for one in filters or everything)
     sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:
-    """Ask for a receive buffer, with force if we may; returns what the kernel granted (it doubles what is set)."""
+    """Request a receive buffer, by force if permitted; return the granted bytes (the kernel doubles the value)."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted // 2)
     except PermissionError:
@@ -389,7 +372,3 @@ def _why_not_bound(interface: str, error: OSError) -> BusNotAvailable:
         why = f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
         return BusNotAvailable(why, reason=BusReason.REFUSED)
     return BusNotAvailable(f"bus {interface}: cannot be opened ({error.strerror})", reason=BusReason.FAILED)
-
-
-def _classic_frame(identifier: int, payload: bytes) -> bytes:
-    return struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")

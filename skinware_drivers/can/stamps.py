@@ -1,4 +1,4 @@
-"""Date CAN frames on CLOCK_MONOTONIC, by the kernel's stamps or the controller's clock."""
+"""Date CAN frames on CLOCK_MONOTONIC, by the kernel's stamps or the controller's clock (decision 7)."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ BLOCK_NS = 250_000_000
 """The smallest difference within this time is one point of the lower edge."""
 BLOCKS = 40
 LEAST_BLOCKS = 4
-"""Before there are so many, the two clocks are taken to run equally fast."""
+"""Before this many points, the two clocks are assumed to run equally fast."""
 LARGEST_DRIFT = 1e-3
 LARGEST_FALL_NS = 10_000_000
-"""No delay is negative: nothing can be below the line by so much, unless the controller's clock was set."""
+"""A stamp this far below the line means that the controller's clock was set: no delay is negative."""
 LONGEST_DELAY_NS = 100_000_000
-"""What is further off the line than this means that the controller's clock was set or began anew."""
+"""A stamp this far off the line means that the controller's clock was set or restarted."""
 
 
 class HardwareClock:
-    """The clock of one controller."""
+    """The clock of one controller.
+
+    Kernel stamp minus controller stamp is offset plus delay. A line is fitted to its lower edge, as no delay is
+    negative; stamps are put on that line, but at most ``LONGEST_DELAY_NS`` before the kernel's and never after it.
+    """
 
     def __init__(self) -> None:
         self._forget()
@@ -43,24 +47,24 @@ class HardwareClock:
         self._last_ns = 0
 
     def convert(self, hardware: Stamps, software: Stamps) -> Stamps:
-        """(n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
+        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
 
         Args:
-            hardware: (n,) int64, stamps of the controller, ns, in order; 0 where it gave none.
-            software: (n,) int64, stamps of the kernel, CLOCK_MONOTONIC ns; kept where nothing better is known.
+            hardware: (n,) int64, stamps of the controller, ns, in order; 0: none.
+            software: (n,) int64, stamps of the kernel, CLOCK_MONOTONIC ns; kept where the controller gave none.
         """
         known = np.flatnonzero(hardware)
         if not len(known):
             return software
         stamps = software.copy()
-        # where the controller's clock goes back or jumps, another life of it begins
+        # a line of its own for each part between two jumps of the controller's clock
         steps, arrived = np.diff(hardware[known]), np.diff(software[known])
         cuts = np.flatnonzero((steps < 0) | (np.abs(arrived - steps) > LONGEST_DELAY_NS)) + 1
         for rows in np.split(known, cuts):
-            stamps[rows] = self._convert_one_life(hardware[rows], software[rows])
+            stamps[rows] = self._convert_part(hardware[rows], software[rows])
         return stamps
 
-    def _convert_one_life(self, hardware: Stamps, software: Stamps) -> Stamps:
+    def _convert_part(self, hardware: Stamps, software: Stamps) -> Stamps:
         difference = software - hardware
         if (self._points or self._lowest is not None) and not self._goes_on(hardware, difference):
             self._forget()
@@ -68,11 +72,11 @@ class HardwareClock:
         self._last_ns = int(hardware[-1])
         stamps: Stamps = hardware + self._line(hardware)
         np.maximum(stamps, software - LONGEST_DELAY_NS, out=stamps)
-        np.minimum(stamps, software, out=stamps)  # it was on the wire before the kernel had it
+        np.minimum(stamps, software, out=stamps)  # a frame is on the wire before the kernel has it
         return stamps
 
     def _goes_on(self, hardware: Stamps, difference: Stamps) -> bool:
-        """Whether these stamps can be of the clock that is known. One that fits is enough: others may be delayed."""
+        """Return whether stamps fit the known line. One that fits is enough: others may be delayed."""
         if hardware[0] < self._last_ns:
             return False
         above = difference - self._line(hardware)
@@ -101,7 +105,7 @@ class HardwareClock:
             self._fit()
 
     def _fit(self) -> None:
-        """The line along the lower edge: the median of all slopes between points, as low as the lowest point."""
+        """Fit the line to the lower edge: the median of all slopes between points, as low as the lowest point."""
         at = np.array([point[0] for point in self._points], np.int64)
         offset = np.array([point[1] for point in self._points], np.int64)
         x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
@@ -124,11 +128,11 @@ _SOFTWARE_WORD, _HARDWARE_WORD = 2, 6  # words of the ancillary data: seconds, t
 
 _CLOCK_READS = 3
 _SLEW_NS = 2_000_000
-"""CLOCK_REALTIME is disciplined by far less than this between two polls; what exceeds it is a step."""
+"""A larger change of CLOCK_REALTIME between two polls is a step: it is disciplined by far less."""
 
 
 def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
-    """Whether the controller of an interface stamps what it receives."""
+    """Return whether the controller of an interface stamps the frames that it receives."""
     info = bytearray(struct.pack("=I", _ETHTOOL_GET_TS_INFO).ljust(_TS_INFO_BYTES, b"\0"))
     buffer = np.frombuffer(info, np.uint8)
     request = struct.pack("=16sQ", interface.encode(), buffer.ctypes.data).ljust(40, b"\0")
@@ -143,9 +147,9 @@ def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
 class Stamper:
     """Reads the stamps of one socket.
 
-    Software stamps are CLOCK_REALTIME; they are converted with an offset that is sampled at every poll, so that steps
-    of that clock do no harm: a frame lies between two polls, and of the offsets before and after a step only one puts
-    it there. Hardware stamps are on a clock of the controller's, see ``hardware_clock``.
+    Software stamps are CLOCK_REALTIME. They are converted with an offset that is sampled at every poll, so that steps
+    of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
+    it there. Hardware stamps are on the controller's clock, see :class:`HardwareClock`.
 
     Args:
         hardware: read the controller's stamps, too.
@@ -159,7 +163,7 @@ class Stamper:
 
     @property
     def state(self) -> tuple[int, int]:
-        """What is known of the clocks: CLOCK_MONOTONIC - CLOCK_REALTIME, ns, and when frames were stamped last."""
+        """CLOCK_MONOTONIC - CLOCK_REALTIME, ns, and the time of the last poll, CLOCK_MONOTONIC ns."""
         return self._offset_ns, self._last_poll_ns
 
     @state.setter
@@ -167,16 +171,16 @@ class Stamper:
         self._offset_ns, self._last_poll_ns = state
 
     def switch_on(self, sock: socket.socket) -> None:
-        """Let the kernel stamp what this socket receives."""
+        """Make the kernel stamp the frames that a socket receives."""
         if self.hardware:
             flags = _RX_HARDWARE | _RAW_HARDWARE | _RX_SOFTWARE | _SOFTWARE
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
         else:
-            # costs 20 ns a frame less, and stamps also frames that came before the kernel began to (in the background)
+            # 20 ns a frame cheaper, and stamps also frames from before the kernel began to stamp (in the background)
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def read(self, control: Stamps) -> Stamps:
-        """(n,) int64, CLOCK_MONOTONIC ns: when frames arrived.
+        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames arrived.
 
         Args:
             control: (n, 8) int64, their ancillary data, in order of arrival.
@@ -198,7 +202,7 @@ class Stamper:
         if is_step:
             np.maximum.accumulate(stamps, out=stamps)
         else:
-            # the kernel begins to stamp in the background: what came before that has the time at which it was read
+            # the kernel begins to stamp in the background: earlier frames have the time at which they were read
             stamps = np.minimum.accumulate(stamps[::-1])[::-1]
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
         self._last_poll_ns = min(int(stamps[-1]), poll_ns)
@@ -208,7 +212,7 @@ class Stamper:
 
 
 def _offset_now_ns() -> tuple[int, int]:
-    """(CLOCK_MONOTONIC - CLOCK_REALTIME, CLOCK_MONOTONIC), ns; not bent by a pause between reading the two."""
+    """Return (CLOCK_MONOTONIC - CLOCK_REALTIME, CLOCK_MONOTONIC), ns; a pause between the two readings does no harm."""
     best_ns, offset_ns, poll_ns = NS_PER_S, 0, 0
     for _ in range(_CLOCK_READS):
         first_ns, real_ns, second_ns = now_ns(), time.time_ns(), now_ns()

@@ -5,14 +5,13 @@ Wire format: ur-o2as ``o2as_xela_sensor.py`` (a 4x4 sensor; github.com/o2ac/ur-o
 ``0x200 | board``, ``07 00``; stop: ``07 01``. Data: eight bytes, byte 0 unused, then X, Y and Z as big-endian uint16,
 byte 7 unused.
 
-Which identifier means which taxel differs from model to model; both published schemes are known here:
+The identifiers of the taxels depend on the model. Both published schemes are implemented:
 
 * consecutive (4x4 model): ``first_id + taxel``, first 0x710;
 * row_column (4x6 model): ``first_id | row << 4 | column``, first 0x100; taxel = column * rows + row.
 
 A message is not always a new sample: in a recording of 506 messages a second, taxels keep their values over many
-messages. Nothing on the wire tells the one from the other. There is no checksum, no sequence number, and no
-answer to any command.
+messages, and the wire does not show which. It carries no checksum and no sequence number, and no command is answered.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
@@ -65,16 +64,16 @@ class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             known |= taken
 
     def identifiers(self, first: int) -> list[int]:
+        """Return the identifiers of a board's taxels, in order."""
         if self.ids == "consecutive":
             return [first + taxel for taxel in range(self.rows * self.columns)]
         return [first | row << 4 | column for column in range(self.columns) for row in range(self.rows)]
 
 
 class XelaDriver(CanAdapter[XelaOptions]):
-    """uSkin boards. See this module's docstring for the wire, and ``XelaOptions`` for the options.
+    """uSkin boards, a patch each. Each taxel is a module of three sensors with one uid = board << 16 | taxel.
 
-    Each taxel is a module of three sensors of one uid = board << 16 | taxel: shear_x, shear_y, pressure. Values are
-    raw (idle about 32 to 37 thousand); forces are computed by the maker's closed server only.
+    Values are raw (idle about 32 to 37 thousand); only the maker's closed server computes forces.
     """
 
     types: Sequence[SensorType] = tuple(
@@ -85,34 +84,29 @@ class XelaDriver(CanAdapter[XelaOptions]):
     def __init__(self, options: XelaOptions) -> None:
         super().__init__(options)
         ids = {b: options.identifiers(first) for b, first in zip(options.boards, options.first_id, strict=True)}
-        self.patches: Sequence[Patch] = tuple(_patch(board, identifiers) for board, identifiers in ids.items())
         axes = Values(offset=1, dtype=">u2", count=3)
-        self.layout: Layout = Layout(
-            tuple(
-                Frame(f"board {board}", (Identifier.covering(own),), (8,), axes, patch=board, module=Bits(0, 11))
-                for board, own in ids.items()
-            )
-        )
+        patches, frames = [], []
+        for board, own in ids.items():
+            first_uid = board << 16
+            modules = [
+                Module(taxels(1, "shear_x", "shear_y", "pressure", first_uid=first_uid | taxel), identifier, "taxel")
+                for taxel, identifier in enumerate(own)
+            ]
+            patches.append(Patch(f"board {board}", modules, key=board))
+            when = (Identifier.covering(own),)
+            frames.append(Frame(f"board {board}", when, (8,), axes, patch=board, module=Bits(0, 11)))
+        self.patches: Sequence[Patch] = patches
+        self.layout: Layout = Layout(frames)
 
     async def start(self, link: Link) -> None:
-        """Command 07 00 to every board."""
         for board in self.options.boards:
             await link.send(0x200 | board, b"\x07\x00")
 
     async def stop(self, link: Link) -> None:
-        """Command 07 01 to every board."""
         for board in self.options.boards:
             await link.send(0x200 | board, b"\x07\x01")
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Tell a silent board to start: there is no question that it would answer, but it may have lost its power."""
+        """Send the start command to a silent board, which may have lost its power: it answers no question."""
         await link.send(0x200 | patch.key, b"\x07\x00")
         return False
-
-
-def _patch(board: int, identifiers: Sequence[int]) -> Patch:
-    modules = [
-        Module(taxels(1, "shear_x", "shear_y", "pressure", first_uid=board << 16 | taxel), key=identifier, kind="taxel")
-        for taxel, identifier in enumerate(identifiers)
-    ]
-    return Patch(f"board {board}", modules, key=board)

@@ -1,4 +1,4 @@
-"""``skin-prove --captured``: a capture, decoded again and compared with what was decoded then."""
+"""``skin-prove --captured``: decode a capture again, and compare with the values that were decoded then."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from click.core import ParameterSource
 
 from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import hardware_values, value_of
+from skinware_drivers.cli.hardware_options import hardware_values, own_values
 
 if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
@@ -20,17 +20,18 @@ if TYPE_CHECKING:
 
 
 def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_json: bool) -> bool:
-    """Compare, print what comes of it, and tell whether all is equal.
+    """Compare, print the result, and return whether all values are equal.
 
     Args:
         capture: the file.
-        arguments: of skin-driver: which driver, with which options of its own.
-        save: write what is decoded now beside the file, as what is right.
+        arguments: of skin-driver: the driver and its own options.
+        save: write the values that are decoded now beside the file, as the expected ones.
         as_json: print JSON.
 
     Raises:
-        BadRecording: it is no recording.
-        ConfigurationError: it cannot be read, has no wire, or those of several drivers; or the arguments are wrong.
+        BadRecording: the file is not a recording.
+        ConfigurationError: the file cannot be read, has no wire, or wires of several drivers; or the arguments are
+            wrong.
         DriverError: the driver failed.
     """
     from skinware_drivers.proving import updates
@@ -41,7 +42,7 @@ def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_j
         if save:
             now = decoded_now(capture, driver, options)
             if not now:
-                raise ConfigurationError(f"{capture}: nothing of it is decoded: nothing to save")
+                raise ConfigurationError(f"{capture}: nothing in it is decoded, so there is nothing to save")
             updates.save(now, expected_of(capture))
         compared, now = check_capture(capture, driver, options)
     except OSError as error:
@@ -50,16 +51,16 @@ def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_j
         raise ConfigurationError(
             f"{capture}: nothing was decoded then, {compared.now} updates are now; if they are right: --save"
         )
-    _tell(capture, compared, as_json)
+    _print(capture, compared, as_json)
     return compared.difference is None
 
 
 def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] | None, Mapping[str, Any]]:
-    """The driver, and the options that were given to it; None: that of then.
+    """Return the chosen driver and its options; None: the recorded driver.
 
     Raises:
-        ConfigurationError: no such driver, or an option that it does not have.
-        UsageError: one that is not about decoding.
+        ConfigurationError: there is no such driver, or it has no such option.
+        UsageError: an option is not about decoding.
     """
     from skinware_drivers.cli.driver import command as driver_command
     from skinware_drivers.options import options_from_strings
@@ -68,7 +69,7 @@ def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] |
 
     if not arguments:
         return None, {}
-    name = value_of("--driver", list(arguments)) or driver_type_of(capture)
+    name = own_values(driver_command, arguments).get("driver_name") or driver_type_of(capture)
     context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
     driver = load_driver(name)
     chosen = {
@@ -84,7 +85,7 @@ def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] |
     return driver, {key: getattr(options, key) for key in given}
 
 
-def _tell(capture: Path, compared: Comparison, as_json: bool) -> None:
+def _print(capture: Path, compared: Comparison, as_json: bool) -> None:
     difference = compared.difference
     if as_json:
         print_json(

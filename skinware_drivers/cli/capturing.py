@@ -1,4 +1,4 @@
-"""Capture a driver and all that goes over its wires in one file, and take driver and options from such a file."""
+"""Capture a driver and its wires in one file, and take driver and options from such a file."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from skinware.recording.recorder import Recorder
     from skinware_drivers.virtual.recorded import Recorded
 
 
@@ -25,7 +26,7 @@ def driver_of_recording(bus_names: Sequence[str]) -> str:
 
 
 def only_listened(bus_names: Sequence[str]) -> bool:
-    """Whether the wires of drivers were recorded that sent nothing."""
+    """Return whether all buses are replayed, and were recorded by drivers that sent nothing."""
     found = [_recorded(name) for name in bus_names]
     return bool(found) and all(recorded is not None and recorded.listen_only for recorded in found)
 
@@ -36,7 +37,6 @@ def options_of_recording(bus_name: str, driver_type: str) -> Mapping[str, Any]:
 
 
 def _recorded(bus_name: str) -> Recorded | None:
-    """What a recording tells; None: the bus is none."""
     if not bus_name.startswith("replay:"):
         return None
     from skinware_drivers.virtual.recorded import recorded_driver
@@ -45,11 +45,11 @@ def _recorded(bus_name: str) -> Recorded | None:
 
 
 _END_S = 30.0
-"""How long it may take to complete the file."""
+"""Longest time to complete the file."""
 
 
 class Capture:
-    """A recording that runs beside.
+    """A recorder in a process of its own.
 
     Args:
         path: of the new file.
@@ -57,26 +57,26 @@ class Capture:
         namespace: of the driver.
 
     Attributes:
-        path: as above.
-        told: what came of it, once it has ended: ``bytes``, ``lost``, ``problem``.
+        path: of the file.
+        result: ``bytes``, ``lost`` and ``problem``, after the end.
 
     Raises:
-        ConfigurationError: it cannot be recorded; the message says why.
+        ConfigurationError: the driver cannot be recorded; the message says why.
     """
 
     def __init__(self, path: Path, driver: str, namespace: str) -> None:
         self.path = path
-        self.told: dict[str, Any] = {"bytes": 0, "lost": 0, "problem": "it was ended by something else"}
+        self.result: dict[str, Any] = {"bytes": 0, "lost": 0, "problem": "something else ended the recorder"}
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__, str(path), driver, namespace],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            start_new_session=True,  # Ctrl-C ends the driver first, and what that says at last is in the file
+            start_new_session=True,  # Ctrl-C ends the driver first, so that its last words are in the file
         )
         try:
             begun = self._next()
-        except BaseException:  # somebody does not want to wait for it
+        except BaseException:  # such as Ctrl-C
             self.end()
             raise
         if not begun.get("ready"):
@@ -92,39 +92,38 @@ class Capture:
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
-        self.told |= self._next()
+        self.result |= self._next()
         if self._process.stdout is not None:
             self._process.stdout.close()
 
     def _next(self) -> dict[str, Any]:
-        """What it says next; empty: it has ended."""
         line = self._process.stdout.readline() if self._process.stdout is not None else ""
         return dict(json.loads(line)) if line else {}
 
 
 @contextmanager
-def captured(path: Path, driver: str, namespace: str, tell: Callable[[Capture], None]) -> Iterator[Capture]:
-    """Capture a driver during a block; it is to begin after that has.
+def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture], None]) -> Iterator[Capture]:
+    """Capture a driver while a block runs; start the driver inside.
 
     Args:
         path: of the new file.
         driver: name of the driver.
         namespace: of the driver.
-        tell: called with the capture when its file is complete.
+        on_end: called with the capture when its file is complete.
 
     Raises:
-        ConfigurationError: it cannot be recorded.
+        ConfigurationError: the driver cannot be recorded.
     """
     capture = Capture(path, driver, namespace)
     try:
         yield capture
     finally:
         capture.end()
-        tell(capture)
+        on_end(capture)
 
 
 def _record(path: Path, driver: str, namespace: str) -> None:
-    """Record until standard input is closed, by whoever wants it or by the kernel."""
+    """Record until standard input is closed."""
     from skinware.errors import SkinwareError
 
     problem, size, lost = "", 0, 0
@@ -135,7 +134,7 @@ def _record(path: Path, driver: str, namespace: str) -> None:
 
         target = Files(path)
         recorder = Recorder(target, names=[driver], namespace=namespace, with_wires=True, disguise=Disguise())
-        threading.Thread(target=_end_with_input, args=(recorder.stop,), daemon=True).start()
+        threading.Thread(target=_end_with_input, args=(recorder,), daemon=True).start()
         _say(ready=True)
         try:
             recorder.run()
@@ -150,9 +149,9 @@ def _record(path: Path, driver: str, namespace: str) -> None:
     _say(problem=problem, bytes=size, lost=lost)
 
 
-def _end_with_input(stop: Callable[[], None]) -> None:
+def _end_with_input(recorder: Recorder) -> None:
     os.read(0, 1)
-    stop()
+    recorder.stop()
 
 
 def _say(**what: Any) -> None:

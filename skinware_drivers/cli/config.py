@@ -32,7 +32,7 @@ _OWN_PARAMETERS = 3
 
 
 class Declined(SkinwareError):
-    """The person who was asked said no."""
+    """The user did not confirm."""
 
 
 @click.command(
@@ -147,7 +147,7 @@ def _through_driver(
             arguments = {**arguments, "bus": bus}
         if known is None or not known.looks:
             on = " ".join(f"{key}={value}" for key, value in arguments.items())
-            _ask_back(f"{owner}: {operation} {on}".rstrip(), offered[operation], yes)
+            _confirm(f"{owner}: {operation} {on}".rstrip(), offered[operation], yes)
         return {"results": reader.call(operation, timeout_s=timeout_s, **arguments)}
 
 
@@ -172,7 +172,7 @@ def _without_driver(
 
     def agree(patches: Sequence[Patch]) -> None:
         names = ", ".join(patch.name for patch in patches)
-        _ask_back(f"{bus_name}: {operation} of {names}", _description(declared[str(operation)].method), yes)
+        _confirm(f"{bus_name}: {operation} of {names}", _description(declared[str(operation)].method), yes)
         owner = driver_on(bus_name, running_drivers())
         if owner is not None:
             raise ConfigurationError(f"{owner} was started meanwhile; nothing was changed")
@@ -191,7 +191,7 @@ def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
     from skinware_drivers.options.file import ConfigFile
-    from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver
+    from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
 
     file = ConfigFile(config)
     driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
@@ -202,16 +202,16 @@ def _adapter(
         if not equals:
             raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
         given[key] = value
-    adapter_class = class_for(driver, bus_name, driver_type)
+    adapter_class = NamedBus(bus_name, driver_type).choose(driver)
     return driver_type, adapter_class(file.options_of_bus(driver.Options, bus_name, given))
 
 
-def _ask_back(what: str, description: str, yes: bool) -> None:
-    """Have a person agree.
+def _confirm(what: str, description: str, yes: bool) -> None:
+    """Ask for confirmation.
 
     Raises:
-        Declined: no.
-        ConfigurationError: there is nobody to ask.
+        Declined: the user did not confirm.
+        ConfigurationError: there is no terminal.
     """
     if yes:
         return
@@ -225,7 +225,7 @@ def _ask_back(what: str, description: str, yes: bool) -> None:
 
 
 def _pair(text: str) -> tuple[str, Any]:
-    """``key=value``; the value is JSON, or else text."""
+    """Return key and value of ``key=value``; the value is JSON, or else text."""
     import msgspec
 
     key, equals, value = text.partition("=")

@@ -22,8 +22,6 @@ from skinware.cli._command import (
 )
 from skinware.cli._terminal import echo, overwrite, print_json, style
 from skinware.text import age_text, plural
-from skinware_drivers.doctor.evidence import Evidence
-from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding, Severity
 
 if TYPE_CHECKING:
@@ -38,12 +36,12 @@ _SIGNS = {Severity.ERROR: ("✗", "red"), Severity.WARNING: ("!", "yellow"), Sev
 
 
 def as_text(evidence: Evidence, found: Examination, report: str | None = None) -> list[str]:
-    """All of it, with colours (which ``echo`` takes out where there is no terminal).
+    """Return the lines to print, with colours, which ``echo`` takes out without a terminal.
 
     Args:
-        evidence: what was seen.
-        found: what came of it.
-        report: the file in which it is written too.
+        evidence: everything that was seen.
+        found: the findings.
+        report: name of the file with the report, if one was written.
     """
     lines = [*_verdict(evidence, found), ""]
     for finding in found.findings:
@@ -100,7 +98,7 @@ def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
 
 
 def _wrapped(text: str, first: str, following: str) -> list[str]:
-    """Lines of the width, counted without colours; what cannot be broken stays whole."""
+    """Return lines of the width, counted without colours; long words stay whole."""
     words = text.split(" ")
     lines = [first + words[0]]
     for word in words[1:]:
@@ -122,7 +120,7 @@ def _wrapped(text: str, first: str, following: str) -> list[str]:
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path), required=False)
-@click.option("--seconds", "watch_s", type=seconds, default="3", show_default=True, help="Look for so long.")
+@click.option("--seconds", "watch_s", type=seconds, default="3", show_default=True, help="Look for SECONDS.")
 @click.option(
     "--report",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -133,9 +131,9 @@ def _wrapped(text: str, first: str, following: str) -> list[str]:
 @json_option
 @version_option
 def command(file: Path | None, watch_s: float, report: Path | None, namespace: str | None, as_json: bool) -> None:
-    """Look at everything that may be wrong: interfaces, permissions, buses, patches, times, taxels, files, machine.
+    """Find out what is wrong: look at interfaces, permissions, buses, patches, times, taxels, files and the machine.
 
-    With FILE: at a recording. Nothing is sent on any bus, and nothing is changed.
+    With FILE: look at a recording. Nothing is sent on any bus, and nothing is changed.
 
     Exit status: 0 nothing found, 1 something found, 2 wrong usage or not a recording.
     """
@@ -175,10 +173,10 @@ def as_data(evidence: Evidence, found: Examination) -> dict[str, Any]:
 
 
 def _write(report: Path, evidence: Evidence, found: Examination) -> None:
-    """The report, as a file.
+    """Write the report.
 
     Raises:
-        ConfigurationError: it cannot be written.
+        ConfigurationError: the file cannot be written.
     """
     from skinware.errors import ConfigurationError
     from skinware_drivers.doctor.report import as_markdown
@@ -189,25 +187,25 @@ def _write(report: Path, evidence: Evidence, found: Examination) -> None:
         raise ConfigurationError(f"{report}: {error.strerror or error}") from None
 
 
-def _live(namespace: str | None, watch_s: float, tell: Callable[[float], None]) -> Evidence:
+def _live(namespace: str | None, watch_s: float, progress: Callable[[float], None]) -> Evidence:
     from skinware.memory.namespace import Namespace
     from skinware_drivers.doctor.looking import look
 
-    return look(Namespace(namespace), watch_s, tell)
+    return look(Namespace(namespace), watch_s, progress)
 
 
-def _recorded(file: Path, tell: Callable[[float], None]) -> Evidence:
-    """Evidence of a recording.
+def _recorded(file: Path, progress: Callable[[float], None]) -> Evidence:
+    """Return the evidence of a recording.
 
     Raises:
-        ConfigurationError: it is none, or cannot be read here.
+        ConfigurationError: the file is not a recording, or cannot be read here.
     """
     from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 
     try:
         from skinware_drivers.doctor.recorded import look_at
 
-        return look_at(file, tell)
+        return look_at(file, progress)
     except (BadRecording, MissingExtra) as error:
         raise ConfigurationError(str(error)) from None
     except OSError as error:
@@ -215,16 +213,16 @@ def _recorded(file: Path, tell: Callable[[float], None]) -> Evidence:
 
 
 def _progress() -> Callable[[float], None]:
-    """Tells how far it is, on a terminal; below 0: it is over."""
+    """Return a function that shows the passed seconds on a terminal; a negative number ends it."""
     is_terminal = sys.stderr is not None and sys.stderr.isatty()
 
-    def tell(passed_s: float) -> None:
+    def show(passed_s: float) -> None:
         if is_terminal and passed_s < 0:
             overwrite("", err=True)
         elif is_terminal:
             overwrite(f"looking ... {passed_s:.1f} s", err=True)
 
-    return tell
+    return show
 
 
 def main() -> None:

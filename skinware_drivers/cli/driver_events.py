@@ -1,4 +1,4 @@
-"""What ``skin-driver`` prints while it runs: lines for people, or one JSON object per event."""
+"""Print the events of ``skin-driver``: lines for people, or one JSON object per event."""
 
 from __future__ import annotations
 
@@ -15,49 +15,50 @@ if TYPE_CHECKING:
     from skinware_drivers.running.runner import Runner
 
 
-def tell_ready(runner: Runner, as_json: bool) -> None:
-    if runner.generation is None:
+def print_ready(runner: Runner, as_json: bool) -> None:
+    if runner.builder.generation is None:
         return
-    structure = runner.generation.tables.structure
+    structure = runner.builder.generation.tables.structure
     buses = [line.name for line in runner.lines]
     if as_json:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
-        ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
-        latency_ms = int(runner.generation.publisher.latency_ns[0]) / 1e6
+        identity = {"driver": runner.identity.driver_type, "name": runner.identity.name}
+        ready: dict[str, Any] = {"event": "ready", **identity, **counts}
+        latency_ms = int(runner.builder.generation.publisher.latency_ns[0]) / 1e6
         print_json({**ready, "types": types, "buses": buses, "latency_ms": latency_ms})
     else:
         patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
         what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
-        echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
+        echo(f"{runner.identity.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
 
 
-def tell_patches(runner: Runner, change: PatchChange) -> None:
-    """Patches fell silent, or are live again: for programs. People have it in the log."""
+def print_patches(runner: Runner, change: PatchChange) -> None:
+    """Print for programs that patches fell silent, or are live again; people see it in the log."""
     if runner.ready:
-        print_json({"event": "patches", "name": runner.name, **change._asdict()})
+        print_json({"event": "patches", "name": runner.identity.name, **change._asdict()})
 
 
-def tell_capture(capture: Capture, as_json: bool) -> None:
-    """The file with what went over the buses is complete, or is not."""
+def print_capture(capture: Capture, as_json: bool) -> None:
+    """Print that the captured file is complete, or why it is not."""
     with contextlib.suppress(BrokenPipeError):
         if as_json:
-            print_json({"event": "captured", "file": str(capture.path), **capture.told})
-        elif capture.told["problem"]:
-            echo(f"{capture.path}: ended early: {capture.told['problem']}", err=True)
+            print_json({"event": "captured", "file": str(capture.path), **capture.result})
+        elif capture.result["problem"]:
+            echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
         else:
-            lost = f", {capture.told['lost']} frames lost" if capture.told["lost"] else ""
-            size = capture.told["bytes"] / 1e6
+            lost = f", {capture.result['lost']} frames lost" if capture.result["lost"] else ""
+            size = capture.result["bytes"] / 1e6
             echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
 
 
 async def report(runner: Runner) -> None:
-    """Its state each second, for programs, until nobody reads any more."""
+    """Print its state each second, for programs, until the pipe is closed."""
     while True:
         await asyncio.sleep(1)
         if runner.ready:
             try:
-                print_json({"event": "status", "name": runner.name, **runner.status()})
+                print_json({"event": "status", "name": runner.identity.name, **runner.status()})
             except BrokenPipeError:
                 runner.stop()
                 return

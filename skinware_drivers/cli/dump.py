@@ -1,4 +1,4 @@
-"""``skin-dump``: print what drivers publish (``skinware.cli.dump``), or with ``--raw`` what is heard on a CAN bus."""
+"""``skin-dump``: print snapshots of drivers (``skinware.cli.dump``), or with ``--raw`` the frames of a CAN bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _CAN_PAYLOAD = 64
 _SERIAL = ("serial", "pty", *NETWORKS)
 _SHARED = ("socketcan", "udp_multicast", "virtual")
-"""Interfaces on which a second listener takes nothing away from the first."""
+"""Interfaces on which two programs can listen."""
 _OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "counts": "--counts"}
 
 
@@ -38,9 +38,9 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
     """Print the frames of a CAN bus as they come; nothing is sent.
 
     Raises:
-        ConfigurationError: not a CAN bus, or one that only one program can have, and that is a driver.
+        ConfigurationError: not a CAN bus, or a driver has it and no other program can listen.
         BusNotAvailable: the bus cannot be opened, or went away.
-        BusError: nothing came for ``timeout_s``.
+        BusError: no frame came for ``timeout_s``.
     """
     from skinware.candump import channel_name
     from skinware.realtime import now_ns
@@ -49,7 +49,7 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
     from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)
-    _refuse_what_has_one_owner(bus_name, interface)
+    _refuse_owned(bus_name, interface)
     name = channel_name(interface, channel)
     bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     left = count
@@ -77,10 +77,10 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
                     return
     finally:
         bus.close()
-        _tell_what_is_missing(bus)
+        _warn_of_missing(bus)
 
 
-def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
+def _refuse_owned(bus_name: str, interface: str) -> None:
     from skinware.errors import ConfigurationError
     from skinware_drivers.finding.running import driver_on, running_drivers
 
@@ -114,7 +114,7 @@ def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[Frame
             raise BusError(f"{bus_name}: no frame for {timeout_s:g} s")
 
 
-def _tell_what_is_missing(bus: Bus) -> None:
+def _warn_of_missing(bus: Bus) -> None:
     counters = bus.counters
     missing = {
         "lost": counters.lost,

@@ -1,6 +1,6 @@
-"""``skin-emulate``: emulated skin patches on a bus that other programs use.
+"""``skin-emulate``: emulate skin patches on a bus that other programs use.
 
-The command line is the emulator's options beside a few of its own; :mod:`.emulation` does the work.
+The command line takes the emulator's options beside a few of its own; :mod:`.emulation` does the work.
 """
 
 from __future__ import annotations
@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, namespace_option, run, seconds, version_option
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
+from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import msgspec
 
     from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
@@ -26,13 +28,13 @@ _LONGEST_COMMAND = {"can": 8, "serial": 4096, "modbus": 4096}
 
 
 class EmulateCommand(HardwareCommand):
-    """The command with the options of the chosen emulator beside its own."""
+    """The command, with the options of the chosen emulator."""
 
-    def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
+    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
         from skinware_drivers.loading import short_name
         from skinware_drivers.virtual.hardware import load_emulator
 
-        driver = value_of("--driver", args) or _DEFAULT_DRIVER
+        driver = given.get("driver") or _DEFAULT_DRIVER
         return f"emulated {short_name(driver)}", load_emulator(driver).Options
 
 
@@ -44,7 +46,7 @@ class EmulateCommand(HardwareCommand):
         "skin-emulate --bus vcan0 --boards 7,8                  ROBOSKIN boards",
         "skin-emulate --bus vcan0 --lose 0.01 --restart 7       with faults",
         "skin-emulate --driver openpatch --bus pty:/tmp/skin    on a serial line",
-        "skin-emulate --driver skintalk --bus tcp://:5000       to be called over TCP",
+        "skin-emulate --driver skintalk --bus tcp://:5000       as a TCP server",
         "skin-emulate --driver xela --help                      options of another",
     ),
 )
@@ -65,7 +67,7 @@ class EmulateCommand(HardwareCommand):
     help="Write the places of the emulated sensors to FILE, for skin-driver --geometry FILE.",
 )
 @click.option(
-    "--name", metavar="NAME", help="Let programs press the skin (skin-press) by a service of that name.  [default: no]"
+    "--name", metavar="NAME", help="Publish a service by which programs press the skin (skin-press).  [default: none]"
 )
 @namespace_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
@@ -100,7 +102,7 @@ def command(
     if parse_bus_name(bus_name).interface == "virtual":
         raise ConfigurationError(
             f"--bus {bus_name}: no other program can open it; give vcan0 or pty:./port,"
-            " or none: skin-driver --bus virtual"
+            " or do without: skin-driver --bus virtual"
         )
     emulator = load_emulator(driver)
     options = options_from_strings(emulator.Options, hardware_values(hardware_options))
@@ -118,17 +120,17 @@ def command(
         hardware = emulator(options, log=log)
         if geometry_path is not None:
             _write_geometry(geometry_path, _placed(hardware, "--geometry"), short_name(driver))
-        beside = None
+        companion = None
         if name is not None:
             service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
-            beside = open_things.enter_context(contextlib.closing(service))
-        emulation = Emulation(bus, hardware, report, beside=beside)
+            companion = open_things.enter_context(contextlib.closing(service))
+        emulation = Emulation(bus, hardware, report, companion=companion)
         signals = open_things.enter_context(SignalWatch())
         emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
 
 
 def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
-    """The same, if it knows where its sensors are.
+    """Return hardware that knows the places of its sensors.
 
     Raises:
         ConfigurationError: it does not.

@@ -1,4 +1,4 @@
-"""Carries the frames of emulated hardware over a bus in real time, until told to stop."""
+"""Carry the frames of emulated hardware over a bus in real time, until a signal."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 
 _STATUS_NS = 1_000_000_000
 _RETRY_NS = 2_000_000
-"""Pause before a frame that a full queue refused is tried again."""
+"""Pause before a frame that a full queue refused is sent again."""
 _GIVE_UP_NS = 500_000_000
-"""A frame that is still refused so long after it was due is given up: newer ones are worth more."""
+"""Age at which a refused frame is dropped: newer ones are worth more."""
 _LONGEST_BACKLOG_NS = 1_000_000_000
-"""Frames that are due for longer (the process was stopped) go unheard, as if nobody had listened."""
+"""Age at which frames that were not sent, because the process was stopped, count as unheard."""
 _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 """Pauses between attempts to open a bus that went down."""
 
 
 class Report(Protocol):
-    """Where the emulation says what it does."""
+    """Receives the events of an emulation."""
 
     def event(self, name: str, **facts: Any) -> None:
-        """Say that something happened: ready, status, bus_down, bus_up, stopped."""
+        """Receive an event: ready, status, bus_down, bus_up, stopped."""
 
 
 class JsonReport:
-    """One JSON object a line."""
+    """Print one JSON object a line."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -49,7 +49,7 @@ class JsonReport:
 
 
 class HumanReport:
-    """Lines for a person; no status every second."""
+    """Print lines for people, without the status of each second."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -69,7 +69,7 @@ class HumanReport:
 
 
 class SignalWatch:
-    """Turns SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
+    """Turn SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
 
     def __init__(self) -> None:
         self.stopped: bool = False
@@ -99,39 +99,39 @@ class SignalWatch:
 
 
 class Stop(Protocol):
-    """What ends a run."""
+    """Ends a run."""
 
     stopped: bool
 
     def fileno(self) -> int:
-        """Readable when ``stopped`` may have changed."""
+        """Return a descriptor that is readable when ``stopped`` may have changed."""
 
 
-class Beside(Protocol):
-    """What is done in the same loop."""
+class Companion(Protocol):
+    """Work in the loop of an emulation."""
 
     def fileno(self) -> int:
-        """Readable when ``step`` has something to do."""
+        """Return a descriptor that is readable when ``step`` has work."""
 
     def step(self, now_ns: int) -> int:
-        """Do what is due; returns when something will be due by itself."""
+        """Do the work that is due, and return the time of the next."""
 
 
 class Emulation:
     """Emulated hardware on a bus.
 
-    Frames go out at the time they are due, rounded up to the millisecond of ``epoll``; those due together go
-    out together. No frame is dropped silently: what a full queue refuses is tried again until half a second after
-    it was due, and then counted as a send failure; what the hardware sent while the bus was down or this process
-    stopped is counted as ``unheard``.
+    Frames go out at the time they are due, rounded up to the millisecond of ``epoll``; those due together go out
+    together. No frame is dropped silently: a frame that a full queue refuses is sent again until half a second after it
+    was due, and then counted as a send failure. Frames of a time when the bus was down or this process
+    stopped are counted as ``unheard``.
 
     Args:
         bus: not opened yet.
         hardware: not powered up yet.
-        report: told what happens.
+        report: receives the events.
         clock: CLOCK_MONOTONIC ns.
-        poll: waits for one of the readable descriptors for so many seconds: ``(descriptors, timeout_s)``.
-        beside: what else there is to do.
+        poll: waits until a descriptor is readable, or for a time: ``(descriptors, timeout_s)``.
+        companion: other work in the same loop.
     """
 
     def __init__(
@@ -142,17 +142,17 @@ class Emulation:
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,
-        beside: Beside | None = None,
+        companion: Companion | None = None,
     ) -> None:
         self._bus, self._hardware, self._report = bus, hardware, report
         self._clock, self._poll = clock, poll or wait_readable
-        self._beside = beside
+        self._companion = companion
         self._outbox: deque[WireFrame] = deque()
         self._batch = FrameBatch(256, bus.payload_size)
         self._open = False
         self._backoff_ns = _FIRST_BACKOFF_NS
         self.send_failures: int = 0
-        """Frames given up."""
+        """Number of dropped frames."""
 
     def run(
         self,
@@ -166,7 +166,7 @@ class Emulation:
         """Emulate until ``stop``, or for ``duration_s``.
 
         Raises:
-            BusNotAvailable: the bus could not be opened at the start. Later on it is opened again indefinitely.
+            BusNotAvailable: the bus cannot be opened at the start. Later it is opened again whenever it goes down.
         """
         self._bus.open()
         self._open = True
@@ -185,15 +185,15 @@ class Emulation:
                     self._report.event("status", **self._totals())
                     status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
                 next_ns = self._step(now_ns)
-                beside_ns = None if self._beside is None else self._beside.step(now_ns)
-                moments = [moment for moment in (next_ns, beside_ns, end_ns, status_ns) if moment is not None]
+                companion_ns = None if self._companion is None else self._companion.step(now_ns)
+                moments = [moment for moment in (next_ns, companion_ns, end_ns, status_ns) if moment is not None]
                 self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
         self._report.event("stopped", **self._totals())
 
     def _step(self, now_ns: int) -> int | None:
-        """Do what is due now; returns when something will be due by itself."""
+        """Do the work that is due, and return the time of the next."""
         if not self._open:
             return self._reopen(now_ns)
         try:
@@ -244,8 +244,8 @@ class Emulation:
 
     def _wait(self, stop: Stop, timeout_s: float) -> None:
         descriptors = [stop.fileno(), self._bus.fileno()] if self._open else [stop.fileno()]
-        if self._beside is not None:
-            descriptors.append(self._beside.fileno())
+        if self._companion is not None:
+            descriptors.append(self._companion.fileno())
         self._poll(descriptors, timeout_s)
 
     def _totals(self) -> dict[str, int]:

@@ -39,7 +39,7 @@ _DETECTION_S = 10.0
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
 @click.option("--listen", "listen_s", type=seconds, default="1", show_default=True, help="Listen for SECONDS.")
-@click.option("--probe", is_flag=True, help="Send harmless requests, to see which devices answer.")
+@click.option("--probe", is_flag=True, help="Send harmless requests to see which devices answer.")
 @click.option(
     "--driver",
     "driver_names",
@@ -68,7 +68,7 @@ def command(
     Exit status: 0 done, 1 failed, or a BUS is not available, 2 wrong usage.
     """
     if force and not probe:
-        raise click.UsageError("--force is about --probe: give both")
+        raise click.UsageError("--force needs --probe")
     if udev:
         _print_rules(buses, as_json)
         return
@@ -89,14 +89,14 @@ async def look(
     force: bool = False,
     driver_names: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Everything that ``skin-find`` tells, as JSON has it.
+    """Return everything that ``skin-find`` prints, as data for JSON.
 
     Raises:
-        BusNotAvailable: one of ``buses`` is not there.
-        ConfigurationError: one of ``driver_names`` is not there, or one of ``buses`` is no name of a bus.
+        BusNotAvailable: one of ``buses`` does not exist.
+        ConfigurationError: one of ``driver_names`` does not exist, or one of ``buses`` is not the name of a bus.
     """
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.bus_names import is_only_asked
+    from skinware_drivers.bus_names import BusName
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import Detection, can_interfaces, detect_adapters
     from skinware_drivers.finding.looking import listen
@@ -106,11 +106,11 @@ async def look(
     drivers = known_drivers("can", driver_names)
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
-    networks = [name for name in others if is_only_asked(name)]
+    networks = [name for name in others if BusName.of(name).is_only_asked]
     for name in networks:
-        make_bus(name)  # refuses what cannot be one, whether or not anybody asks
+        make_bus(name)  # refuses bad names, also without --probe
     buses_to_hear = [one.name for one in interfaces if one.up]
-    buses_to_hear += [name for name in others if not is_only_asked(name)]
+    buses_to_hear += [name for name in others if not BusName.of(name).is_only_asked]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
     detection: Detection
     detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
@@ -131,7 +131,7 @@ async def look(
 def _chosen(
     buses: tuple[str, ...], interfaces: list[CanInterface]
 ) -> tuple[list[CanInterface], list[SerialPort], list[str]]:
-    """CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
+    """Return CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
     from skinware.errors import BusNotAvailable
     from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.ports import pseudo_terminal, serial_ports
@@ -146,7 +146,7 @@ def _chosen(
             port = next((port for port in serial_ports() if same_bus(port.path, channel or name)), None)
             port = port or pseudo_terminal(channel)
             if port is None:
-                raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
+                raise BusNotAvailable(f"there is no serial port {name}; skin-find lists all")
             chosen[1].append(port)
         elif interface == "socketcan" and channel in [one.name for one in interfaces]:
             chosen[0].extend(one for one in interfaces if one.name == channel)
@@ -208,7 +208,7 @@ def _can_data(
 ) -> dict[str, Any]:
     import msgspec
 
-    from skinware_drivers.can.interface import NO_CAN
+    from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.interfaces import NO_INTERFACE, kernel_has_can
 
     in_kernel = kernel_has_can()
@@ -256,7 +256,7 @@ def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
 
     _, ports, others = _chosen(buses, [])
     if others:
-        raise click.UsageError(f"{others[0]} is no serial port, and needs no udev rule")
+        raise click.UsageError(f"{others[0]} is not a serial port, and needs no udev rule")
     rules = rules_for(ports)
     if not rules:
         warn("no serial device is plugged in by USB; these are the rules for the adapters that are usual")

@@ -1,4 +1,4 @@
-"""What ``skin-find`` found, for people: lines that fit a terminal of 80 columns."""
+"""The output of ``skin-find`` for people, in lines of at most 80 columns."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import click
 
 from skinware.cli._terminal import style
 from skinware.text import count_text, plural
-from skinware_drivers.bus_names import is_only_asked
+from skinware_drivers.bus_names import BusName
 
 _WIDTH = 80
 _MOST_CLASSES = 6
 
 
 def as_text(found: dict[str, Any]) -> list[str]:
-    """The whole report, with colours (which ``echo`` takes out where there is no terminal)."""
+    """Return the whole report, with colours, which ``echo`` takes out without a terminal."""
     can = found["can"]
     lines: list[str] = []
     if can["interfaces"] or can["advice"]:
@@ -73,9 +73,9 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
     if bus["used_by"] is not None:
         lines += _wrapped(f"{bus['used_by']} runs on it")
     heard, probe = bus["heard"], bus["probe"]
-    if heard is None and probe is None and bus["used_by"] is None and is_only_asked(bus["bus"]):
+    if heard is None and probe is None and bus["used_by"] is None and BusName.of(bus["bus"]).is_only_asked:
         lines += _wrapped(
-            f"not listened to: it is not known what a device does when it is called; to ask who is there:"
+            f"not opened, because a connection may change what a device does; to ask which device is on it:"
             f" skin-find {bus['bus']} --probe"
         )
     if heard is not None and heard.problem:
@@ -84,7 +84,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
         load = f", {100 * heard.load:.0f} % of the bus' time" if heard.load is not None and heard.frames else ""
         what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
         errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""
-        errors += f"; the controller tells: {heard.trouble}" if heard.trouble else ""
+        errors += f"; the controller is {heard.trouble}" if heard.trouble else ""
         lines += _wrapped(f"heard in {heard.duration_s:.1f} s: {what}{errors}")
         for one in heard.classes[:_MOST_CLASSES]:
             span = f"{one.first:X}" if one.first == one.last else f"{one.first:X} to {one.last:X}"
@@ -99,7 +99,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
         if heard.frames and not heard.guesses:
             lines += _wrapped("no installed driver knows these frames")
         if not heard.frames and probe is None and bus["used_by"] is None:
-            lines += _wrapped(f"to ask who is there: skin-find {bus['bus']} --probe")
+            lines += _wrapped(f"to ask which devices are on it: skin-find {bus['bus']} --probe")
     return lines + _probe_lines(probe)
 
 
@@ -113,7 +113,7 @@ def _probe_lines(probe: Any) -> list[str]:
         lines += _wrapped(f"answers: {text}")
     for driver, text in probe.problems.items():
         lines += _wrapped(f"{driver} could not ask: {text}")
-    return lines or _wrapped(f"nobody answers (asked by {', '.join(probe.asked)})")
+    return lines or _wrapped(f"no answer (asked by {', '.join(probe.asked)})")
 
 
 def _port_lines(port: dict[str, Any]) -> list[str]:
@@ -137,7 +137,7 @@ def _port_lines(port: dict[str, Any]) -> list[str]:
 
 
 def _advice(texts: list[str]) -> list[str]:
-    """What is wrong and what to do, marked; commands in it can be copied as they are."""
+    """Return problems and what to do, with marks; the commands can be copied as they stand."""
     lines = []
     for text in texts:
         why, colon, commands = text.partition(": sudo ")

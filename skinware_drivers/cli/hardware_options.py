@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     import msgspec
 
     from skinware_drivers.options import Option
 
 _HARDWARE_OPTIONS = "skinware.hardware_options"
 _PREFIX = "hardware_"
-"""Of parameters of hardware: the command's own have other names than their flags."""
+"""Prefix of the parameters of hardware, so that they never clash with the command's own."""
 _LONGEST_KIND = 24
-"""What is longer stands in the text, where it can be wrapped."""
+"""Longer kinds are written in the help text, where they can be wrapped."""
 
 
 class HardwareCommand(click.Command):
     """A command of which ``--driver`` says what further options it has; their values are the texts that were given."""
 
-    def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
-        """The driver that an unparsed command line names, and the options that it brings.
+    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
+        """Return the driver that a command line names, and the options that the driver adds.
+
+        Args:
+            given: values of the command's own flags, as texts.
 
         Raises:
             ConfigurationError: there is no such driver.
@@ -35,7 +40,7 @@ class HardwareCommand(click.Command):
         """Find out whose options the command line may hold, then parse it."""
         from skinware_drivers.options import check_names, describe_options
 
-        driver, options_class = self.options_class(args)
+        driver, options_class = self.options_class(own_values(self, args))
         check_names(options_class, reserved_names(self), str(ctx.info_name), f"driver {driver}")
         ctx.meta[_HARDWARE_OPTIONS] = driver, [_click_option(option) for option in describe_options(options_class)]
         return super().parse_args(ctx, args)
@@ -65,14 +70,11 @@ def hardware_values(parameters: dict[str, str | None]) -> dict[str, str]:
     return {name.removeprefix(_PREFIX): text for name, text in parameters.items() if text is not None}
 
 
-def value_of(flag: str, args: list[str]) -> str | None:
-    """The value of a flag, looked at before the command line is parsed."""
-    for position, argument in enumerate(args):
-        if argument == flag and position + 1 < len(args):
-            return args[position + 1]
-        if argument.startswith(flag + "="):
-            return argument.partition("=")[2]
-    return None
+def own_values(command: click.Command, args: Sequence[str]) -> dict[str, Any]:
+    """Return the values of a command's own flags, as texts; the other flags of the command line are ignored."""
+    context = click.Context(command, info_name=command.name, ignore_unknown_options=True)
+    values, _, _ = command.make_parser(context).parse_args(list(args))
+    return values
 
 
 def _click_option(option: Option) -> click.Option:

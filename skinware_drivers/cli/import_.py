@@ -1,4 +1,4 @@
-"""``skin-import``: other systems' files into ours."""
+"""``skin-import``: translate files of other systems."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def command() -> None:
     "--yarp",
     "root",
     metavar="BUS",
-    help="Read YARP ports instead of CAN: what they begin with, as yarp://HOST:PORT/icub/skin.",
+    help="Read YARP ports instead of CAN: their common beginning, as yarp://HOST:PORT/icub/skin.",
 )
 @json_option
 @click.option("-v", "--verbose", is_flag=True, help="Also list remarks that need no action.")
@@ -109,7 +109,7 @@ def icub(
     if output is None:
         echo(_configuration(done.parts[0], root), nl=False)
         if done.parts[0].groups:
-            echo("skin-import: with -o DIR, there is a geometry file too", err=True)
+            echo("skin-import: -o DIR writes a geometry file too", err=True)
         return
     for part in done.parts:
         figures = part.figures()
@@ -137,7 +137,7 @@ def _patch(text: str) -> int:
 
 
 def _root(text: str | None) -> str:
-    """With what the names of ports begin; empty: no ports are wanted."""
+    """Return the beginning of the names of ports; empty: no ports are wanted."""
     from skinware_drivers.streams.yarp_bus import split_channel
 
     if text is None:
@@ -170,7 +170,7 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) 
         written.append({kind: str(path) for kind, path in files.items()})
     in_the_way = [str(path) for path in texts if path.exists()]
     if in_the_way and not force:
-        raise ConfigurationError(f"{', '.join(in_the_way)}: there already; give another folder, or --force")
+        raise ConfigurationError(f"{', '.join(in_the_way)}: exist already; give another folder, or --force")
     folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``skin-new``: a package for a driver of one's own, ready to install, to test and to run."""
+"""``skin-new``: create a package for a new driver, ready to install, test and run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HOW_TO_RUN = {
     ),
     "virtual": ("skin-driver --driver {name} --bus virtual",),
 }
-"""Of each transport."""
+"""Commands to type for each transport."""
 
 
 @click.command(
@@ -50,7 +50,7 @@ _HOW_TO_RUN = {
 def command(name: str, transport: str) -> None:
     """Create a driver package in the new folder NAME: driver, emulated hardware, tests and instructions.
 
-    It works as it is, for a small imaginary device: replace this device by yours, step by step.
+    It works at once, for a small imaginary device: replace this device by yours, step by step.
 
     For a first test you need no package: skin-driver --driver ./my_skin.py runs a driver in a file.
     """

@@ -1,4 +1,4 @@
-"""The service beside ``skin-emulate`` by which programs press the emulated skin, and that tells where it is pressed."""
+"""The service of ``skin-emulate`` by which programs press the emulated skin, and which publishes the presses."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _MOST = 16
 
 
 class PressingService:
-    """Publishes what presses the skin, at 50 Hz, and takes presses: the operation ``press``, as of the bus ``virtual``.
+    """Publish the presses on the skin at 50 Hz, and take new ones by the operation ``press``.
 
     Args:
         name: of the service.
-        hardware: that is pressed.
-        bus_name: of the emulation, for the answers.
+        hardware: the emulated skin.
+        bus_name: of the emulation, for the replies.
         namespace: of the service.
 
     Raises:
@@ -35,25 +35,25 @@ class PressingService:
         self._writer = ServiceWriter(
             name,
             {
-                "count": Column(np.dtype("<u4"), (1,), "", "of the presses; the rows behind them are old"),
-                "point_m": Column(np.dtype("<f8"), (_MOST, 3), "m", "where each is, in the frame of the geometry"),
+                "count": Column(np.dtype("<u4"), (1,), "", "number of presses; later rows are old"),
+                "point_m": Column(np.dtype("<f8"), (_MOST, 3), "m", "places, in the coordinate frame of the geometry"),
                 "force_n": Column(np.dtype("<f8"), (_MOST,), "N", "of each"),
             },
             namespace=namespace,
             rate_hz=_RATE_HZ,
-            description="what presses an emulated skin",
+            description="presses on an emulated skin",
             operations={"press": self.press},
         )
-        self._writer.request_server()  # from now on, not from the first turn of the loop on
+        self._writer.request_server()  # takes requests from now on, before the first turn of the loop
 
     def fileno(self) -> int:
         return self._writer.request_server().fileno()
 
     def step(self, now_ns: int) -> int:
-        """Publish and answer what is due; returns when it will be due by itself, CLOCK_MONOTONIC ns."""
+        """Publish and answer what is due, and return the next time of publishing, CLOCK_MONOTONIC ns."""
         waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
-            self._publish(clock_ns())  # later than what was asked for before
+            self._publish(clock_ns())  # later than the requests
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ
         for request in waiting:
             request.reply(position=self._writer.position)
@@ -65,7 +65,7 @@ class PressingService:
         """Press the emulated skin at a place for a while.
 
         Raises:
-            ValueError: the numbers make no sense, or nothing of the skin would feel it.
+            ValueError: the numbers make no sense, or no part of the skin would feel it.
         """
         pressing = Pressing.of(at_m, force_n, radius_m, seconds)
         return {self._bus_name: self._hardware.press(pressing, clock_ns())}

@@ -54,7 +54,7 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
         "skin-prove hand --only index --only palm      only these modules",
         "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
         "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
-        "skin-prove --captured hand.mcap               without the device: does the driver still show what it did?",
+        "skin-prove --captured hand.mcap               without the device: are the decoded values the same?",
         "skin-prove --captured hand.mcap -- --driver ./my.py",
     ),
 )
@@ -66,9 +66,9 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
 @click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; repeat it for several.")
 @click.option("--wait", "patience_s", type=seconds, default="30", show_default=True, help="SECONDS for each step.")
 @click.option(
-    "--rest", "rest_s", type=seconds, default="3", show_default=True, help="Look so long at the skin at rest."
+    "--rest", "rest_s", type=seconds, default="3", show_default=True, help="Look at the skin at rest for SECONDS."
 )
-@click.option("--tare", "with_tare", is_flag=True, help="At last, have the driver tare, if it can.")
+@click.option("--tare", "with_tare", is_flag=True, help="At the end, let the driver tare, if it can.")
 @click.option(
     "-o",
     "--output",
@@ -81,10 +81,12 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "--captured",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="No device: decode a capture (skin-driver --capture FILE) again, and compare with what was decoded then.",
+    help="No device: decode a capture (skin-driver --capture FILE) again, and compare with the values of then.",
 )
 @click.option(
-    "--save", is_flag=True, help="With --captured: from now on, what is decoded now is right; written beside FILE."
+    "--save",
+    is_flag=True,
+    help="With --captured: write the values that are decoded now beside FILE, as the expected ones.",
 )
 @namespace_option
 @json_option
@@ -105,22 +107,22 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Prove the driver of a device that you have: press where you are told, stroke, and attach the report to an issue.
+    """Prove the driver of a device: press and stroke where it asks you to, and attach the report to an issue.
 
-    It looks whether the right module answers, the sign, saturation, the order of taxels in matrices, dead taxels, rate
-    and losses, with driver NAME, or the only one that runs, or one that it starts. All of it is captured. Type
-    "skip" and Enter to leave a module out. Nothing is sent to the device but by the driver itself.
+    It checks whether the right module answers, sign, saturation, the order of taxels in matrices, dead taxels, rate and
+    losses of driver NAME, of the only one that runs, or of one that it starts. Everything is captured. Type "skip" and
+    Enter to leave a module out. Only the driver sends to the device.
 
-    With --captured it proves that the driver decodes a capture as it did when that was made, and tells the first
-    difference. The driver and its options are those of then, but for what is given behind the --.
+    With --captured it proves that the driver decodes a capture to the same values as then, and prints the first
+    difference. It uses the recorded driver and options; options after the -- replace them.
 
-    Ctrl-C ends the walk: the report has what was seen until then.
+    Ctrl-C ends the walk; the report holds the checks until then.
 
     Exit status: 0 proven, 1 something failed, differs, or nothing was pressed, 2 wrong usage.
     """
     from skinware.memory.namespace import Namespace
 
-    if name is not None and name.startswith("-"):  # there was nothing before the --
+    if name is not None and name.startswith("-"):  # nothing stands before the --
         driver_arguments, name = (name, *driver_arguments), None
     if captured is not None:
         _refuse_others(
@@ -132,7 +134,7 @@ def command(
             context.exit(EXIT_FAILED)
         return
     if save:
-        raise click.UsageError("--save is for --captured")
+        raise click.UsageError("--save needs --captured")
     from skinware_drivers.proving.proof import Proof, ProofFiles
     from skinware_drivers.proving.walk import Manner, walk
 
@@ -151,7 +153,7 @@ def command(
                 undisturbed()
         except KeyboardInterrupt:
             proof.about["ended early"] = f"interrupted{person.meanwhile}"
-        except (SkinwareError, OSError) as error:  # OSError: there is no terminal any more
+        except (SkinwareError, OSError) as error:  # OSError: the terminal is gone
             undisturbed()
             if not proof.checks:
                 raise
@@ -159,7 +161,7 @@ def command(
             proof.about["ended early"] = f"{error}{person.meanwhile}"
         proof.about["capture"] = files.capture_text(is_whole=bool(driver_arguments))
         trouble = files.write(proof) or trouble
-    _tell(proof, files, as_json)
+    _print(proof, files, as_json)
     if trouble is not None:
         raise trouble
     if not proof.is_proven:
@@ -170,8 +172,8 @@ def command(
 def _captured(
     name: str | None, driver_arguments: Sequence[str], place: Namespace, files: ProofFiles
 ) -> Iterator[DriverReader]:
-    """A reader of a driver that is captured as long as the block: of one that runs, or of one that is started."""
-    from skinware.cli._driver_snapshots import reader_of
+    """Capture a running driver, or start one, while the block runs, and yield a reader of it."""
+    from skinware.views.driver_snapshots import reader_of
     from skinware_drivers.cli.capturing import captured
 
     with contextlib.ExitStack() as beside:
@@ -179,13 +181,13 @@ def _captured(
             name = beside.enter_context(_started(driver_arguments, name, place, files))
         reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
         if not driver_arguments:
-            tell: Callable[[Capture], None] = lambda done: files.captured.update(done.told)  # noqa: E731
-            beside.enter_context(captured(files.capture, reader.name, place.name, tell))
+            keep: Callable[[Capture], None] = lambda done: files.captured.update(done.result)  # noqa: E731
+            beside.enter_context(captured(files.capture, reader.name, place.name, keep))
         yield reader
 
 
 def _refuse_others(context: click.Context, allowed: set[str]) -> None:
-    """What is about a device says nothing of a capture."""
+    """Refuse options that are about a device."""
     for parameter in context.command.params:
         is_given = parameter.name and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
         if is_given and parameter.name not in allowed and context.params[parameter.name]:
@@ -203,10 +205,10 @@ def _facts() -> dict[str, str]:
 
 @contextlib.contextmanager
 def _interrupted_once() -> Iterator[Callable[[], None]]:
-    """Ctrl-C, SIGTERM, or a closed terminal, ends what the block does, once: what comes after it is undisturbed.
+    """Let Ctrl-C, SIGTERM or a closed terminal interrupt the block once; the code after it runs undisturbed.
 
     Yields:
-        What to call where the block is to be undisturbed without having been interrupted.
+        A function that ends the interruptions.
     """
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
@@ -230,10 +232,10 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def _started(arguments: Sequence[str], name: str | None, place: Namespace, files: ProofFiles) -> Iterator[str]:
-    """A driver that runs as long as the block and captures, and its name.
+    """Run a driver that captures while the block runs, and yield its name.
 
     Raises:
-        DriverError: it does not start; it has said why.
+        DriverError: it does not start; it has printed why.
     """
     more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(files.capture), "--json"]
     process = subprocess.Popen(
@@ -243,7 +245,7 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
         text=True,
         start_new_session=True,  # Ctrl-C ends the walk, which ends it
     )
-    told: dict[str, Any] = {}
+    ready: dict[str, Any] = {}
     is_ready = threading.Event()
 
     def listen() -> None:
@@ -251,7 +253,7 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
         for line in process.stdout:
             event = _event_of(line)
             if event.get("event") == "ready":
-                told.update(event)
+                ready.update(event)
                 is_ready.set()
             elif event.get("event") == "captured":
                 files.captured.update(event)
@@ -260,9 +262,9 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
     thread = threading.Thread(target=listen, daemon=True)
     try:
         thread.start()
-        if not is_ready.wait(_STARTS_WITHIN_S) or not told:
+        if not is_ready.wait(_STARTS_WITHIN_S) or not ready:
             raise DriverError(_why_nothing(files.capture))
-        yield str(told["name"])
+        yield str(ready["name"])
     finally:
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -276,7 +278,7 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
 
 
 def _event_of(line: str) -> dict[str, Any]:
-    """What a driver tells; empty: what its author prints."""
+    """Return an event of the driver; empty for other output of its code."""
     try:
         event = json.loads(line)
     except ValueError:
@@ -286,12 +288,12 @@ def _event_of(line: str) -> dict[str, Any]:
 
 def _why_nothing(capture: Path) -> str:
     if capture.exists():
-        return f"skin-driver publishes nothing; {capture} has what went over its buses: attach it"
+        return f"skin-driver publishes nothing; {capture} holds the frames on its buses: attach it"
     return "skin-driver did not start"
 
 
 class _AtTerminal:
-    """A person, or a program, that reads what is asked for and writes ``skip``."""
+    """Print the steps for a person or a program, and read ``skip``."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
@@ -318,7 +320,7 @@ class _AtTerminal:
         return is_skipped
 
 
-def _tell(proof: Proof, files: ProofFiles, as_json: bool) -> None:
+def _print(proof: Proof, files: ProofFiles, as_json: bool) -> None:
     if as_json:
         print_json({"event": "done", "files": files.written, **proof.as_data()})
         return

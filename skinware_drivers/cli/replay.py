@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 _OF_SERVICES = {"paused": "--paused", "stay": "--stay", "namespace": "--namespace"}
 _LONGEST_SLEEP_S = 0.05
 _FULL_S = 0.1
-"""How long a bus that takes nothing is waited for, before a frame is given up."""
+"""Longest wait for a bus that takes no frame, before the frame is dropped."""
 _PAYLOAD = 64
 
 
 def replay(wire: bool, buses: tuple[str, ...], **options: Any) -> None:
     if not wire:
         if buses:
-            raise click.UsageError("--bus is for --wire")
+            raise click.UsageError("--bus needs --wire")
         click.get_current_context().invoke(frames_command, **options)
         return
     for option, flag in _OF_SERVICES.items():
         if options[option]:
-            raise click.UsageError(f"{flag} is about drivers and services, --wire about what went over buses")
+            raise click.UsageError(f"{flag} is about drivers and services, --wire about frames on buses")
     if options["times"] != "now":
-        raise click.UsageError("--times is about the frames of drivers, --wire about what went over buses")
+        raise click.UsageError("--times is about snapshots of drivers, --wire about frames on buses")
     if not buses:
         file = options["file"]
         raise click.UsageError(
@@ -72,11 +72,11 @@ def _replay_wires(
         sender = WireSender(pairs, speed, start_s, end_s)
         with contextlib.closing(sender), signals_end(sender.stop):
             sender.open()
-            told = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
+            names = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
             if as_json:
-                print_json({"event": "ready", "file": str(file), "buses": told, "duration_s": recording.duration_s})
+                print_json({"event": "ready", "file": str(file), "buses": names, "duration_s": recording.duration_s})
             else:
-                echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in told.items())} (Ctrl-C ends)")
+                echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in names.items())} (Ctrl-C ends)")
             sender.send_all(loop=loop)
         for problem in recording.problems:
             warn(problem)
@@ -88,10 +88,10 @@ def _replay_wires(
 
 
 def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireTrack, Bus]]:
-    """What is sent where.
+    """Return recorded wires, each with the bus to send it on.
 
     Raises:
-        ConfigurationError: a recorded bus is not there, or it is not clear which is meant, or named twice.
+        ConfigurationError: a recorded bus does not exist, is ambiguous, or is named twice.
     """
     from skinware.errors import ConfigurationError
     from skinware.wire import MOST_BYTES
@@ -114,17 +114,17 @@ def _names_recorded(recording: Recording, text: str) -> bool:
 
 
 class WireSender:
-    """Sends what was received on wires onto buses, with the times that it had.
+    """Send recorded frames on buses, at their recorded times.
 
     Args:
         pairs: recorded wires, and unopened buses to send them on.
         speed: 2.0: twice as fast.
-        start_s: where to begin, s since the recording began.
-        end_s: where to end, likewise; None: with the last.
+        start_s: begin, in seconds of the recording.
+        end_s: end, in seconds of the recording; None: with the last frame.
 
     Attributes:
-        sent: frames, or reads of a serial line, of each recorded bus.
-        failed: those that a bus did not take.
+        sent: number of frames, or reads of a serial line, of each recorded bus.
+        failed: number of those that a bus did not take.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class WireSender:
         """Open the buses.
 
         Raises:
-            BusNotAvailable: one is not there.
+            BusNotAvailable: one does not exist.
         """
         for _, bus in self._pairs:
             bus.open()
@@ -157,9 +157,9 @@ class WireSender:
         self._stopping = True
 
     def send_all(self, *, loop: bool = False) -> None:
-        """Send everything, once or again and again, until it is over or ``stop`` is called."""
+        """Send everything once, or in a loop until ``stop`` is called."""
         before = -1
-        while not self._stopping and before < self.sent.total():  # what has no frames is not looped
+        while not self._stopping and before < self.sent.total():  # an empty part is not looped
             before = self.sent.total()
             self._send_once()
             if not loop:
@@ -210,14 +210,12 @@ command: click.Command = click.Command(
     callback=replay,
     params=[
         *frames_command.params,
-        click.Option(
-            ["--wire"], is_flag=True, help="Send what went over buses, if it was recorded, on a --bus instead."
-        ),
+        click.Option(["--wire"], is_flag=True, help="Send the recorded frames of buses on a --bus instead."),
         click.Option(
             ["--bus", "buses"],
             metavar="[RECORDED=]BUS",
             multiple=True,
-            help="With --wire: where to send; if several buses were recorded, one of them: can0=vcan0. Repeat it.",
+            help="With --wire: bus to send on; with several recorded buses, which one: can0=vcan0. Repeat it.",
         ),
     ],
     help=frames_command.help,

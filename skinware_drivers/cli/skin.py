@@ -16,7 +16,7 @@ from skinware_drivers.options.texts import nearest_name
 
 
 class Entry(NamedTuple):
-    """One command: the module that has it, and what it does in a line."""
+    """The module of a command, and its purpose in a line."""
 
     module: str
     summary: str
@@ -24,9 +24,9 @@ class Entry(NamedTuple):
 
 GROUPS: Mapping[str, Mapping[str, Entry]] = {
     "Connect a skin": {
-        "find": Entry("skinware_drivers.cli.find", "show what is plugged in and which driver could use it"),
+        "find": Entry("skinware_drivers.cli.find", "show which devices are plugged in and which driver knows them"),
         "driver": Entry("skinware_drivers.cli.driver", "run a driver: buses into one stream of snapshots"),
-        "doctor": Entry("skinware_drivers.cli.doctor", "look at everything that may be wrong"),
+        "doctor": Entry("skinware_drivers.cli.doctor", "find out what is wrong"),
         "config": Entry("skinware_drivers.cli.config", "change settings of boards"),
         "import": Entry("skinware_drivers.cli.import_", "make configurations from files of other systems"),
     },

@@ -1,8 +1,7 @@
-"""Frames in, updates out: a layout compiled to lookup tables, applied to whole batches.
+"""Frames in, updates out, for whole batches: in numpy, as the specification of what C does.
 
-Every identifier is looked up for all buses at once (``addresses``), the kinds of frame are told apart, the
-members of a cycle are paired (``pairing``), and their payloads read (``frame_kind``). The updates are then shown
-(``skin_state``) when the publisher finds it right.
+The kind and the module of every frame are looked up (``compiled``), the members of a cycle are paired (``pairing``),
+and their payloads are read (``frame_kind``). The updates are shown (``skin_state``) when the publisher decides it.
 
 Nothing on the wire raises here. What cannot be used is counted.
 """
@@ -11,34 +10,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from itertools import repeat
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import Samples
-from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
+from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS
+from skinware_drivers.decoding.compiled import NO_KIND, CompiledLayouts
 from skinware_drivers.decoding.device_stamps import DeviceStamps
-from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
-from skinware_drivers.decoding.groups import Carrier, Groups
+from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.decoding.pairing import CompiledCycle
 from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.layout import Byte, Layout
 from skinware_drivers.numbering import SequenceNumber
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-_NO_KIND = 255
 _EARLIEST_NS = 1
 """CLOCK_MONOTONIC begins with the machine, and 0 means never."""
 _MUCH_HASTE, _NEVER_AGAIN = 200, -(1 << 62)
-"""Frames that come too soon, with no whole cycle between, before somebody is told; and afterwards."""
+"""Frames that come too soon, with no whole cycle between, before a warning is logged; and their number afterwards."""
 
 Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
@@ -46,18 +42,21 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Decoder:
-    """Compiled layouts for one set of tables.
+    """What is known of a skin, and the frames that change it.
+
+    The arrays are shared with C, which decodes in a running driver; ``decode`` does the same in numpy.
 
     Args:
-        layouts: what frames mean, for each bus; None for a bus of which that is not known yet.
-        tables: what is attached to the buses.
-        periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
-            joined whenever they come (as those of fixed bytes in a test).
+        layouts, tables, periods_s: as for :class:`CompiledLayouts`.
 
     Attributes:
-        described: the tables as given.
-        tables: the same with the update groups that follow from the layouts.
+        compiled: what the layouts compile to.
+        tables: what is attached to the buses, with update groups.
+        state: the values and states of the sensors.
         samples: for each bus, some of the frames that could not be used.
+        sequences, device_stamps: the last numbers and the clocks of the devices.
+        haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
+        unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
 
     Raises:
         ConfigurationError: the buses have more kinds of frame than can be told apart.
@@ -66,62 +65,19 @@ class Decoder:
     def __init__(
         self, layouts: Sequence[Layout | None], tables: SkinTables, periods_s: Sequence[float] | None = None
     ) -> None:
-        self.layouts: list[Layout | None] = list(layouts)
-        self.described = tables
-        self.samples: list[Samples] = [Samples() for _ in layouts]
-        structure = tables.structure
+        self.compiled = CompiledLayouts(layouts, tables, periods_s)
+        self.tables: SkinTables = self.compiled.tables
+        structure = self.tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
-        self.frames: list[Frame] = []
-        # different layouts (and periods), and the number of the first kind of each
-        first_of: list[tuple[Layout, float | None, int]] = []
-        kinds_of_bus = []
-        for layout, period_s in zip(layouts, periods_s or repeat(None), strict=False):
-            if layout is None:
-                kinds_of_bus.append(range(0))
-                continue
-            first = next((first for *known, first in first_of if known == [layout, period_s]), None)
-            if first is None:
-                first = len(self.frames)
-                first_of.append((layout, period_s, first))
-                self.frames += layout.frames
-            kinds_of_bus.append(range(first, first + len(layout.frames)))
-        if len(self.frames) > MOST_FRAMES:
-            raise ConfigurationError(
-                f"the buses have {len(self.frames)} kinds of frame, a driver takes {MOST_FRAMES}: run several drivers"
-            )
-        self.addresses = Addresses(self.frames, kinds_of_bus, tables)
-        self.kinds = [FrameKind(frame, tables) for frame in self.frames]
-        # frames whose payload may name the module; if the identifier does, to no avail, it is just unknown
-        by_payload = np.array([kind.module_by_byte is not None for kind in self.kinds], bool)
-        self.payload_names: Flags = self.addresses.sets @ by_payload
-        self._compile_assemblies(first_of)
-        longest = max((max(frame.length) for frame in self.frames), default=0)
-        # by kind (the last row: right for any frame) and length (the last column: all that are longer than any)
-        self.length_ok = np.zeros((256, max(256, longest + 2)), bool)
-        for kind, frame in enumerate(self.frames):
-            self.length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
-        self.header = self._compile_header()
         self.state: SkinState = SkinState(self.tables)
-        self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
+        self.samples: list[Samples] = [Samples() for _ in layouts]
         self.sequences = Sequences(structure)
         self.haste = np.zeros(self._n_patches, np.int64)
-        self.device_stamps: DeviceStamps = DeviceStamps(self.frames, structure)
-        self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
-            (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
-        )
-
-    def columns_of(self, kind: int) -> slice:
-        """Where the values of a kind of frame are among those of its update."""
-        if kind in self.alone:
-            return self.alone[kind].columns[0]
-        return next(c.assembly.columns[c.members.index(kind)] for c in self.cycles if kind in c.members)
-
-    @property
-    def headroom(self) -> int:
-        """Rows that a batch must keep free in front for frames that wait for their partners."""
-        longest = max((len(cycle.members) for cycle in self.cycles), default=1)
-        return max(self._n_modules, self._n_patches) * (longest - 1)
+        self.device_stamps: DeviceStamps = DeviceStamps(self.compiled.frames, structure)
+        shape = len(structure.buses), STANDARD_IDENTIFIERS
+        self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(shape, np.int64)
+        self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
 
     def put_back(self, batch: FrameBatch) -> None:
         """Empty a batch, except for the frames that still wait for their partners, which come first."""
@@ -157,18 +113,18 @@ class Decoder:
         is_foreign[wrong] = False
         foreign = np.flatnonzero(is_foreign)
         parts = []
-        for number, assembly in self.alone.items():
+        for number, assembly in self.compiled.alone.items():
             rows = np.flatnonzero((kind == number) & is_module)
             if len(rows):
                 parts.append(self._read(assembly, batch, rows[:, None], entry[rows]))
-                self._compare(self.frames[number].sequence, payload[rows], entry[rows])
+                self._compare(self.compiled.frames[number].sequence, payload[rows], entry[rows])
         severed = np.zeros(len(bus), bool)
         if interrupted:
             severed[: new.start] = np.isin(bus[: new.start], interrupted)
-        for cycle in self.cycles:
+        for cycle in self.compiled.cycles:
             parts += self._pair(batch, cycle, entry, is_module, kind, severed)
         if not parts:
-            return self._no_updates, foreign + first
+            return self._no_updates(), foreign + first
         updates = Updates.join([part for part, _ in parts])
         newest_ns = updates.newest_ns
         if len(parts) > 1:
@@ -185,10 +141,10 @@ class Decoder:
         """
         wire, bus = batch.wire[batch.start : batch.stop], batch.bus[batch.start : batch.stop]
         payload = wire["payload"]
-        slots = self.addresses.slots(bus, wire["identifier"])
-        entry = self.addresses.entry[slots]
+        slots = self.compiled.addresses.slots(bus, wire["identifier"])
+        entry = self.compiled.addresses.entry[slots]
         kind, wrong = self._tell_kinds(slots, entry, wire, bus)
-        for number, compiled in enumerate(self.kinds):
+        for number, compiled in enumerate(self.compiled.kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
                 entry[rows] = compiled.name_modules(entry[rows], payload[rows])
@@ -198,7 +154,7 @@ class Decoder:
         """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""
         self.sequences.forget(patch)
         self.device_stamps.forget(patch)
-        for cycle in self.cycles:
+        for cycle in self.compiled.cycles:
             cycle.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
@@ -222,64 +178,6 @@ class Decoder:
                 if samples.wants(why):
                     samples.take(why, wire[rows[bus[rows] == ordinal]])
 
-    # -- compiling ----------------------------------------------------------------------------------------------
-
-    def _compile_assemblies(self, layouts: Sequence[tuple[Layout, float | None, int]]) -> None:
-        cycles: list[tuple[Cycle, list[int], float | None]] = []
-        for layout, period_s, first in layouts:
-            number_of = {frame.name: first + number for number, frame in enumerate(layout.frames)}
-            cycles += [(cycle, [number_of[name] for name in cycle.members], period_s) for cycle in layout.cycles]
-        in_cycles = {number for _, members, _ in cycles for number in members}
-        alone = [number for number in range(len(self.frames)) if number not in in_cycles]
-        made_of = [[number] for number in alone] + [members for _, members, _ in cycles]
-        width = max((sum(len(self.kinds[number].channels) for number in members) for members in made_of), default=0)
-        period_of: list[float] = [0.0 for _ in alone]
-        period_of += [own_s if (own_s := cycle.period_s or 0.0) > (bus_s or 0.0) else 0.0 for cycle, _, bus_s in cycles]
-        carriers = [self._carrier(members, period_s) for members, period_s in zip(made_of, period_of, strict=True)]
-        groups = Groups(self.described, carriers)
-        self.tables = groups.tables
-        made = [
-            Assembly([self.kinds[n] for n in members], self.tables, width, own)
-            for members, own in zip(made_of, groups.of_carrier, strict=True)
-        ]
-        self.alone = dict(zip(alone, made, strict=False))
-        of_cycles = iter(made[len(alone) :])
-        self.cycles = [
-            CompiledCycle(cycle, self.frames, members, next(of_cycles), self.tables, period_s)
-            for cycle, members, period_s in cycles
-        ]
-        self.width = width
-        empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
-        self.most_groups = made[0].groups.shape[1] if made else 1
-        no_groups = np.zeros((0, self.most_groups), np.int64)
-        self._no_updates = Updates(none, no_groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
-
-    def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
-        """What an update that is made of some kinds of frame can be of."""
-        modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
-        declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
-        longest_s = max([*declared_s, period_s])
-        channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
-        return Carrier(sorted(modules), channels, longest_s or None)
-
-    def _compile_header(self) -> tuple[int, Bytes] | None:
-        """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
-        conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self.frames]
-        if not conditions or not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
-            return None
-        if len({(c[0].offset) for c in conditions}) > 1 or len({c[0].value for c in conditions}) < len(conditions):
-            return None
-        if not self.addresses.sets[1:].all():
-            return None  # which kinds it can be depends on bus and identifier
-        offset = conditions[0][0].offset
-        table = np.full((256, self.length_ok.shape[1]), _NO_KIND, np.uint8)
-        for number, (frame, condition) in enumerate(zip(self.frames, conditions, strict=True)):
-            # what lies behind the end of a payload means nothing
-            table[condition[0].value, [length for length in frame.length if length > offset]] = number
-        return offset, table
-
-    # -- decoding -----------------------------------------------------------------------------------------------
-
     def _tell_kinds(
         self, slots: Indices, entry: Indices, wire: npt.NDArray[np.void], bus: npt.NDArray[np.uint16]
     ) -> tuple[Bytes, Indices]:
@@ -288,23 +186,26 @@ class Decoder:
         Those are counted here.
         """
         n_buses, payload = len(self.state.bus_counters), wire["payload"]
-        length = np.minimum(wire["length"], self.length_ok.shape[1] - 1)
+        length = np.minimum(wire["length"], self.compiled.length_ok.shape[1] - 1)
         ours = entry < self._n_modules + self._n_patches
-        if self.header is not None:
-            at, table = self.header
+        if self.compiled.header is not None:
+            at, table = self.compiled.header
             kind = table[payload[:, at], length]
-            kind[~ours] = _NO_KIND
+            kind[~ours] = NO_KIND
         else:
             kind = self._match_kinds(slots, payload, length)
-        wrong = kind == _NO_KIND
+        wrong = kind == NO_KIND
         wrong &= ours
         rows = np.flatnonzero(wrong)
         if len(rows):
-            rows = rows[(entry[rows] < self._n_modules) | self.payload_names[self.addresses.candidates[slots[rows]]]]
+            rows = rows[
+                (entry[rows] < self._n_modules)
+                | self.compiled.payload_names[self.compiled.addresses.candidates[slots[rows]]]
+            ]
             likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
             ours_too = self._name_known_modules(likely, entry[rows], payload[rows], length[rows])
             rows, likely = rows[ours_too], likely[ours_too]
-            is_length = ~self.length_ok[likely, length[rows]]
+            is_length = ~self.compiled.length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
             self.keep_samples(Unused.BAD_LENGTH, bus, wire, rows[is_length])
@@ -313,7 +214,7 @@ class Decoder:
 
     def _name_known_modules(self, kind: Bytes, entry: Indices, payload: Bytes, length: Bytes) -> Flags:
         known = np.ones(len(kind), bool)
-        for number, compiled in enumerate(self.kinds):
+        for number, compiled in enumerate(self.compiled.kinds):
             bits = compiled.frame.module_byte
             if bits is not None and bits.byte is not None:
                 rows = np.flatnonzero((kind == number) & (length > bits.byte))
@@ -322,17 +223,17 @@ class Decoder:
 
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
         """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
-        kind = np.full(len(slots), _NO_KIND, np.uint8)
-        candidates = self.addresses.candidates[slots]
-        for number, frame in enumerate(self.frames):
-            match = self.addresses.sets[:, number][candidates]
+        kind = np.full(len(slots), NO_KIND, np.uint8)
+        candidates = self.compiled.addresses.candidates[slots]
+        for number, frame in enumerate(self.compiled.frames):
+            match = self.compiled.addresses.sets[:, number][candidates]
             for condition in frame.when:
                 if isinstance(condition, Byte):
                     match &= payload[:, condition.offset] & condition.mask == condition.value
                     match &= length > condition.offset
             kind[match] = number
         if check_length:
-            kind[~self.length_ok[kind, length]] = _NO_KIND
+            kind[~self.compiled.length_ok[kind, length]] = NO_KIND
         return kind
 
     def _pair(
@@ -386,8 +287,8 @@ class Decoder:
         self, assembly: Assembly, batch: FrameBatch, rows: Indices, module: Indices, whole: Flags | None = None
     ) -> tuple[Updates, Indices]:
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        values = np.zeros((len(rows), self.width), self.state.values.dtype)
-        status = np.zeros((len(rows), self.width), np.uint8)
+        values = np.zeros((len(rows), self.compiled.width), self.state.values.dtype)
+        status = np.zeros((len(rows), self.compiled.width), np.uint8)
         if whole is None:
             whole = np.ones(len(rows), bool)
         sensors, unreadable = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
@@ -424,3 +325,8 @@ class Decoder:
         if sequence is not None and len(module):
             for counter, found in enumerate(self.sequences.compare(sequence, payload, module), start=3):
                 self.state.patch_counters[:, counter] += found
+
+    def _no_updates(self) -> Updates:
+        empty, none = np.zeros((0, self.compiled.width), np.int64), np.zeros(0, np.int64)
+        groups = np.zeros((0, self.compiled.most_groups), np.int64)
+        return Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)

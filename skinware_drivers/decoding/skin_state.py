@@ -90,70 +90,95 @@ class Updates:
 
 
 class SkinState:
-    """Private arrays, copied into the ring at publication.
+    """What is known of the skin; copied into the ring at publication.
+
+    Arrays have one element more than there are sensors, groups or patches: values that belong nowhere go there, which
+    is cheaper than to sort them out.
 
     Attributes:
-        values: (n_sensors,) of the structure's dtype.
-        status: (n_sensors,) uint8, what the wire said of each sensor.
-        group_time_ns: (n_groups,) int64, oldest stamp among the frames shown for an update group; 0 = never.
-        updated: (n_groups,) bool, shown since the last publication.
-        touched: (n_groups,) bool, heard since then, if only in part.
+        all_values: (n_sensors + 1,) of the structure's dtype.
+        all_status: (n_sensors + 1,) uint8, what the wire said of each sensor.
+        all_group_time_ns: (n_groups + 1,) int64, oldest stamp among the frames shown for an update group; 0: never.
+        all_updated: (n_groups + 1,) bool, shown since the last publication.
+        all_touched: (n_groups + 1,) bool, heard since then, if only in part.
+        all_patch_time_ns: (n_patches + 1,) int64, newest stamp of a complete update of a prompt group; 0: never.
+        group_patch: (n_groups,) the patch of each group.
         is_prompt: (n_groups,) bool: updated in every period, so that frames wait for it.
-        patch_time_ns: (n_patches,) int64, newest stamp of a complete update of a prompt group; 0 = never.
         newest_ns: newest stamp of all.
         bus_counters: (n_buses, len(BUS_COUNTERS)) int64.
         patch_counters: (n_patches, len(PATCH_COUNTERS)) int64.
     """
 
     def __init__(self, tables: SkinTables) -> None:
-        structure = tables.structure
-        # one element more than there is: it takes what belongs nowhere, which is cheaper than to sort it out
-        self.values_and_sink = np.zeros(structure.n_sensors + 1, structure.dtype)
-        self.status_and_sink = np.full(structure.n_sensors + 1, int(Status.NEVER_SEEN), np.uint8)
-        self._group_time_ns = np.zeros(structure.n_groups + 1, np.int64)
-        self._updated = np.zeros(structure.n_groups + 1, bool)
-        self._touched = np.zeros(structure.n_groups + 1, bool)
-        self._patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
-        self.values: npt.NDArray[Any] = self.values_and_sink[:-1]
-        self.status: npt.NDArray[np.uint8] = self.status_and_sink[:-1]
-        self.group_time_ns: npt.NDArray[np.int64] = self._group_time_ns[:-1]
-        self.updated: npt.NDArray[np.bool_] = self._updated[:-1]
-        self.patch_time_ns: npt.NDArray[np.int64] = self._patch_time_ns[:-1]
-        self.touched: npt.NDArray[np.bool_] = self._touched[:-1]
+        structure = self._structure = tables.structure
+        self.all_values = np.zeros(structure.n_sensors + 1, structure.dtype)
+        self.all_status = np.full(structure.n_sensors + 1, int(Status.NEVER_SEEN), np.uint8)
+        self.all_group_time_ns = np.zeros(structure.n_groups + 1, np.int64)
+        self.all_updated = np.zeros(structure.n_groups + 1, bool)
+        self.all_touched = np.zeros(structure.n_groups + 1, bool)
+        self.all_patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
+        self.group_patch = structure.group_patch.astype(np.intp)
+        self._prompt_patch = np.append(self.group_patch, structure.n_patches)
         self.is_prompt: npt.NDArray[np.bool_] = np.ones(structure.n_groups, bool)
         self.newest_ns: int = 0
-        self._group_period_ns = structure.group_period_ns
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
         self._status_is_zero = False
-        self._nobody, self._no_patch = structure.n_groups, structure.n_patches
-        self.group_patch = structure.group_patch.astype(np.intp)
-        self._patch = np.append(self.group_patch, self._no_patch)
-        self._first_group = np.searchsorted(structure.group_module, np.arange(structure.n_modules))
+
+    @property
+    def values(self) -> npt.NDArray[Any]:
+        """(n_sensors,) of the structure's dtype."""
+        return self.all_values[:-1]
+
+    @property
+    def status(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8."""
+        return self.all_status[:-1]
+
+    @property
+    def group_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_groups,) int64."""
+        return self.all_group_time_ns[:-1]
+
+    @property
+    def updated(self) -> npt.NDArray[np.bool_]:
+        """(n_groups,) bool."""
+        return self.all_updated[:-1]
+
+    @property
+    def touched(self) -> npt.NDArray[np.bool_]:
+        """(n_groups,) bool."""
+        return self.all_touched[:-1]
+
+    @property
+    def patch_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_patches,) int64."""
+        return self.all_patch_time_ns[:-1]
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:
         """(n_modules,) int64, the oldest of the times of each module's groups."""
-        return np.minimum.reduceat(self.group_time_ns, self._first_group)
+        first_group = np.searchsorted(self._structure.group_module, np.arange(self._structure.n_modules))
+        return np.minimum.reduceat(self.group_time_ns, first_group)
 
     def settle_pace(self, period_ns: int) -> None:
-        """Take groups whose own period is much longer than the driver's as not prompt."""
-        self.is_prompt[:] = self._group_period_ns <= period_ns * _PROMPT
-        self._patch[:-1] = np.where(self.is_prompt, self.group_patch, self._no_patch)
+        """Count groups whose own period is much longer than the driver's as not prompt."""
+        self.is_prompt[:] = self._structure.group_period_ns <= period_ns * _PROMPT
+        self._prompt_patch[:-1] = np.where(self.is_prompt, self.group_patch, self._structure.n_patches)
 
     def show(self, updates: Updates) -> None:
         """Show updates. Of several for one module, the last one stays."""
         if not len(updates):
             return
-        shown = np.where(updates.whole[:, None], updates.groups, self._nobody)
-        self.values_and_sink[updates.sensors] = updates.values
+        shown = np.where(updates.whole[:, None], updates.groups, self._structure.n_groups)
+        self.all_values[updates.sensors] = updates.values
         if updates.flagged or not self._status_is_zero:
-            self.status_and_sink[updates.sensors] = updates.status
+            self.all_status[updates.sensors] = updates.status
             self._status_is_zero = not updates.flagged and not self.status.any()
-        self._group_time_ns[shown] = updates.oldest_ns[:, None]
-        self._updated[shown] = True
-        self._touched[updates.groups] = True
-        self._patch_time_ns[self._patch[shown[:, 0]]] = updates.newest_ns
+        self.all_group_time_ns[shown] = updates.oldest_ns[:, None]
+        self.all_updated[shown] = True
+        self.all_touched[updates.groups] = True
+        self.all_patch_time_ns[self._prompt_patch[shown[:, 0]]] = updates.newest_ns
         self.newest_ns = max(self.newest_ns, int(updates.newest_ns[-1]))
 
     def begin_frame(self) -> None:

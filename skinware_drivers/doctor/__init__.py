@@ -1,6 +1,6 @@
-"""What may be wrong with a skin and with the machine that reads it: seen once, judged field by field (``skin-doctor``).
+"""Find out what is wrong with a skin and with the machine that reads it (``skin-doctor``).
 
-What is seen is :class:`skinware_drivers.doctor.evidence.Evidence`, of a running skin or of a recording. The modules
-``interfaces``, ``permissions``, ``buses``, ``patches``, ``timing``, ``taxels``, ``files`` and ``machine`` have one
-function each, ``check``, which yields what it makes of that. ``examining`` calls them all.
+:mod:`looking` and :mod:`recorded` gather :class:`evidence.Evidence` of a running skin and of a recording. The modules
+``buses``, ``patches``, ``programs``, ``taxels``, ``files`` and ``machine`` hold the rules, as tables of texts and
+advice, and the checks that apply them. :mod:`examining` runs all checks.
 """

@@ -1,7 +1,4 @@
-"""What the frames of one driver tell, one after the other: counters that grow, states that change, times that jump.
-
-The frames may come from a running driver or from a recording.
-"""
+"""Sum up the snapshots of one driver, running or recorded: counters, states, times, and the health of its taxels."""
 
 from __future__ import annotations
 
@@ -14,17 +11,24 @@ import numpy.typing as npt
 
 from skinware.driver_service import counters_of
 from skinware.driver_snapshot import DriverSnapshot
+from skinware.errors import ConfigurationError
+from skinware.matrices import filled_by
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware.samples import sample_report, sample_text
 from skinware.state import bus_reason_name, bus_state_name, count_statuses, patch_state_name
 from skinware.status import Status, load_report
 from skinware.structure import Structure
-from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, PatchSeen
-from skinware_drivers.doctor.judging import whole_lines
+from skinware.tactile.chain import ChainSettings
+from skinware.tactile.chain_health import ChainHealth
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, HealthSeen, PatchSeen, TaxelFault
 
 _HOUR_S = 3600
 _MOST_CHANGES = 500
 _MOST_NAMES = 3
+_JUDGE_EVERY_NS = 45_000_000
+"""Snapshots at a higher rate say nothing more of a taxel's health."""
+_STUCK_S = 600.0
 _BAD = np.uint8(Status.SUSPECT | Status.NOT_CONNECTED | Status.NO_ACK)
 
 Numbers = npt.NDArray[np.int64]
@@ -32,7 +36,7 @@ Tables = Mapping[str, npt.NDArray[Any]]
 
 
 class _Growth:
-    """Counters of all buses or patches: what they began with, and by how much they grew."""
+    """The growth of the counters of all buses or patches."""
 
     def __init__(self, names: list[str], counts: npt.NDArray[np.uint64]) -> None:
         self.names = names
@@ -41,7 +45,7 @@ class _Growth:
         self.hours: dict[int, Numbers] = {}
 
     def follow(self, counts: npt.NDArray[np.uint64], time_s: float) -> None:
-        """The next frame's; a counter that is smaller than before began at 0 again."""
+        """Add the counters of the next snapshot; one that is smaller than before has begun at 0 again."""
         now = counts.astype(np.int64)
         by = np.where(now >= self.now, now - self.now, now)
         self.now = now
@@ -52,26 +56,24 @@ class _Growth:
 
     def counted(self, row: int, *, by_hour: bool) -> Counted:
         hours = sorted(self.hours.items()) if by_hour else ()
-        return Counted(
-            self._named(self.now[row]),
-            self._named(self.grown[row]),
-            tuple((hour, self._named(counts[row])) for hour, counts in hours if counts[row].any()),
-        )
 
-    def _named(self, row: Numbers) -> dict[str, int]:
-        return dict(zip(self.names, row.tolist(), strict=True))
+        def named(counts: Numbers) -> dict[str, int]:
+            return dict(zip(self.names, counts[row].tolist(), strict=True))
+
+        by_hours = tuple((hour, named(counts)) for hour, counts in hours if counts[row].any())
+        return Counted(named(self.now), named(self.grown), by_hours)
 
 
 @dataclass
 class DriverLog:
-    """Follows the frames of one structure of a driver.
+    """Sum up the snapshots of one structure of a driver.
 
     Args:
         structure: of the driver.
-        by_hour: losses are told by the hour.
+        by_hour: count losses by the hour.
 
     Attributes:
-        frames: that were taken.
+        frames: number of snapshots.
         newest: the last one; None before the first.
         future_ns, backwards, longest_gap_s: see :class:`skinware_drivers.doctor.evidence.Timing`.
     """
@@ -96,12 +98,12 @@ class DriverLog:
         self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
 
     def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
-        """Take in the next frame.
+        """Add a snapshot.
 
         Args:
-            frame: it, of this structure.
+            frame: the snapshot, of this structure.
             tables: static columns of its generation.
-            time_s: when it was published, since somebody began to look.
+            time_s: when it was published, since the look began.
         """
         bus_names, bus_counts = counters_of(frame, tables, "bus", len(self.structure.buses))
         patch_names, patch_counts = counters_of(frame, tables, "patch", self.structure.n_patches)
@@ -137,17 +139,17 @@ class DriverLog:
         for row, state in enumerate(frame.patch_state.tolist()):
             self._note_state(("patch", row), Change(time_s, patch_state_name(state)))
 
-    def _note_state(self, who: tuple[str, int], now: Change) -> None:
-        states = self._states.setdefault(who, [])
+    def _note_state(self, part: tuple[str, int], now: Change) -> None:
+        states = self._states.setdefault(part, [])
         if not states or (states[-1].state, states[-1].reason) != (now.state, now.reason):
             if len(states) == _MOST_CHANGES:
                 del states[1]
             states.append(now)
 
-    # -- what came of it ----------------------------------------------------------------------------------------
+    # -- the sum ------------------------------------------------------------------------------------------------
 
     def buses(self) -> tuple[BusSeen, ...]:
-        """Its buses, as the newest frame has them; none before the first."""
+        """Return the buses in the newest snapshot; none before the first."""
         frame = self.newest
         if frame is None or self._buses is None:
             return ()
@@ -171,11 +173,11 @@ class DriverLog:
         return tuple(found)
 
     def patches(self, status: npt.NDArray[np.uint8], at_ns: int) -> tuple[PatchSeen, ...]:
-        """Its patches, likewise.
+        """Return the patches in the newest snapshot; none before the first.
 
         Args:
             status: (n_sensors,) of the sensors at the end.
-            at_ns: when that is, CLOCK_MONOTONIC.
+            at_ns: time of the end, CLOCK_MONOTONIC.
         """
         frame, structure = self.newest, self.structure
         if frame is None or self._patches is None:
@@ -205,9 +207,9 @@ class DriverLog:
         )
 
     def affected(self, status: npt.NDArray[np.uint8]) -> tuple[dict[str, int], dict[str, tuple[str, ...]]]:
-        """Sensors by status, and the names of the first few of each but ``fresh``, and of modules that are dark.
+        """Return the numbers of sensors by status, and the names of the first few with each status but ``fresh``.
 
-        A sensor that was out of range for a while was pressed hard: only those that always are count as such.
+        A sensor that was out of range for a while was pressed hard: only sensors that always were are counted.
 
         Args:
             status: (n_sensors,) of the sensors at the end.
@@ -227,12 +229,12 @@ class DriverLog:
         return counts, names
 
     def lines(self) -> tuple[str, ...]:
-        """Names of the rows and columns of matrices of which nothing good came, in no frame; of dark ones, none."""
+        """Return the names of rows and columns of matrices that were good in no snapshot, without dark modules."""
         dark = self._dark_modules()[self.structure.sensor_module]
         return whole_lines(self.structure, ((self._always & _BAD) != 0) & ~dark) if self.frames else ()
 
     def dark(self) -> dict[str, int]:
-        """The modules that sent nothing but 0, if the driver says so, with how many of their sensors are suspect."""
+        """Return the modules that have sent nothing but 0, with the number of their sensors that are suspect."""
         suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
         sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
         dark = np.flatnonzero(self._dark_modules()).tolist()
@@ -243,3 +245,102 @@ class DriverLog:
         found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
         found[self.structure.sensor_module[~is_dark]] = False
         return found if self.newest is None else found | self.newest.module_untouched
+
+
+def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return the names of rows, columns (counted from 0) and matrices without a good sensor.
+
+    Args:
+        structure: its modules are matrices if their kind says so: ``12x32``.
+        bad: (n_sensors,) bool.
+    """
+    found: list[str] = []
+    for module, name in enumerate(structure.module_names):
+        kind = structure.module_kind[module].decode()
+        index = np.arange(structure.n_sensors)[structure.module_index(module)]
+        for type_id in np.unique(structure.sensor_type[index]).tolist():
+            of_type = bad[index[structure.sensor_type[index] == type_id]]
+            shape = filled_by(kind, len(of_type))
+            if shape is not None:
+                found += [f"{line} of {name}" for line in _lines(of_type.reshape(shape))]
+    return tuple(dict.fromkeys(found))
+
+
+def _lines(bad: npt.NDArray[np.bool_]) -> list[str]:
+    if bad.all():
+        return ["all"]
+    if 1 in bad.shape:
+        return []
+    rows, columns = (np.flatnonzero(bad.all(axis=axis)).tolist() for axis in (1, 0))
+    return [*(f"row {row}" for row in rows), *(f"column {column}" for column in columns)]
+
+
+class TaxelJudge:
+    """Judge the health of the taxels of one structure by its snapshots.
+
+    Args:
+        structure: of the driver.
+        driver: name of the driver.
+    """
+
+    def __init__(self, structure: Structure, driver: str) -> None:
+        self._structure = structure
+        self._first_ns = self._due_ns = self._last_ns = 0
+        self._why_not = ""
+        self._values: npt.NDArray[np.float32] = np.zeros(structure.n_sensors, np.float32)
+        self._status: npt.NDArray[np.uint8] = np.zeros(structure.n_sensors, np.uint8)
+        try:
+            self._chain = ChainSettings.calm().chain(structure)
+        except ConfigurationError:
+            self._why_not = "its sensors have no value of rest"
+            return
+        self._health = ChainHealth(self._chain, driver)
+
+    def take(self, frame: DriverSnapshot) -> None:
+        """Add a snapshot, unless it comes too soon after the one before."""
+        if self._why_not or frame.acquired_ns < self._due_ns:
+            return
+        self._first_ns = self._first_ns or frame.acquired_ns
+        self._last_ns, self._due_ns = frame.acquired_ns, frame.acquired_ns + _JUDGE_EVERY_NS
+        with np.errstate(all="ignore"):  # values may be any that a file or a device gives
+            self._chain.step(frame, self._values, self._status)
+            self._health.update(frame.acquired_ns)
+
+    def seen(self) -> HealthSeen:
+        if self._why_not or not self._health:
+            return HealthSeen("", 0, (), {"health": self._why_not or "no sensor can be judged"})
+        faults: list[TaxelFault] = []
+        with np.errstate(all="ignore"):
+            reports = self._health.reports()
+        known_noise = untouched = judged = 0
+        for name, report in reports.items():
+            positions = np.arange(self._structure.n_sensors)[self._structure.index(name)]
+            faults += taxel_faults(self._structure, positions, report)
+            judged += len(positions)
+            known_noise += int(np.isfinite(report.noise).sum())
+            untouched += int((report.kind == HealthKind.NEVER_TOUCHED).sum())
+        missing = {}
+        seconds = (self._last_ns - self._first_ns) / 1e9
+        if not known_noise:
+            missing["noisy and clipped taxels"] = f"that takes 10 s without a touch, and these were {seconds:.0f} s"
+        if seconds < _STUCK_S:
+            missing["stuck taxels"] = f"that takes {_STUCK_S / 60:.0f} min of use, and these were {seconds:.0f} s"
+        if untouched or not faults:
+            missing["dead and weak taxels"] = f"nothing has touched {untouched:,} of {judged:,} meanwhile"
+        return HealthSeen("these frames", judged, tuple(faults), missing)
+
+
+def taxel_faults(
+    structure: Structure, positions: npt.NDArray[np.int64], report: HealthReport
+) -> tuple[TaxelFault, ...]:
+    """Return the faulty taxels of a report on the sensors at some positions of a structure."""
+    units = {sensor_type.id: sensor_type.unit for sensor_type in structure.types}
+    rows = np.flatnonzero(report.faulty).tolist()
+    return tuple(
+        TaxelFault(
+            structure.sensor_name(position),
+            HealthKind(int(report.kind[row])).name.lower(),
+            report.evidence(row, units[int(structure.sensor_type[position])]),
+        )
+        for row, position in zip(rows, positions[rows].tolist(), strict=True)
+    )

@@ -1,4 +1,4 @@
-"""What was seen of a skin and of the machine that reads it, gathered once; every check looks at the same."""
+"""Everything that was seen of a skin and of the machine that reads it: gathered once, for all checks."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Counted:
     """Counters of a bus, a patch or an interface.
 
     Attributes:
-        total: since it was made (of a driver: since it was started).
-        grown: while somebody looked; of a recording, in all of it.
-        hours: of a recording, in each hour that has data: (hours since it began, what was counted).
+        total: since it exists; counters of a driver: since it was started.
+        grown: during the look, or in the whole recording.
+        hours: (hour, growth) for each hour of a recording that has data; the first hour is 0.
     """
 
     total: Counts
@@ -35,9 +35,9 @@ class Change:
     """A change of state.
 
     Attributes:
-        time_s: since somebody began to look; of a recording, since it began.
+        time_s: since the look or the recording began.
         state: from then on.
-        reason: for it; empty: none was told.
+        reason: of the state; empty: none.
     """
 
     time_s: float
@@ -50,13 +50,13 @@ class BusSeen:
     """A bus of a driver.
 
     Attributes:
-        name: as the driver was told.
+        name: as given to the driver.
         state, reason: at the end, in the words of ``skin-info``; reason ``""``: none.
-        since_s: for how long; None: not told.
-        load: 0 to 1; None: not known. Of a recording, the highest.
+        since_s: age of the state; None: unknown.
+        load: 0 to 1, in a recording the highest; None: unknown.
         counted: its counters.
-        samples: texts of frames that were not used, the newest few.
-        changes: of its state, the first one is what it was at the beginning.
+        samples: texts of the newest few frames that were not used.
+        changes: of its state; the first one is the state at the beginning.
     """
 
     name: str
@@ -77,12 +77,13 @@ class PatchSeen:
         name: for people.
         bus: name of its bus.
         state: at the end, in the words of ``skin-info``.
-        sensors, modules, fresh: how many it has, and how many of its sensors are fresh at the end.
-        age_ns: of its newest data at the end; None: it never sent.
+        sensors, modules: their numbers.
+        fresh: number of sensors that are fresh at the end.
+        age_ns: age of its newest data at the end; None: it never sent any.
         counted: its counters.
-        interval: time between two updates of a module, while somebody looked.
-        delay: age of an update when it was published, likewise.
-        changes: of its state, the first one is what it was at the beginning.
+        interval: times between two updates of a module, during the look.
+        delay: ages of updates when they were published, during the look.
+        changes: of its state; the first one is the state at the beginning.
     """
 
     name: str
@@ -100,12 +101,12 @@ class PatchSeen:
 
 @dataclass(frozen=True)
 class TaxelFault:
-    """A taxel that the judge of health calls faulty.
+    """A faulty taxel.
 
     Attributes:
         name: for people.
         kind: ``dead``, ``stuck``, ``noisy``, ``weak`` or ``clipped``.
-        evidence: why, in words.
+        evidence: the reason, in words.
     """
 
     name: str
@@ -115,13 +116,13 @@ class TaxelFault:
 
 @dataclass(frozen=True)
 class HealthSeen:
-    """What is known of the health of a driver's taxels.
+    """The health of a driver's taxels.
 
     Attributes:
-        source: who judged: ``skin-calm`` or what was looked at.
-        judged: how many taxels something is known of.
-        faults: those with a fault.
-        missing: what could not be judged, by kind: why.
+        source: the judge: ``skin-calm`` or ``these frames``.
+        judged: number of taxels of which something is known.
+        faults: the faulty ones.
+        missing: reasons why something could not be judged, by the kind of fault.
     """
 
     source: str
@@ -135,16 +136,15 @@ class Timing:
     """Times of a driver.
 
     Attributes:
-        rate_hz: frames a second; None: not known.
-        period_ns: its nominal period; 0: it has none.
-        missed: periods that it missed while somebody looked.
-        missed_before: and before that.
-        late: how late its periods began, while somebody looked.
-        age: how old the newest data of its frames was when they were published, likewise.
-        future_ns: by how much data was stamped later than its frame was published, at most; 0: never.
-        backwards: how often the times of a module went backwards.
-        before_boot: frames that were stamped before the machine was started.
-        longest_gap_s: longest time between two frames.
+        rate_hz: rate of its snapshots; None: unknown.
+        period_ns: its nominal period; 0: none.
+        missed, missed_before: periods that it missed during the look, and before.
+        late: delays of its periods during the look.
+        age: ages of the newest data when it was published, during the look.
+        future_ns: the most by which data was stamped later than it was published; 0: never.
+        backwards: times that the times of a module went backwards.
+        before_boot: snapshots that were stamped before the machine was started.
+        longest_gap_s: longest time between two snapshots.
     """
 
     rate_hz: float | None
@@ -164,23 +164,22 @@ class DriverSeen:
     """A driver.
 
     Attributes:
-        name, namespace, driver_type: of it.
-        life: ``live``, ``silent``, ``paused``, ``starting``, ``dead``, as ``skin-info`` calls it; of a recording at its
-            end, also ``closed``.
-        pid: of its process; 0: not known.
-        scheduling: how the kernel schedules it, in words; empty: not known.
+        name, namespace, driver_type: of the driver.
+        life: ``live``, ``silent``, ``paused``, ``starting`` or ``dead``, as in ``skin-info``; at the end of a recording
+            also ``closed``.
+        pid: of its process; 0: unknown.
+        scheduling: of its process, in words; empty: unknown.
         data_path: ``native``, ``mixed``, ``python`` or ``not_told``.
-        restarts: how often it came back, while somebody looked.
-        frames: that were seen.
-        frames_lost: that were published and are not in the recording.
+        restarts: during the look, or in the recording.
+        frames: number of snapshots that were seen.
+        frames_lost: number of snapshots that were published and are missing in the recording.
         structure: of its sensors.
-        statuses: sensors by status at the end, ``fresh`` first.
-        affected: names of some sensors of each status but ``fresh``, for people.
-        lines: names of the rows and columns of matrices of which nothing good came.
-        dark: modules that sent nothing but 0 so far, with how many of their sensors are suspect; none of
-            ``lines``.
-        buses, patches: its.
-        timing: its.
+        statuses: number of sensors with each status at the end, ``fresh`` first.
+        affected: names of some sensors of each status but ``fresh``.
+        lines: names of the rows and columns of matrices that were never good.
+        dark: modules that have sent nothing but 0 so far, with the number of their sensors that are suspect; they are
+            not among ``lines``.
+        buses, patches, timing: of the driver.
         health: of its taxels; None: not judged.
     """
 
@@ -210,13 +209,13 @@ class NamespaceSeen:
     """A namespace.
 
     Attributes:
-        name, path: of it.
-        is_ours: it is the one that was asked for.
-        problem: why it cannot be looked at; empty: it can.
-        damaged: files that cannot be read, with the reason.
+        name, path: of the namespace.
+        is_ours: it is the one to examine.
+        problem: the reason why it cannot be read; empty: it can.
+        damaged: errors of files that cannot be read.
         living, dead: names of services whose writer lives, and of those whose writer was killed.
-        bytes_of_dead: what their files take.
-        idle_s: for how long no service has come or gone.
+        bytes_of_dead: size of the files of killed writers.
+        idle_s: time since a service last came or went.
     """
 
     name: str
@@ -232,12 +231,7 @@ class NamespaceSeen:
 
 @dataclass(frozen=True)
 class InterfaceSeen:
-    """A CAN interface of the kernel.
-
-    Attributes:
-        interface: as it was at the end.
-        counted: by the kernel and by the controller.
-    """
+    """A CAN interface of the kernel at the end of the look, and the counters of the kernel and of its controller."""
 
     interface: CanInterface
     counted: Counted
@@ -245,23 +239,23 @@ class InterfaceSeen:
 
 @dataclass(frozen=True)
 class MachineSeen:
-    """The machine and what is installed.
+    """The machine and its software.
 
     Attributes:
         versions: of skinware, Python, numpy ..., by name.
-        kernel: release, and the machine's kind.
-        cpus: that are switched on.
-        load: processes that want one, mean of the last minute.
-        governors: of the processors, each once; empty: they have none, or it is not told.
-        memory_bytes, memory_available_bytes: of the machine; 0: not known.
-        shared_bytes, shared_free_bytes: of /dev/shm; 0: not there.
-        shared_problem: why files cannot be made there; empty: they can.
-        locked_memory_bytes: that this user may lock; -1: any.
-        realtime_priority: the highest that this user may ask for; 0: none.
-        groups: that this process is a member of.
+        kernel: release and processor architecture.
+        cpus: number of processors that this process may use.
+        load: number of processes that are ready to run, mean of the last minute.
+        governors: of the processors, each once; empty: none, or unknown.
+        memory_bytes, memory_available_bytes: of the machine; 0: unknown.
+        shared_bytes, shared_free_bytes: of /dev/shm; 0: it is missing.
+        shared_problem: the reason why files cannot be made in /dev/shm; empty: they can.
+        locked_memory_bytes: the most that this user may lock; -1: unlimited.
+        realtime_priority: the highest that this user may request; 0: none.
+        groups: of this process.
         limits: settings of the kernel, by name: ``net.core.rmem_max``.
-        softnet_dropped: packets that the machine dropped before any socket saw them, while somebody looked.
-        clock_set_s: by how much the wall clock was set, while somebody looked.
+        softnet_dropped: packets that the kernel dropped before any socket, during the look; None: unknown.
+        clock_set_s: change of the wall clock by setting it, during the look.
     """
 
     versions: Mapping[str, str]
@@ -284,11 +278,11 @@ class MachineSeen:
 
 @dataclass(frozen=True)
 class ClockSet:
-    """The wall clock was set, or the machine slept, in a recording.
+    """A jump of the wall clock in a recording, because it was set or the machine slept.
 
     Attributes:
-        time_s: when, since the recording began.
-        by_s: by how much it went on or back.
+        time_s: since the recording began.
+        by_s: size of the jump, forward or back.
     """
 
     time_s: float
@@ -301,16 +295,16 @@ class RecordingSeen:
 
     Attributes:
         name: of the file.
-        size: bytes.
-        duration_s: of it.
-        is_whole: it was ended in good order.
-        problems: what is wrong with it.
-        services: names of what is in it and is no driver.
-        lost: frames that were published meanwhile and are not in it.
-        events: how many there are of each kind: ``restarted``, ``dead`` ...
-        clock_sets: times at which the wall clock jumped.
-        boots: starts of machines that it spans.
-        recorded_by: program and version; empty: not known.
+        size: in bytes.
+        duration_s: length.
+        is_whole: it was closed in good order.
+        problems: errors in it.
+        services: names of the services in it that are not drivers.
+        lost: number of snapshots that were published meanwhile and are missing.
+        events: number of events of each kind: ``restarted``, ``dead`` ...
+        clock_sets: jumps of the wall clock.
+        boots: number of starts of the machine that it spans.
+        recorded_by: program and version; empty: unknown.
     """
 
     name: str
@@ -328,12 +322,12 @@ class RecordingSeen:
 
 @dataclass(frozen=True)
 class ReaderSeen:
-    """A program that reads a driver frame by frame.
+    """A program that reads a driver snapshot by snapshot.
 
     Attributes:
         program, pid: of its process.
-        driver: that it reads.
-        frames, lost: that it took, and that it did not, while somebody looked.
+        driver: name of the driver.
+        frames, lost: number of snapshots that it took and missed during the look.
     """
 
     program: str
@@ -348,19 +342,19 @@ class Evidence:
     """Everything that was seen.
 
     Attributes:
-        seconds: how long somebody looked; of a recording, its length.
-        namespace: that was asked for.
-        drivers: in it, or in the recording.
-        machine: None: of a recording only what is installed here is known.
-        recording: None: the skin was looked at while it ran.
+        seconds: duration of the look, or length of the recording.
+        namespace: the one to examine.
+        drivers: in the namespace or the recording.
+        machine: this one; of the machine that recorded nothing is known.
+        recording: None: a running skin was examined.
         namespaces: on this machine.
-        interfaces: of CAN.
-        kernel_has_can: it does.
-        ports: serial ones.
-        running: living drivers in all namespaces that may be read; without those that publish another one's frames.
+        interfaces: CAN interfaces of the kernel.
+        kernel_has_can: the kernel supports CAN.
+        ports: serial ports.
+        running: living drivers in all namespaces that may be read, without those that publish another driver's data.
         waiting: processes of ``skin-driver`` that have published nothing so far.
-        readers: programs that read the drivers frame by frame.
-        bridges: over which services come into the namespace, and that run.
+        readers: programs that read the drivers snapshot by snapshot.
+        bridges: running bridges that bring services into the namespace.
     """
 
     seconds: float
@@ -379,5 +373,4 @@ class Evidence:
 
     @property
     def is_live(self) -> bool:
-        """Whether the skin was looked at while it ran."""
         return self.recording is None

@@ -1,48 +1,46 @@
-"""All checks, one after the other, and what they found, the worst first."""
+"""Run all checks, and sort what they find."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from skinware.memory.namespace import Namespace
 from skinware.text import printable
-from skinware_drivers.doctor import bridges, buses, files, interfaces, machine, patches, permissions, taxels, timing
+from skinware_drivers.doctor import buses, files, machine, patches, programs, taxels
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked
 
-CHECKS: tuple[Callable[[Evidence], Iterator[Note]], ...] = (
-    interfaces.check,
-    permissions.check,
-    bridges.check,
-    buses.check,
-    patches.check,
-    timing.check,
-    taxels.check,
-    files.check,
-    machine.check,
-)
-"""By the way that data takes."""
+CHECKS: dict[str, Callable[[Evidence], Iterator[Note]]] = {
+    "interfaces": machine.check_interfaces,
+    "permissions": machine.check_permissions,
+    "bridges": programs.check_bridges,
+    "buses": buses.check,
+    "patches": patches.check,
+    "timing": programs.check_timing,
+    "taxels": taxels.check,
+    "files": files.check,
+    "machine": machine.check_machine,
+}
+"""The check of each area, in the order in which data travels."""
 
 _OF_ANY_TIME = ("skin-recover", "skin-driver", "skin-calibrate", "skin-doctor", "pip ")
-
+"""Commands that help with a recording, whose drivers and devices may be gone."""
 _FOLLOWS_NAMESPACE = (
     "skin-calibrate", "skin-calm", "skin-config", "skin-doctor", "skin-driver", "skin-info", "skin-top", "skin-wipe"
 )  # fmt: skip
 
-_NoteT = TypeVar("_NoteT", Finding, Looked, NotLooked)
-
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found.
+    """The result of all checks.
 
     Attributes:
-        findings: the worst first, else by the way that data takes.
-        looked: what was looked at.
-        not_looked: what could not be looked at.
+        findings: the worst first, then in the order in which data travels.
+        looked: what was examined.
+        not_looked: what could not be examined.
     """
 
     findings: tuple[Finding, ...]
@@ -51,37 +49,29 @@ class Examination:
 
 
 def examine(evidence: Evidence) -> Examination:
-    """Run all checks.
+    """Run all checks on what was seen."""
+    notes = [_finished(note, area, evidence) for area, check in CHECKS.items() for note in check(evidence)]
+    return Examination(
+        tuple(sorted((note for note in notes if isinstance(note, Finding)), key=lambda one: -one.severity)),
+        tuple(note for note in notes if isinstance(note, Looked)),
+        tuple(note for note in notes if isinstance(note, NotLooked)),
+    )
 
-    Args:
-        evidence: what was seen.
-    """
-    notes: list[Note] = [_clean(note, evidence) for check in CHECKS for note in check(evidence)]
-    findings = sorted(_of(Finding, notes), key=lambda finding: -finding.severity)  # stable: the order stays
-    return Examination(tuple(findings), tuple(_of(Looked, notes)), tuple(_of(NotLooked, notes)))
 
-
-def _clean(note: Note, evidence: Evidence) -> Note:
-    fits = bool if evidence.is_live else _is_of_any_time
+def _finished(note: Note, area: str, evidence: Evidence) -> Note:
+    """Return a note with its area, printable texts, and the commands that are of use."""
     texts: dict[str, Any] = {name: printable(value) for name, value in vars(note).items() if isinstance(value, str)}
     if not isinstance(note, Looked):
         texts["commands"] = tuple(
-            printable(_in_namespace(command, evidence.namespace)) for command in note.commands if fits(command)
+            printable(_in_namespace(command, evidence.namespace))
+            for command in note.commands
+            if evidence.is_live or command.startswith(_OF_ANY_TIME)
         )
-    return replace(note, **texts)
+    return replace(note, **{**texts, "area": area})
 
 
 def _in_namespace(command: str, namespace: str) -> str:
-    """A command that reaches the namespace that was looked at, also where that is not the default one here."""
+    """Return a command that reaches the namespace that was examined, even if it is not the default here."""
     if not namespace or namespace == Namespace().name or "--namespace" in command:
         return command
     return f"{command} --namespace {shlex.quote(namespace)}" if command.startswith(_FOLLOWS_NAMESPACE) else command
-
-
-def _is_of_any_time(command: str) -> bool:
-    """Whether a command helps who has only a recording; what is in it may be long over."""
-    return command.startswith(_OF_ANY_TIME)
-
-
-def _of(kind: type[_NoteT], notes: list[Note]) -> list[_NoteT]:
-    return [note for note in notes if isinstance(note, kind)]

@@ -1,4 +1,4 @@
-"""Gather the evidence of what runs on this machine now: programs, interfaces, ports, drivers."""
+"""Gather the evidence of a running skin and of this machine."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ import platform
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from skinware.bridge_state import BridgeState
-from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.drivers import Drivers
+from skinware.errors import ConfigurationError, NamespaceError
 from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import ROOT, Namespace
 from skinware.memory.ring import Sample
 from skinware.service import ServiceReader
-from skinware.views.beside import LiveBridges
+from skinware.views.live import LiveBridges
 from skinware_drivers.doctor.evidence import (
     Counted,
     DriverSeen,
@@ -34,17 +36,13 @@ from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.running.news import softnet_dropped
 
 _EVERY_FRAME = "in order"
-"""How readers read that want every frame; others are meant to skip some."""
+"""The kind of readers that want every snapshot; others skip some on purpose."""
 _DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay", "skin-bridge")
 _PROC = Path("/proc")
 
 
 class ReadersWatch:
-    """Looks at the programs that read the drivers of a namespace: now, and at the end of the watch.
-
-    Args:
-        namespace: of the drivers.
-    """
+    """Compare the readers of a namespace's drivers at the beginning and at the end of the look."""
 
     def __init__(self, namespace: Namespace) -> None:
         self._namespace = namespace
@@ -64,28 +62,18 @@ class ReadersWatch:
 
 
 def waiting_drivers(known: set[int], proc: Path = _PROC) -> tuple[int, ...]:
-    """Processes of ``skin-driver`` that publish nothing.
-
-    Args:
-        known: processes of drivers that do.
-        proc: procfs.
-    """
+    """Return the processes of ``skin-driver`` but the ``known`` ones, which publish."""
     found = {int(path.name) for path in proc.glob("[0-9]*") if program_of(int(path.name), proc) == _DRIVER}
     return tuple(sorted(found - known))
 
 
 def publishes_again(pid: int, proc: Path = _PROC) -> bool:
-    """Whether a process has no bus: what it publishes is another driver's, or was once.
-
-    Args:
-        pid: of a driver.
-        proc: procfs.
-    """
+    """Return whether a process publishes the data of another driver or of a recording, and has no bus."""
     return program_of(pid, proc) in _SECOND_HAND
 
 
 def program_of(pid: int, proc: Path = _PROC) -> str:
-    """Name of a process' program; empty if there is no such process."""
+    """Return the name of a process' program; empty if there is no such process."""
     try:
         return (proc / str(pid) / "comm").read_text(errors="replace").strip()
     except OSError:
@@ -116,11 +104,11 @@ _MEMORY = Path("/proc/meminfo")
 
 
 class MachineWatch:
-    """Looks at the machine: now, and at the end of the watch."""
+    """Examine the machine at the beginning and at the end of the look."""
 
     def __init__(self) -> None:
         self._softnet = softnet_dropped()
-        self._clock_s = _clock_offset_s()
+        self._clock_s = time.time() - time.monotonic()
 
     def seen(self) -> MachineSeen:
         softnet, memory = softnet_dropped(), _memory()
@@ -141,7 +129,7 @@ class MachineWatch:
             groups=_groups(),
             limits={name: int(text) for name, path in _LIMITS.items() if (text := _text(path)).lstrip("-").isdigit()},
             softnet_dropped=None if softnet is None or self._softnet is None else softnet - self._softnet,
-            clock_set_s=_clock_offset_s() - self._clock_s,
+            clock_set_s=time.time() - time.monotonic() - self._clock_s,
         )
 
 
@@ -154,12 +142,7 @@ def versions() -> dict[str, str]:
 
 
 def interfaces_seen(before: list[CanInterface], now: list[CanInterface]) -> tuple[InterfaceSeen, ...]:
-    """CAN interfaces, and what was counted on them in between.
-
-    Args:
-        before: as they were at the beginning.
-        now: as they are.
-    """
+    """Return the CAN interfaces with their counters, and the growth of these since ``before``."""
     earlier = {one.name: _counts(one) for one in before}
     found = []
     for one in now:
@@ -172,11 +155,7 @@ def interfaces_seen(before: list[CanInterface], now: list[CanInterface]) -> tupl
 
 
 def namespaces_seen(ours: Namespace) -> tuple[NamespaceSeen, ...]:
-    """All namespaces of this machine, as far as they may be looked at.
-
-    Args:
-        ours: the one that was asked for; it is told first, whether it is there or not.
-    """
+    """Return the namespaces of this machine, first ``ours``, even if it does not exist."""
     names = {folder.name.removeprefix(_PREFIX) for folder in ROOT.glob(f"{_PREFIX}*")} - {ours.name}
     found = [_namespace_seen(ours, is_ours=True)]
     for name in sorted(names):
@@ -189,34 +168,25 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
     path = str(namespace.path)
     if not namespace.path.exists() and not namespace.path.is_symlink():
         return NamespaceSeen(namespace.name, path, is_ours)
-    living: list[str] = []
-    dead: list[str] = []
-    damaged: list[str] = []
-    size = 0
     try:
         namespace.check()
         idle_s = time.time() - namespace.path.stat().st_mtime
-        for name in namespace.services():
-            try:
-                with ServiceReader[Sample](name, namespace=namespace, announce=False) as reader:
-                    (living if reader.alive else dead).append(name)
-                    size += 0 if reader.alive else namespace.ring_path(name).stat().st_size
-            except (BadServiceFile, ConfigurationError) as error:
-                damaged.append(str(error))
-            except (ServiceNotFound, FileNotFoundError):
-                continue  # withdrawn this very moment
+        with Drivers(namespace, partial(ServiceReader[Sample], announce=False)) as services:
+            services.look()
+            if services.trouble:
+                raise NamespaceError(services.trouble)
+            living = tuple(name for name, reader in services.readers.items() if reader.alive)
+            dead = tuple(name for name in services.readers if name not in living)
+            damaged = tuple(services.unreadable.values())
+        files = [namespace.ring_path(name) for name in dead]
+        size = sum(file.stat().st_size for file in files if file.exists())
     except (NamespaceError, OSError) as error:
         return NamespaceSeen(namespace.name, path, is_ours, problem=str(error))
-    return NamespaceSeen(namespace.name, path, is_ours, "", tuple(damaged), tuple(living), tuple(dead), size, idle_s)
+    return NamespaceSeen(namespace.name, path, is_ours, "", damaged, living, dead, size, idle_s)
 
 
 def _counts(one: CanInterface) -> dict[str, int]:
     return {**one.statistics, **{f"controller_{name}": count for name, count in one.controller_errors.items()}}
-
-
-def _clock_offset_s() -> float:
-    """Wall clock beside the clock that nobody sets."""
-    return time.time() - time.monotonic()
 
 
 def _groups() -> tuple[str, ...]:
@@ -228,7 +198,7 @@ def _groups() -> tuple[str, ...]:
 
 
 def _memory() -> dict[str, int]:
-    """Figures of the machine's memory, in bytes."""
+    """Return the figures of /proc/meminfo, in bytes."""
     found = {}
     for line in _text(_MEMORY).splitlines():
         name, _, rest = line.partition(":")
@@ -238,7 +208,7 @@ def _memory() -> dict[str, int]:
 
 
 def _shared_memory() -> tuple[int, int, str]:
-    """Bytes of /dev/shm, free ones, and why no file can be made there."""
+    """Return size and free space of /dev/shm in bytes, and the reason why no file can be made in it."""
     try:
         room = os.statvfs(ROOT)
     except OSError as error:
@@ -254,21 +224,21 @@ def _text(path: Path) -> str:
         return ""
 
 
-def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Look at everything that runs or is plugged in.
+def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
+    """Examine everything that runs or is plugged in.
 
     Args:
-        namespace: whose drivers are looked at.
-        seconds: how long.
-        tell: called now and then with how long that is by now, s.
+        namespace: of the drivers.
+        seconds: duration of the look.
+        progress: called now and then with the seconds that have passed.
     """
     machine, readers = MachineWatch(), ReadersWatch(namespace)
     before = interfaces.can_interfaces()
     namespaces = namespaces_seen(namespace)
     drivers: tuple[DriverSeen, ...]
     try:
-        drivers = watch(namespace, seconds, tell)
-    except NamespaceError:  # told as a namespace that cannot be looked at
+        drivers = watch(namespace, seconds, progress)
+    except NamespaceError:  # a finding of its own
         drivers = ()
     living = running.running_drivers()
     return Evidence(
@@ -290,7 +260,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
 def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
     live = LiveBridges(namespace)
     try:
-        live.look(namespace.services())
+        live.look()
         return tuple(live.states())
     except NamespaceError:
         return ()

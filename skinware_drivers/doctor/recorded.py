@@ -1,4 +1,4 @@
-"""Gathers the evidence of a recording, from the file alone."""
+"""Gather the evidence of a recording, from the file alone."""
 
 from __future__ import annotations
 
@@ -10,45 +10,45 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 import skinware.recording
 from skinware.memory.statistics import Histogram
 from skinware.realtime import NS_PER_S
 from skinware.recording import RecordedDriverSnapshot, Recording
 from skinware.status import Status
-from skinware_drivers.doctor.driver_log import DriverLog
+from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge
 from skinware_drivers.doctor.evidence import (
     BusSeen,
     ClockSet,
     Counted,
-    Counts,
     DriverSeen,
     Evidence,
     PatchSeen,
     RecordingSeen,
     Timing,
 )
-from skinware_drivers.doctor.judging import TaxelJudge
 from skinware_drivers.doctor.looking import MachineWatch
 
 _LOOK_EVERY_NS = 45_000_000
-"""Frames between two looks are only counted and timed."""
-_TELL_EVERY = 200
+"""Snapshots in between are only counted and timed."""
+_PROGRESS_EVERY = 200
 _SET_S = 0.1
 _CLOSED, _DEAD = "closed", "dead"
 
 _PartT = TypeVar("_PartT", BusSeen, PatchSeen)
 
 
-def look_at(file: Path, tell: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Look at all of a recording.
+def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
+    """Examine a whole recording.
 
     Args:
-        file: it.
-        tell: called now and then with how much of it was looked at, s.
+        file: the recording.
+        progress: called now and then with the seconds of it that were read.
 
     Raises:
-        BadRecording: it is not a recording, or one of a newer version.
-        OSError: it cannot be read.
+        BadRecording: the file is not a recording, or one of a newer version.
+        OSError: the file cannot be read.
     """
     with skinware.recording.open(file) as recording:
         events = recording.events
@@ -56,8 +56,8 @@ def look_at(file: Path, tell: Callable[[float], object] = lambda _seconds: None)
         for number, (time_s, name, frame, _) in enumerate(recording.moments(tuple(drivers))):
             if isinstance(frame, RecordedDriverSnapshot):
                 drivers[name].take(frame, recording[name].generation(frame.generation).static(), time_s)
-            if number % _TELL_EVERY == 0:
-                tell(time_s)
+            if number % _PROGRESS_EVERY == 0:
+                progress(time_s)
         seen = tuple(one for track in drivers.values() if (one := track.seen(events)) is not None)
         return Evidence(
             seconds=recording.duration_s,
@@ -86,7 +86,7 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
 
 
 def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
-    """When the wall clock moved against the one that nobody sets."""
+    """Return the jumps of the wall clock against CLOCK_MONOTONIC, which cannot be set."""
     offsets = [
         (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
         for moment in clock
@@ -103,14 +103,7 @@ def _lost_in(event: dict[str, Any]) -> int:
 
 
 class _DriverTrack:
-    """Follows one driver of a recording over its restarts.
-
-    Args:
-        name: of it.
-
-    Attributes:
-        log: of its present structure; None before the first frame.
-    """
+    """Follow one driver of a recording through its restarts."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -126,10 +119,10 @@ class _DriverTrack:
         self._longest_gap_ns = 0
 
     def take(self, frame: RecordedDriverSnapshot, tables: Any, time_s: float) -> None:
-        """The next frame.
+        """Add a snapshot.
 
         Args:
-            frame: it.
+            frame: the snapshot.
             tables: static columns of its generation.
             time_s: when it was published, since the recording began.
         """
@@ -148,7 +141,7 @@ class _DriverTrack:
                 self._judge.take(frame)
 
     def _begin(self, frame: RecordedDriverSnapshot, tables: Any, *, is_restart: bool) -> None:
-        """Another generation; where its sensors are the same, what was seen goes on."""
+        """Begin a generation. If its sensors are the same, their log continues."""
         self._restarts += is_restart
         self._driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1]).decode(errors="replace")
         if self.log is not None and self.log.structure == frame.structure:
@@ -159,7 +152,7 @@ class _DriverTrack:
         self._judge = TaxelJudge(frame.structure, self._name)
 
     def _time(self, before: RecordedDriverSnapshot, frame: RecordedDriverSnapshot) -> None:
-        """How regular frames are that follow each other; those after a loss say nothing."""
+        """Time two snapshots that follow each other, without a loss between them."""
         if frame.sequence != before.sequence + 1:
             return
         interval_ns, period_ns = frame.published_ns - before.published_ns, frame.period_ns
@@ -170,11 +163,7 @@ class _DriverTrack:
             self._late.add(max(0, interval_ns - period_ns))
 
     def seen(self, events: Sequence[dict[str, Any]]) -> DriverSeen | None:
-        """What came of it; None: there is no frame.
-
-        Args:
-            events: of the recording.
-        """
+        """Return the sum, with the events of the recording; None if it has no snapshot."""
         log, newest, judge = self.log, self._newest, self._judge
         if log is None or newest is None or judge is None:
             return None
@@ -201,7 +190,10 @@ class _DriverTrack:
             buses=_joined(log.buses(), [one.buses() for one in self._earlier]),
             patches=_joined(
                 log.patches(status, newest.published_ns),
-                [one.patches(_unknown(one), newest.published_ns) for one in self._earlier],
+                [
+                    one.patches(np.full(one.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8), newest.published_ns)
+                    for one in self._earlier
+                ],
             ),
             timing=Timing(
                 rate_hz=self._intervals * NS_PER_S / self._live_ns if self._live_ns > 0 else None,
@@ -218,14 +210,8 @@ class _DriverTrack:
         )
 
 
-def _unknown(log: DriverLog) -> Any:
-    import numpy as np
-
-    return np.full(log.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
-
-
 def _joined(now: tuple[_PartT, ...], before: list[tuple[_PartT, ...]]) -> tuple[_PartT, ...]:
-    """Buses or patches with what was counted of them, under the same name, before the structure changed."""
+    """Return buses or patches with the counters that they had under the same name before the structure changed."""
     return tuple(
         reduce(_after, [one for parts in reversed(before) for one in parts if one.name == part.name], part)
         for part in now
@@ -233,12 +219,8 @@ def _joined(now: tuple[_PartT, ...], before: list[tuple[_PartT, ...]]) -> tuple[
 
 
 def _after(part: _PartT, earlier: _PartT) -> _PartT:
-    """A bus or patch, with what was counted and seen of it before."""
     now: Counted = part.counted
     before: Counted = earlier.counted
-    counted = Counted(now.total, _sum(before.grown, now.grown), (*before.hours, *now.hours))
+    grown = dict(Counter(before.grown) + Counter(now.grown))
+    counted = Counted(now.total, grown, (*before.hours, *now.hours))
     return replace(part, counted=counted, changes=(*earlier.changes, *part.changes))
-
-
-def _sum(one: Counts, other: Counts) -> Counts:
-    return {name: one.get(name, 0) + other.get(name, 0) for name in {*one, *other}}

@@ -1,4 +1,4 @@
-"""Write all that was seen and found as one Markdown text without secrets, to attach to an issue."""
+"""Write all evidence and findings as one Markdown text without secrets, to attach to an issue."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skinware.text import age_text, plural, printable
-from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
+from skinware_drivers.doctor.evidence import Counted, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding
 
-_FIRST_PERSON = 1000
-"""Accounts of people have numbers from here on."""
-_NOBODY = 65534
+_PEOPLE = range(1000, 65534)
+"""Numbers of accounts of people."""
 _LEAST_NAME, _LEAST_VALUE = 3, 8
-"""Letters of what is taken out: shorter ones are in every text."""
+"""Least number of letters that are taken out: shorter words are in every text."""
 _SECRET = re.compile(r"TOKEN|SECRET|PASS|KEY|AUTH|CREDENTIAL|COOKIE|SESSION", re.IGNORECASE)
 _COMMON = ("root", "localhost", "skinware")
 _TOKENS = (
@@ -36,7 +35,7 @@ _ADDRESSES = (
     re.compile(r"(?<=://)[^\s/:@]+:[^\s/@]+(?=@)"),
 )
 _HOST = re.compile(r"(?<=://)(?:\[[^\]]*\]|[^/:?\s]+)|(?<=[?&]host=)[^&\s]+")
-"""Of the name of a bus."""
+"""The host in the name of a bus."""
 _PATH = re.compile(r"(?<![\w./:])/(?:[^\s/'\"`,;:()]+/)+(?=[^\s/'\"`,;:()])")
 _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 """Beginnings of paths that are the same on all machines."""
@@ -44,11 +43,11 @@ _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 
 @dataclass(frozen=True)
 class Secrets:
-    """What is not to be told.
+    """Private words, and what to write in their place.
 
     Attributes:
-        words: texts and what stands in their place, as whole words.
-        texts: likewise, wherever they are.
+        words: replaced where they stand as whole words.
+        texts: replaced everywhere.
     """
 
     words: Mapping[str, str] = field(default_factory=dict)
@@ -56,13 +55,13 @@ class Secrets:
 
     @classmethod
     def of_this_machine(cls, environment: Mapping[str, str] | None = None) -> Secrets:
-        """Names of its people and of itself, their homes, and values of the environment.
+        """Return names of people, their home folders, the name of the machine, and values of environment variables.
 
         Args:
             environment: default: that of this process.
         """
         given = os.environ if environment is None else environment
-        people = [one for one in pwd.getpwall() if _FIRST_PERSON <= one.pw_uid < _NOBODY or one.pw_uid == os.geteuid()]
+        people = [one for one in pwd.getpwall() if one.pw_uid in _PEOPLE or one.pw_uid == os.geteuid()]
         homes = {one.pw_dir for one in people} | {str(Path.home()), given.get("HOME", "")}
         names = {one.pw_name for one in people} | {given.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")}
         names |= {one.pw_gecos.partition(",")[0] for one in people}
@@ -78,12 +77,7 @@ class Secrets:
 
 
 def scrubbed(text: str, secrets: Secrets) -> str:
-    """The same text without them, and without tokens, addresses of networks, and folders.
-
-    Args:
-        text: any.
-        secrets: what is known to be some.
-    """
+    """Return a text without these secrets, and without tokens, addresses and names of folders."""
     for known, place in _longest_first(secrets.texts):
         text = text.replace(known, place)
     for known, place in _longest_first(secrets.words):
@@ -96,10 +90,10 @@ def scrubbed(text: str, secrets: Secrets) -> str:
 
 
 class Disguise:
-    """Names of buses and other texts as they may be given to others: hosts are ``host1``, ``host2``; no secrets.
+    """Take secrets out of names of buses and other texts; hosts become ``host1``, ``host2``.
 
     Args:
-        secrets: what is known to be some; default: those of this machine.
+        secrets: default: those of this machine.
     """
 
     def __init__(self, secrets: Secrets | None = None) -> None:
@@ -107,7 +101,7 @@ class Disguise:
         self._hosts: dict[str, str] = {}
 
     def __call__(self, text: str) -> str:
-        """The same text in disguise; the same host has the same name again."""
+        """Return a text in disguise; a host keeps its new name."""
         return scrubbed(_HOST.sub(self._host, text), self._secrets)
 
     def _host(self, found: re.Match[str]) -> str:
@@ -119,12 +113,12 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
 
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
-    """The report.
+    """Return the report.
 
     Args:
-        evidence: what was seen.
-        found: what came of it.
-        secrets: what must not be in it; default: those of this machine.
+        evidence: everything that was seen.
+        found: the findings.
+        secrets: to be left out; default: those of this machine.
     """
     text = "\n".join(map(printable, _lines(evidence, found))) + "\n"
     return scrubbed(text, secrets or Secrets.of_this_machine())
@@ -135,7 +129,8 @@ def _lines(evidence: Evidence, found: Examination) -> Iterator[str]:
     yield ""
     about = "a running skin" if evidence.recording is None else f"the recording {evidence.recording.name}"
     span = age_text(evidence.seconds * 1e9)
-    yield f"Of {about}, {span}, {plural(len(evidence.drivers), 'driver')}: {plural(len(found.findings), 'finding')}."
+    drivers, findings = plural(len(evidence.drivers), "driver"), plural(len(found.findings), "finding")
+    yield f"{findings} in {about}, {span}, {drivers}."
     yield ""
     for number, finding in enumerate(found.findings, 1):
         yield from _finding(number, finding)
@@ -173,10 +168,9 @@ def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str
 
 
 def _driver(driver: DriverSeen) -> Iterator[str]:
-    """Counters, which the tables above sum up."""
     yield f"## Counters of driver {driver.name}"
     yield ""
-    what = driver.driver_type or "no type told"
+    what = driver.driver_type or "unknown type"
     yield f"{what}, data path {driver.data_path}, {plural(driver.frames, 'frame')} seen."
     yield ""
     yield "```text"
@@ -195,11 +189,10 @@ def _driver(driver: DriverSeen) -> Iterator[str]:
 
 
 def _counted(counted: Counted) -> str:
-    """Counters that are not 0: in all (in the time that was looked at)."""
-    told = [f"{name} {count} (+{counted.grown.get(name, 0)})" for name, count in counted.total.items() if count]
-    hours = [f"hour {hour + 1}: {_some(counts)}" for hour, counts in counted.hours]
-    return ", ".join(told) + (f"; {'; '.join(hours)}" if len(hours) > 1 else "")
-
-
-def _some(counts: Counts) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    """Return the counters that are not 0: total (growth during the look)."""
+    counts = [f"{name} {count} (+{counted.grown.get(name, 0)})" for name, count in counted.total.items() if count]
+    hours = [
+        f"hour {hour + 1}: {', '.join(f'{name} {count}' for name, count in growth.items() if count)}"
+        for hour, growth in counted.hours
+    ]
+    return ", ".join(counts) + (f"; {'; '.join(hours)}" if len(hours) > 1 else "")

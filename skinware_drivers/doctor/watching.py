@@ -1,76 +1,61 @@
-"""Looks at the drivers of a namespace for some seconds, and sums up what their frames told."""
+"""Read the drivers of a namespace for some seconds, and sum up their snapshots."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from skinware.cli._report import health
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import (
-    BadServiceFile,
-    ConfigurationError,
-    NamespaceError,
-    Overrun,
-    ServiceError,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.drivers import Drivers
+from skinware.errors import NamespaceError, Overrun, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread, WriterStatistics
 from skinware.realtime import now_ns
 from skinware.state import life_of, rate_now_hz, status_now
 from skinware.status import Status
-from skinware_drivers.doctor.driver_log import DriverLog
-from skinware_drivers.doctor.evidence import DriverSeen, HealthSeen, TaxelFault, Timing
-from skinware_drivers.doctor.judging import TaxelJudge
+from skinware.structure import Structure
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import HealthReader
+from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge, taxel_faults
+from skinware_drivers.doctor.evidence import DriverSeen, HealthSeen, Timing
 
 _LOOK_EVERY_S = 0.02
 _POLICIES = {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
 
 
-def watch(namespace: Namespace, seconds: float, tell: Callable[[float], object]) -> tuple[DriverSeen, ...]:
-    """Look at all drivers of a namespace.
+def watch(namespace: Namespace, seconds: float, progress: Callable[[float], object]) -> tuple[DriverSeen, ...]:
+    """Read all drivers of a namespace.
 
     Args:
-        namespace: where.
-        seconds: how long.
-        tell: called now and then with how long that is by now, s.
+        namespace: of the drivers.
+        seconds: duration.
+        progress: called now and then with the seconds that have passed.
 
     Raises:
         NamespaceError: the namespace cannot be trusted or read.
     """
-    with contextlib.ExitStack() as opened:
-        watches = []
-        for name in namespace.services():
-            try:
-                watches.append(
-                    _DriverWatch(opened.enter_context(DriverReader(name, namespace=namespace, announce=False)))
-                )
-            except (BadServiceFile, ServiceNotFound, ConfigurationError):
-                continue  # no driver, or told as a file that cannot be read
+    with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
+        drivers.look()
+        if drivers.trouble:
+            raise NamespaceError(drivers.trouble)
+        watches = [_DriverWatch(reader) for reader in drivers.readers.values()]
         begun_s = time.monotonic()
         while (passed_s := time.monotonic() - begun_s) < seconds:
             for one in watches:
                 one.look(passed_s)
-            tell(passed_s)
+            progress(passed_s)
             time.sleep(min(_LOOK_EVERY_S, seconds))
         return tuple(one.seen() for one in watches)
 
 
 class _DriverWatch:
-    """Looks at one driver.
-
-    Args:
-        reader: of it.
-    """
+    """Read one driver."""
 
     def __init__(self, reader: DriverReader) -> None:
         self._reader = reader
@@ -82,11 +67,7 @@ class _DriverWatch:
         self._newest: DriverSnapshot | None = None
 
     def look(self, time_s: float) -> None:
-        """Take the newest frame in, if there is one that is new.
-
-        Args:
-            time_s: since the watch began.
-        """
+        """Add the newest snapshot if there is a new one, ``time_s`` after the watch began."""
         reader = self._reader
         try:
             frame = reader.read(newer_than=self._newest, timeout_s=0.0)
@@ -100,7 +81,7 @@ class _DriverWatch:
             return
         if frame.generation != self._generation:
             self._generation, self._restarts = frame.generation, self._restarts + 1
-            self._begun = _nothing()
+            self._begun = WriterStatistics(0, 0, 0, 0, Spread(), Spread(), Histogram(), Histogram())
         self._newest = frame
         self._newest_statistics = reader.writer_statistics
         self._log.take(frame, reader.static(), time_s)
@@ -156,16 +137,12 @@ class _DriverWatch:
         )
 
 
-def _nothing() -> WriterStatistics:
-    return WriterStatistics(0, 0, 0, 0, Spread(), Spread(), Histogram(), Histogram())
-
-
 def _grown(before: Histogram, now: Histogram) -> Histogram:
     return Histogram([max(0, after - was) for was, after in zip(before.counts, now.counts, strict=True)])
 
 
 def _scheduling(pid: int) -> str:
-    """How the kernel schedules a process; empty where that cannot be known."""
+    """Return how the kernel schedules a process; empty if that is unknown."""
     try:
         policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
         if policy in _POLICIES:
@@ -176,20 +153,27 @@ def _scheduling(pid: int) -> str:
 
 
 def _by_calm(reader: DriverReader, life: str) -> HealthSeen | None:
-    """What ``skin-calm`` says of a driver's taxels, where it runs for it."""
-    if life == "dead":
-        return None
-    with contextlib.suppress(NamespaceError):
-        found = health([reader.namespace, Namespace(reader.namespace.calm_name)], reader.name)
-        for entry in found["health"]:
-            if entry["state"] == "live" and entry["sensors"] == reader.structure.n_sensors:
-                return _calm_health(entry)
+    """Return the health of a driver's taxels as a running ``skin-calm`` publishes it; None without one."""
+    for namespace in (reader.namespace, Namespace(reader.namespace.calm_name)) if life != "dead" else ():
+        with (
+            contextlib.suppress(NamespaceError, ServiceTimeout, Overrun),
+            Drivers(namespace, partial(HealthReader, announce=False)) as judges,
+        ):
+            judges.look()
+            for judge in judges.readers.values():
+                source = judge.source
+                if source.driver == reader.name and np.array_equal(source.uid, reader.structure.sensor_uid):
+                    sample = judge.read(timeout_s=0.0)
+                    if life_of(judge, sample) == "live":
+                        return _calm_health(reader.structure, sample.report)
     return None
 
 
-def _calm_health(entry: Mapping[str, Any]) -> HealthSeen:
-    kinds, judged, missing = entry["kinds"], entry["sensors"] - entry["kinds"]["unknown"], {}
-    if kinds["never_touched"]:
-        missing["dead and weak taxels"] = f"nothing has touched {kinds['never_touched']:,} of {judged:,} so far"
-    faults = tuple(TaxelFault(one["name"], one["kind"], one["evidence"]) for one in entry["faults"])
+def _calm_health(structure: Structure, report: HealthReport) -> HealthSeen:
+    judged = int(np.isfinite(report.still_s).sum())
+    untouched = int((report.kind == HealthKind.NEVER_TOUCHED).sum())
+    missing = {}
+    if untouched:
+        missing["dead and weak taxels"] = f"nothing has touched {untouched:,} of {judged:,} so far"
+    faults = taxel_faults(structure, np.arange(structure.n_sensors), report)
     return HealthSeen("skin-calm", judged, faults, missing)

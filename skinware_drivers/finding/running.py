@@ -1,15 +1,17 @@
-"""Which drivers run on this machine, and on which buses: nobody may send behind a driver's back."""
+"""Find the drivers that run on this machine, and their buses, so that no other program sends on these."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from skinware.driver_service import DriverReader
-from skinware.errors import BadServiceFile, BusNotAvailable, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.drivers import Drivers
+from skinware.errors import BusNotAvailable, ConfigurationError, NamespaceError
 from skinware.memory.namespace import ROOT, Namespace
-from skinware_drivers.bus_names import BusPlace, place_of_bus
+from skinware_drivers.bus_names import BusName, BusPlace
 from skinware_drivers.serial.opening import SerialOptions, find_port
 
 _PREFIX = "skinware."
@@ -21,11 +23,10 @@ class RunningDriver:
     """A driver whose process lives.
 
     Attributes:
-        name: under which programs find it.
-        namespace: where.
+        name, namespace: of the driver.
         driver_type: ``roboskin``.
         pid: of its process.
-        buses: as it was told them.
+        buses: as given to the driver.
     """
 
     name: str
@@ -42,18 +43,18 @@ class RunningDriver:
 
 
 def running_drivers() -> list[RunningDriver]:
-    """All living drivers in namespaces that this user may read."""
+    """Return all living drivers in namespaces that this user may read."""
     found = []
     for folder in sorted(ROOT.glob(f"{_PREFIX}*")):
-        try:
+        with contextlib.suppress(ConfigurationError, NamespaceError):
             namespace = Namespace(folder.name.removeprefix(_PREFIX))
-            services = namespace.services()
-        except (ConfigurationError, NamespaceError, NotADirectoryError):
-            continue
-        for name in services:
-            driver = _look_at(namespace, name)
-            if driver is not None:
-                found.append(driver)
+            with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
+                drivers.look()
+                found += [
+                    RunningDriver(name, namespace.name, reader.driver_type, reader.writer_pid, reader.structure.buses)
+                    for name, reader in drivers.readers.items()
+                    if reader.alive
+                ]
     return found
 
 
@@ -62,7 +63,7 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 
 
 def same_bus(one: str, other: str) -> bool:
-    """Whether two names, of one program or of two, mean one bus now, by :func:`place_of_bus`.
+    """Whether two names, of one program or of two, mean one bus now, by their :class:`BusPlace`.
 
     Serial lines that are named by their USB device are where that is plugged in now; while it is not plugged in, the
     names alone are compared. A ``virtual`` bus is nobody else's: each process has its own.
@@ -72,20 +73,10 @@ def same_bus(one: str, other: str) -> bool:
 
 
 def _place_now(bus_name: str) -> BusPlace:
-    place = place_of_bus(bus_name)
+    place = BusName.of(bus_name).place
     if (place.interface, place.channel) == ("serial", ""):
         with contextlib.suppress(BusNotAvailable, ConfigurationError):
             usb = dict(place.options)
             device = SerialOptions(serial_number=usb["serial_number"], vid_pid=usb["vid_pid"])
-            return place_of_bus(find_port("", device))
+            return BusName.of(find_port("", device)).place
     return place
-
-
-def _look_at(namespace: Namespace, name: str) -> RunningDriver | None:
-    try:
-        with DriverReader(name, namespace=namespace, announce=False) as reader:
-            if not reader.alive:
-                return None
-            return RunningDriver(name, namespace.name, reader.driver_type, reader.writer_pid, reader.structure.buses)
-    except (BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound):
-        return None  # no driver, just withdrawn, or nothing that may be read

@@ -1,4 +1,4 @@
-"""Adapt drivers of Modbus devices: they declare which registers hold which values, and no more."""
+"""The base class of drivers of Modbus devices, which declare only which registers hold which values."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }
 _WORDS = {"byte_order": get_args(Order), "word_order": get_args(Order)}
 _UNHURRIED = 1.25
-"""Of the time that bytes take: devices take some before they answer."""
+"""Factor on the time that bytes take: devices need some before they answer."""
 _LISTEN_S, _PERIODS, _LONGEST_LISTEN_S = 0.3, 4, 2.0
 _ENOUGH_CYCLES, _TOO_SLOW = 4, 1.5
 
@@ -61,21 +61,20 @@ class ModbusException(BusError):
 class ModbusAdapter(Adapter[OptionsT]):
     """One Modbus line or connection of a driver; see :class:`skinware_drivers.adapter.Adapter`.
 
-    It reads and never writes by itself. Values are those of the registers; ``layout`` follows from them.
+    It reads, and never writes by itself. ``layout`` follows from the registers.
 
     Attributes:
         registers: blocks of registers, each with values of one module.
-        flags: what sets status bits, in every block (values that mean "none", say).
-        timeout_s: how long to wait for a reply.
-        turnaround_s: pause after a reply; None: what the standard wants.
-        baudrate: of serial lines, unless the bus' name says another.
+        flags: conditions that set status bits in every block, for example a value that means "none".
+        timeout_s: longest wait for a reply.
+        turnaround_s: pause after a reply; None: that of the standard.
+        baudrate: of serial lines, unless the options of the bus give one.
         byte_order: of the bytes of a register.
         word_order: of the registers of a value that has several.
-        address_step: by how much the address grows from one register to the next: 2 where addresses count bytes.
-        largest_gap: registers that nobody wants, but that are read along rather than ask twice.
+        address_step: from the address of one register to the next: 2 where addresses count bytes.
+        largest_gap: unwanted registers that are read along at most, to save a question.
         most_registers: of a read.
-        follows_line: on a serial line that is too slow for ``period_s``, take as long as it needs; and see
-            :meth:`learn_period`.
+        follows_line: lengthen ``period_s`` where a serial line is too slow for it; see also :meth:`learn_period`.
     """
 
     medium: ClassVar[str] = "modbus"
@@ -99,26 +98,20 @@ class ModbusAdapter(Adapter[OptionsT]):
 
     @property
     def payload_size(self) -> int:
-        """Longest frame; also answers to questions of its own must fit."""
+        """Bytes of the longest frame, answers to the driver's own questions included."""
         return max(self.layout.payload_size if self.registers else 0, 256)
 
     @property
     def wanted(self) -> Wanted:
-        """What a bus is to ask for; ``wanted.reads()`` are the questions of a cycle."""
-        return Wanted(
-            self.registers,
-            self.address_step,
-            self.largest_gap,
-            self.most_registers,
-            self.byte_order,
-            self.word_order,
-        )
+        """The registers that a bus asks for; ``wanted.reads()`` are the questions of a cycle."""
+        sizes = self.address_step, self.largest_gap, self.most_registers
+        return Wanted(self.registers, *sizes, self.byte_order, self.word_order)
 
     def check(self) -> None:
-        """Also the registers.
+        """Check the driver and its registers.
 
         Raises:
-            ConfigurationError: something is missing, or contradicts something else; the message says what.
+            ConfigurationError: a declaration is missing, or contradicts another; the message says which.
         """
         is_declared, name = type(self).describe is Adapter.describe, type(self).__name__
         if is_declared and not self.registers:
@@ -131,7 +124,7 @@ class ModbusAdapter(Adapter[OptionsT]):
             self._check_keys()
 
     def fit(self, bus: Bus) -> None:
-        """Tell the bus what to ask.
+        """Set what the bus asks for.
 
         Raises:
             ConfigurationError: it is another kind of bus.
@@ -141,7 +134,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         self.use_registers(self.registers)
 
     def use_registers(self, registers: Sequence[Registers]) -> None:
-        """Go over to other registers, for devices that tell in ``describe`` what they have.
+        """Read other registers from now on, for devices that are asked in ``describe`` which they have.
 
         Raises:
             ConfigurationError: they cannot be read.
@@ -155,14 +148,14 @@ class ModbusAdapter(Adapter[OptionsT]):
             self._line.use(self.wanted, self.period_s, self.timeout_s, self.turnaround_s, self.baudrate)
 
     async def probe(self, link: Link, patch: object) -> bool:  # noqa: ARG002
-        """Nothing: the registers of a silent device are asked for all the time."""
+        """Return False: the registers of a silent device are asked for all the time."""
         return False
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """One read of the first registers that the driver wants, which changes nothing in any device.
+        """Read the first registers that the driver wants, which changes nothing in any device.
 
-        What answers need not be what the driver is for: Modbus knows no names, and many devices have registers there.
+        A device that answers need not be the driver's: Modbus knows no names, and many devices have registers there.
         """
         of_default_options: Callable[[msgspec.Struct], ModbusAdapter[Any]] = cls
         adapter = of_default_options(cls.Options())
@@ -176,7 +169,7 @@ class ModbusAdapter(Adapter[OptionsT]):
     async def read(
         self, link: Link, address: int, count: int = 1, *, unit: int = 1, function: int = wire.READ_HOLDING
     ) -> npt.NDArray[np.uint16]:
-        """Read registers once; (count,) uint16.
+        """Read registers once; return (count,) uint16.
 
         Raises:
             HandshakeTimeout: no answer.
@@ -186,8 +179,21 @@ class ModbusAdapter(Adapter[OptionsT]):
         answer = await self._ask(link, unit, question)
         return np.frombuffer(answer[2:], self._register).astype(np.uint16)
 
+    async def read_or_none(
+        self, link: Link, address: int, count: int = 1, *, unit: int = 1, function: int = wire.READ_HOLDING
+    ) -> tuple[int, ...] | None:
+        """Read registers once; return None where the device refuses, because it has no such registers.
+
+        Raises:
+            HandshakeTimeout: no answer.
+        """
+        try:
+            return tuple((await self.read(link, address, count, unit=unit, function=function)).tolist())
+        except ModbusException:
+            return None
+
     async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:
-        """Write registers (function 16): only what a device's documentation allows, and only when a person wants it.
+        """Write registers (function 16): only those of the device's documentation, and only when a person wants it.
 
         Raises:
             HandshakeTimeout: no answer.
@@ -205,9 +211,9 @@ class ModbusAdapter(Adapter[OptionsT]):
         return np.dtype(">u2" if order == "big" else "<u2")
 
     async def learn_period(self, link: Link) -> None:
-        """With ``follows_line``, listen how long a cycle takes: for ``describe`` of devices that need several reads.
+        """With ``follows_line``, measure how long a cycle takes: for ``describe`` of devices that need several reads.
 
-        One that is asked faster than it answers never has all its values of one cycle, and some are always stale.
+        If a device is asked faster than it answers, no cycle is ever complete, and some values are always stale.
         """
         if not self.follows_line or self._line is None or self._line.is_recorded:
             return
@@ -226,9 +232,9 @@ class ModbusAdapter(Adapter[OptionsT]):
             self.use_registers(self.registers)
 
     async def _ask(self, link: Link, unit: int, question: bytes) -> bytes:
-        timeout_s = 4 * self.timeout_s + 1  # it waits for the read before, and for what is written beside it
+        timeout_s = 4 * self.timeout_s + 1  # the read before, and the gateway's question, come first
         reply = await link.request(unit, question, Match(ANSWERS | unit), timeout_s=timeout_s)
-        if not wire.is_reply(question, reply.payload):  # a late one, to a question that was given up
+        if not wire.is_reply(question, reply.payload):  # late, to a question that was given up
             raise BusError(f"{link.bus_name}, unit {unit}: it answered another question")
         if code := wire.exception_of(reply.payload):
             raise ModbusException(f"{link.bus_name}, unit {unit}: {wire.exception_text(code)}", code)
@@ -254,39 +260,32 @@ class ModbusAdapter(Adapter[OptionsT]):
             number = getattr(self, what)
             if not (isinstance(number, int | float) and least <= number <= most):
                 raise ConfigurationError(f"{name}: {what} = {number!r}: give {least:g} to {most:g}")
-        frames = [self._frame(number, block) for number, block in enumerate(self.registers)]
-        _refuse_twice(self.registers)
-        return Layout(frames)
-
-    def _frame(self, number: int, block: Registers) -> Frame:
-        block.check(self.address_step)
-        return Frame(
-            f"{block.name} ({number})",
-            [Identifier(number)],
-            [2 * block.count],
-            block.runs,
-            patch=block.patch,
-            module=block.module,
-            flags=[*self.flags, *block.flags],
-        )
-
-
-def _refuse_twice(registers: Sequence[Registers]) -> None:
-    owners: dict[tuple[int | None, int | None, int], Registers] = {}
-    for block in registers:
-        for channel in (channel for run in block.runs for channel in run.channels):
-            if channel is None:
-                continue
-            owner = owners.setdefault((block.patch, block.module, channel), block)
-            if owner is not block:
-                raise ConfigurationError(
-                    f"{owner.name} and {block.name} both have the value of channel {channel}: say which patch or module"
-                    " each is of, or with `to` which channels it has"
+        frames, owners = [], dict[tuple[int | None, int | None, int], Registers]()
+        for number, block in enumerate(self.registers):
+            block.check(self.address_step)
+            for channel in (channel for run in block.runs for channel in run.channels if channel is not None):
+                owner = owners.setdefault((block.patch, block.module, channel), block)
+                if owner is not block:
+                    raise ConfigurationError(
+                        f"{owner.name} and {block.name} both have the value of channel {channel}: say which patch or"
+                        " module each is of, or with `to` which channels it has"
+                    )
+            frames.append(
+                Frame(
+                    f"{block.name} ({number})",
+                    [Identifier(number)],
+                    [2 * block.count],
+                    block.runs,
+                    patch=block.patch,
+                    module=block.module,
+                    flags=[*self.flags, *block.flags],
                 )
+            )
+        return Layout(frames)
 
 
 class OrderWatch(ZeroWatch):
-    """Also tells what it means that the layout holds values for suspect because they are above all that a taxel tells.
+    """Also log, once, why values above the greatest value of a taxel are suspect.
 
     Args:
         tables: of the skin.
@@ -296,13 +295,13 @@ class OrderWatch(ZeroWatch):
     def __init__(self, tables: SkinTables, full_scale: int) -> None:
         super().__init__(tables)
         self._full_scale = full_scale
-        self._has_told_order = False
+        self._has_logged = False
 
     def look(self, updates: Updates) -> None:
         super().look(updates)
         is_sensor = updates.sensors < self.tables.structure.n_sensors
-        if not self._has_told_order and (updates.status[is_sensor] & Status.SUSPECT).any():
-            self._has_told_order = True
+        if not self._has_logged and (updates.status[is_sensor] & Status.SUSPECT).any():
+            self._has_logged = True
             log.warning(
                 "values above %d, which no taxel has, are suspect; if there are many, the device may send the bytes of"
                 " registers in the other order: add byte_order=little to the options of the bus",

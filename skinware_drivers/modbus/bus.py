@@ -1,4 +1,4 @@
-"""A Modbus line or connection as a bus: its frames are the blocks of registers that a driver declared."""
+"""Read a Modbus line or connection as a bus, whose frames are the blocks of registers that a driver declares."""
 
 from __future__ import annotations
 
@@ -36,29 +36,31 @@ DEFAULT_PORT = 502
 _TCP = "tcp://"
 _SILENT_CHARACTERS, _BITS_PER_CHARACTER = 3.5, 11
 _FRAME_BYTES = 3
-"""Around a message on a line: unit and checksum."""
+"""Unit and checksum around a message on a line."""
 
 
 class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a Modbus bus; those of a serial line, or of a connection, come beside them."""
+    """Options of a Modbus bus, besides those of a serial line or a connection."""
 
     timeout_ms: Annotated[
-        Annotated[float, Meta(gt=0)] | None, Meta(description="wait so long for a reply; default: as the driver says")
+        Annotated[float, Meta(gt=0)] | None, Meta(description="longest wait for a reply; default: of the driver")
     ] = None
     turnaround_ms: Annotated[
         Annotated[float, Meta(ge=0)] | None,
-        Meta(description="pause after a reply; default: as the driver says, or 3.5 characters"),
+        Meta(description="pause after a reply; default: of the driver, or 3.5 characters"),
     ] = None
     listen: Annotated[bool, Meta(description="send nothing: overhear another master on a tapped line")] = False
-    byte_order: Annotated[Order | None, Meta(description="of a register; default: as the driver says")] = None
-    word_order: Annotated[Order | None, Meta(description="of registers of a value; default: likewise")] = None
-    gateway: Annotated[str, Meta(description="let others ask, too: PORT or HOST:PORT, or the path of a new port")] = ""
-    gateway_writes: Annotated[bool, Meta(description="no: the gateway refuses every write")] = True
+    byte_order: Annotated[Order | None, Meta(description="of the bytes of a register; default: of the driver")] = None
+    word_order: Annotated[Order | None, Meta(description="of the registers of a value; default: of the driver")] = None
+    gateway: Annotated[
+        str, Meta(description="let other programs ask, too: PORT or HOST:PORT, or the path of a new port")
+    ] = ""
+    gateway_writes: Annotated[bool, Meta(description="no: refuse every write of the gateway's programs")] = True
     gateway_public: Annotated[bool, Meta(description="other machines may reach the gateway")] = False
 
 
 def device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    """The end at which emulated devices are: as bytes, which they take apart themselves.
+    """Make the device's end, for emulators: a bus of bytes, which they take apart themselves.
 
     Raises:
         ConfigurationError: no such address, or an option is unknown or has a bad value.
@@ -70,12 +72,12 @@ def device_end(channel: str, options: dict[str, str] | None = None, **more: Any)
 
 
 class ModbusBus(KernelBus):
-    """Its name is ``modbus:tcp://HOST[:PORT]`` or ``modbus:/dev/ttyUSB0``, with ``?key=value``.
+    """A Modbus line or connection: ``modbus:tcp://HOST[:PORT]`` or ``modbus:/dev/ttyUSB0``, with ``?key=value``.
 
     As master, it asks for the registers of :meth:`use` by itself, one question at a time. With ``listen``, or opened to
-    listen only, it follows what another master on the same line asks, and sends nothing.
+    listen only, it follows the questions of another master on the same line and sends nothing.
 
-    ``send`` has a message (function and data) sent to a unit between two reads; the answer is a frame of the identifier
+    ``send`` sends a message (function and data) to a unit between two reads; its answer is a frame with the identifier
     ``ANSWERS | unit``. Only reads and writes of registers can be sent.
 
     With a ``gateway``, other programs ask through it between two reads.
@@ -85,7 +87,7 @@ class ModbusBus(KernelBus):
         options: see :class:`ModbusOptions`.
         payload_size: longest frame.
         listen_only: send nothing.
-        make_timer: gives the timer that wakes it.
+        make_timer: makes the timer that wakes it.
 
     Raises:
         ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
@@ -94,7 +96,7 @@ class ModbusBus(KernelBus):
     medium: ClassVar[str] = "modbus"
     opens_slowly: ClassVar[bool] = True
     is_recorded: ClassVar[bool] = False
-    """Whoever listens to a recording misses what it says meanwhile."""
+    """A recording, which goes on while a driver listens: the driver would miss that part."""
     device_end: ClassVar[Callable[..., Bus] | None] = staticmethod(device_end)
 
     def __init__(
@@ -116,13 +118,13 @@ class ModbusBus(KernelBus):
             self._address = parse_address("modbus:tcp", channel.removeprefix(_TCP), default_port=DEFAULT_PORT)
             self._tcp_options = options_from_strings(TcpOptions, given, ModbusOptions.__struct_fields__)
             if listens:
-                raise ConfigurationError(f"{self.name}: only a line can be tapped, not a connection: it needs a master")
+                raise ConfigurationError(f"{self.name}: a connection cannot be tapped as a line can: it needs a master")
         else:
             self._serial_options = options_from_strings(SerialOptions, given, ModbusOptions.__struct_fields__)
         self._gateway: Gateway | None = None
         if self._modbus.gateway:
             if listens:
-                raise ConfigurationError(f"{self.name}: who only listens cannot ask for others: no gateway")
+                raise ConfigurationError(f"{self.name}: a bus that only listens cannot ask for others: no gateway")
             guests = Guests(may_write=self._modbus.gateway_writes, over_tcp=self._address is not None)
             self._gateway = Gateway(self._modbus.gateway, guests, is_public=self._modbus.gateway_public)
         self._make_timer = make_timer
@@ -134,7 +136,7 @@ class ModbusBus(KernelBus):
         self._timer: Timer | None = None
         self._epoll: select.epoll | None = None
         self._unsent = b""
-        self._left = b""  # by C, to be understood
+        self._left = b""  # read by C and not understood
 
     @property
     def name(self) -> str:
@@ -142,23 +144,26 @@ class ModbusBus(KernelBus):
 
     @property
     def asks(self) -> bool:
-        """Whether it waits for a reply: what comes next depends on how soon that is taken."""
+        """Whether it waits for replies, so that the next question depends on how soon a reply is taken."""
         return not self.listen_only
 
     @property
     def byte_order(self) -> Order:
-        """Of a register: as the bus' name says, else the driver."""
+        """Order of the bytes of a register: from the options of the bus, else from the driver."""
         return self._wanted.byte_order
 
     def use(self, wanted: Wanted, period_s: float, timeout_s: float, turnaround_s: float | None, baudrate: int) -> None:
-        """Say what is asked for; takes effect at once, and anew when it is opened.
+        """Set what to ask for, now and after each opening. Options of the bus override these arguments.
 
         Args:
-            wanted: which registers; what the options of the bus say comes first.
+            wanted: the registers.
             period_s: time from one cycle to the next.
-            timeout_s: how long to wait for a reply.
-            turnaround_s: pause after a reply; None: what the standard wants of a serial line, none over TCP.
-            baudrate: unless the bus' name says another.
+            timeout_s: longest wait for a reply.
+            turnaround_s: pause after a reply; None: that of the standard on a serial line, none over TCP.
+            baudrate: of a serial line.
+
+        Raises:
+            ConfigurationError: a serial line has no unit 0.
         """
         self._baudrate = baudrate if self._address is not None else self._serial_options.baudrate or baudrate
         if turnaround_s is None:
@@ -172,16 +177,16 @@ class ModbusBus(KernelBus):
         word_order = self._modbus.word_order or wanted.word_order
         self._wanted = replace(wanted, byte_order=byte_order, word_order=word_order)
         if self._address is None and any(block.unit == 0 for block in wanted.blocks):
-            raise ConfigurationError(f"{self.name}: unit 0 is everybody on a line, and nobody answers: which unit?")
+            raise ConfigurationError(f"{self.name}: unit 0 means all units of a line, and none answers: which unit?")
         if self._port is not None:
-            self._begin_anew()
+            self._begin()
 
     def cycle_s(self, wanted: Wanted, baudrate: int) -> float:
-        """How long the bytes of a cycle are on a serial line, and the silence between them, s; 0 over TCP.
+        """Return the time that the bytes of a cycle and the silence between them take on a serial line, s; 0 over TCP.
 
         Args:
-            wanted: which registers.
-            baudrate: unless the bus' name says another.
+            wanted: the registers.
+            baudrate: unless the options of the bus give one.
         """
         if self._address is not None:
             return 0.0
@@ -195,7 +200,7 @@ class ModbusBus(KernelBus):
         """Connect, or open the line for us alone.
 
         Raises:
-            BusNotAvailable: not there, not permitted or taken; the message says what to do.
+            BusNotAvailable: it is missing, not permitted or taken; the message says what to do.
             ConfigurationError: no such kind of port, or it has no such baud rate.
         """
         if self._epoll is not None:
@@ -213,7 +218,7 @@ class ModbusBus(KernelBus):
         for each in (port, self._timer, self._gateway):
             if each is not None:
                 epoll.register(each.fileno(), select.EPOLLIN)
-        self._begin_anew()
+        self._begin()
         self._epoll = epoll  # last: the driver looks at it while a thread opens the bus
 
     def _open_port(self) -> Port:
@@ -221,7 +226,7 @@ class ModbusBus(KernelBus):
             return TcpPort(f"modbus:tcp://{self._address}", connect(self._address), self._tcp_options.patience_s)
         return open_port(find_port(self.channel, self._serial_options), self._serial_options, self._baudrate)
 
-    def _begin_anew(self) -> None:
+    def _begin(self) -> None:
         self._unsent = self._left = b""
         if self.listen_only:
             self._talk = Listener(self._wanted, self.counters)
@@ -250,7 +255,7 @@ class ModbusBus(KernelBus):
         """Take replies, ask what is due, and append the frames that are whole.
 
         Raises:
-            BusNotAvailable: the port went away, or no Modbus comes from it.
+            BusNotAvailable: the port went away, or sends no Modbus.
         """
         port, talk = self._port, self._talk
         if port is None or talk is None:
@@ -285,11 +290,11 @@ class ModbusBus(KernelBus):
 
     @property
     def reads_natively(self) -> bool:
-        """Whether C asks and takes the replies, as long as all is well."""
+        """Whether C asks and takes the replies as long as all are good."""
         return not self.listen_only and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
-        """Have C ask; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Let C ask; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
         talk, port = self._talk, self._port
         if not isinstance(talk, NativeMaster) or not isinstance(port, DescriptorPort):
             return False
@@ -310,18 +315,18 @@ class ModbusBus(KernelBus):
             self._wake()
 
     def nothing_received(self, number: int) -> int:  # noqa: ARG002
-        """Nothing: Python reads again what C could not."""
+        """Return 0: Python reads again what C could not."""
         return 0
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Have a message sent to a unit between two reads.
+        """Send a message to a unit between two reads.
 
         Args:
             identifier: the unit.
-            payload: function and data.
+            payload: function and data of a read or write of registers.
 
         Raises:
-            BusSendError: closed, only listening, too many wait already, or nothing but reads and writes of registers.
+            BusSendError: the bus is closed or only listens, too many messages wait, or this is no read or write.
         """
         self.may_send_by(self._port)
         message = wire.Message(identifier, payload)
@@ -341,7 +346,7 @@ class ModbusBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """What a person should know about the port."""
+        """Remarks on the port, for people."""
         notes = [] if self._port is None else [self._port.note, "" if self._gateway is None else self._gateway.note]
         return ", ".join(filter(None, notes))
 
@@ -358,7 +363,7 @@ class ModbusBus(KernelBus):
             self._unsent = self._unsent[written:]
 
     def _wake(self) -> None:
-        """Be readable when something is due, or is still to be handed out."""
+        """Be readable when something is due, or has still to be handed out."""
         talk, timer = self._talk, self._timer
         if talk is not None and timer is not None:
             timer.wake_at(0 if talk.rows or self._unsent or self._left else talk.due_ns)

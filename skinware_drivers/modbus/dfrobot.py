@@ -1,12 +1,12 @@
-"""DFRobot's tactile arrays SEN0704 and SEN0705 (6 x 6 and 4 x 8, piezoresistive), over Modbus RTU. It writes nothing.
+"""DFRobot's tactile arrays SEN0704 and SEN0705 (6 x 6, 4 x 8, piezoresistive), over Modbus RTU. It writes nothing.
 
 Source: the maker's libraries for Arduino and Python (DFRobot/DFRobot_TactileSensor, 2025), and a program that reads
 several arrays on one line with them. Input registers: 0001 the maker, 3343 (hexadecimal); 0006 the state, 1 = ready;
 from 0007 on the cells, 12 bits, row by row from the lowest row up; 002B the model, 0 = 4 x 8, 1 = 6 x 6.
 
-Inferred, not documented: that state and cells can be read together, as one question. The option ``state`` reads the
-cells alone. The maker's programs write registers with the low byte first, and read them with the high byte first; the
-bus' option ``byte_order`` is there for arrays that do otherwise.
+It is inferred, not documented, that state and cells can be read with one question; ``--no-state`` reads the cells
+alone. The maker's programs write registers with the low byte first, and read them with the high byte first; the bus'
+option ``byte_order`` is for arrays that differ.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = (1,)
     shapes: Annotated[
         tuple[Shape, ...],
-        Meta(description="rows and columns of each array, or of all; default: each is asked"),
+        Meta(description="rows and columns of each array, or of all; default: ask each"),
     ] = ()
     state: Annotated[bool, Meta(description="read along whether an array is ready; no: the cells alone")] = True
     period_ms: Annotated[
         Annotated[float, Meta(ge=1, le=10_000)] | None,
-        Meta(description="time between two readings of all arrays; default: 20, or what the line needs"),
+        Meta(description="time between two readings of all arrays; default: 20, or as long as the line needs"),
     ] = None
 
     def __post_init__(self) -> None:
@@ -76,23 +76,23 @@ class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DfrobotWatch(OrderWatch):
-    """Also tells which arrays are not ready."""
+    """Also log which arrays are not ready."""
 
     def __init__(self, tables: SkinTables) -> None:
         super().__init__(tables, _FULL_SCALE)
-        self._is_told_of: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
+        self._is_logged: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
 
     def look(self, updates: Updates) -> None:
         super().look(updates)
         unready = np.unique(updates.module[(updates.status & Status.NOT_CONNECTED).any(axis=1)])
-        for module in unready[~self._is_told_of[unready]].tolist():
+        for module in unready[~self._is_logged[unready]].tolist():
             log.warning("%s is not ready (register 0006 is not 1)", self.tables.structure.module_names[module])
-        self._is_told_of[unready] = True
+        self._is_logged[unready] = True
 
     def forget(self, patch: int) -> None:
-        """It is told again of an array that was set up anew."""
+        """Log again of an array that was set up again."""
         super().forget(patch)
-        self._is_told_of[self.tables.structure.module_patch == patch] = False
+        self._is_logged[self.tables.structure.module_patch == patch] = False
 
 
 class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
@@ -109,22 +109,22 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Arrays that tell nothing but 0 or are not ready, and values that no cell has."""
+        """Watch for arrays that send only 0 or are not ready, and for values that no cell has."""
         return DfrobotWatch(tables)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask each array for its shape, unless the options tell it.
+        """Ask each array for its shape, unless the options give it.
 
         Raises:
-            BusError: one does not answer, says what cannot be, or must not be asked.
+            BusError: an array does not answer, reports an unknown shape, or must not be asked.
         """
         units, shapes = self.options.units, list(self.options.shapes)
         if not shapes:
             if link.listen_only:
-                raise BusError("arrays tell their shape only on request, listening is not enough: say option shapes")
+                raise BusError("arrays must be asked for their shape, listening is not enough: say option shapes")
             shapes = [await self._ask_shape(link, unit) for unit in units]
         arrays = list(zip(units, shapes * len(units) if len(shapes) == 1 else shapes, strict=True))
-        has_state = self.options.state and not link.listen_only  # who else is master may not read it
+        has_state = self.options.state and not link.listen_only  # another master may not read it
         self.use_registers([_registers(unit, _GRIDS[shape], has_state=has_state) for unit, shape in arrays])
         self.geometry = Geometry.joined([_places(unit, _GRIDS[shape]) for unit, shape in arrays])
         self.patches = [_patch(unit, shape) for unit, shape in arrays]
@@ -132,7 +132,7 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Whether unit 1, which is what arrays are sold as, says that it is one."""
+        """Ask unit 1, the number with which arrays are sold, whether it is one."""
         adapter = cls(DfrobotOptions())
         [unit] = adapter.options.units
         [maker] = await adapter.read(link, _MAKER_AT, unit=unit, function=READ_INPUT)
@@ -151,7 +151,7 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
 
 
 def _order(grid: Grid) -> list[int]:
-    """Row by row from the top, which register each cell is in, counted from the first; and the other way round."""
+    """Return the register of each cell, counted from the first, row by row from the top; it is its own inverse."""
     return [int(cell) for cell in np.arange(grid.rows * grid.columns).reshape(grid.rows, -1)[::-1].ravel()]
 
 
@@ -173,5 +173,5 @@ def _patch(unit: int, shape: Shape) -> Patch:
 
 
 def _places(unit: int, grid: Grid) -> Geometry:
-    """Nominal ones: no pitch is published, and nobody knows how two arrays lie to each other."""
+    """Return nominal places: no pitch is published, and how two arrays lie to each other is not known."""
     return grid.at((0.0, 0.0, 0.0), ["pressure"], _uids(unit, grid), f"unit_{unit}_nominal")

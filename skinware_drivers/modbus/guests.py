@@ -1,6 +1,6 @@
-"""Other programs that ask through our line: whose question is next, and what is refused.
+"""Choose which question of other programs goes out on our line next, and refuse those that cannot be asked.
 
-Like :mod:`.master`, it reads no clock and knows no socket.
+As :mod:`.master`, it reads no clock and knows no socket.
 """
 
 from __future__ import annotations
@@ -8,116 +8,134 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 
+from skinware.realtime import NS_PER_S
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.trouble import Trouble
 from skinware_drivers.modbus.wire import Message
+from skinware_drivers.running.guard import Backoff
 
 _NO_SUCH_FUNCTION, _BAD_VALUE, _NO_WAY, _NO_ANSWER = 1, 3, 10, 11
 _EVERY_UNIT = 0
+_PATIENT_TIMES = 3
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
+
+
+class Retry:
+    """Space the attempts at something that fails again and again.
+
+    Attributes:
+        times: failures in a row.
+        until_ns: when the next attempt may be made.
+    """
+
+    def __init__(self) -> None:
+        self.times = 0
+        self.until_ns = 0
+        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
+
+    def failed(self, time_ns: int) -> None:
+        self.times += 1
+        if self.times >= _PATIENT_TIMES:
+            self.until_ns = time_ns + round(self._pauses.next_s() * NS_PER_S)
 
 
 class Guest(ABC):
     """A program that asks.
 
     Attributes:
-        waiting: its questions, in the order in which it asked; each with its own number.
+        waiting: its questions in the order in which it asked, each with the number that the program gave it.
     """
 
     def __init__(self) -> None:
         self.waiting: deque[Message] = deque()
 
     @abstractmethod
-    def tell(self, reply: Message) -> None:
-        """Hand it the reply to a question."""
+    def reply(self, message: Message) -> None:
+        """Send the program the reply to one of its questions."""
 
 
 class Guests:
-    """Who asks besides the master. One question at a time goes out, and each guest's in the order in which it asked.
+    """The programs that ask besides the master: one question goes out at a time, in each program's own order.
 
-    Guests take turns; who wants to write comes before who wants to read, but not twice in a row. A unit that does not
-    answer guests three times in a row is asked more and more rarely: each silence costs the line two timeouts.
+    Programs take turns. A write comes before a read, but not twice in a row. A unit that has left three questions of
+    programs in a row unanswered is asked more and more rarely, because each silence costs the line two timeouts.
 
     Args:
-        may_write: False: every write is refused.
-        over_tcp: the line is a connection; else unit 0 is everybody, and nobody answers.
+        may_write: False: refuse every write.
+        over_tcp: the line is a connection. On a serial line, unit 0 means every unit, and none answers.
     """
 
     def __init__(self, *, may_write: bool, over_tcp: bool) -> None:
         self._may_write, self._over_tcp = may_write, over_tcp
-        self._guests: list[Guest] = []  # who was served longest ago comes first
-        self._asked: tuple[Guest, Message] | None = None
+        self._guests: list[Guest] = []  # the one that was served longest ago comes first
+        self._open: tuple[Guest, Message] | None = None
         self._has_written = False
-        self._silent: dict[int, Trouble] = {}
+        self._silent: dict[int, Retry] = {}
 
     @property
     def are_waiting(self) -> bool:
         return any(guest.waiting for guest in self._guests)
 
-    def come(self, guest: Guest) -> None:
+    def join(self, guest: Guest) -> None:
         self._guests.append(guest)
 
     def leave(self, guest: Guest) -> None:
-        """It is not any more: its questions are forgotten. The reply to the open one will be for nobody."""
+        """Forget the guest's questions, and drop the reply to its open one when it comes."""
         guest.waiting.clear()
         self._guests.remove(guest)
 
     def ask(self, guest: Guest, question: Message) -> None:
-        """Take a question; what cannot be asked is refused when those that the guest asked before are answered."""
+        """Queue a question. One that cannot be asked is refused after the guest's earlier ones are answered."""
         guest.waiting.append(question)
-        if self._asked is None or self._asked[0] is not guest:
+        if self._open is None or self._open[0] is not guest:
             self._refuse_first(guest)
 
     def next(self, time_ns: int) -> Message | None:
-        """The question that is to be asked now, if there is one: ``answer`` is called when it is over."""
-        while (guest := self._next_guest()) is not None:
+        """Take the question that is to be asked now, if any; call ``answer`` when it is over."""
+        while waiting := [guest for guest in self._guests if guest.waiting]:
+            waiting.sort(key=lambda guest: wire.is_write(guest.waiting[0].data) is self._has_written)
+            guest = waiting[0]
             self._guests.remove(guest)
             self._guests.append(guest)
             question = guest.waiting.popleft()
-            trouble = self._silent.get(question.unit)
-            if trouble is not None and time_ns < trouble.until_ns:
+            retry = self._silent.get(question.unit)
+            if retry is not None and time_ns < retry.until_ns:
                 self._refuse(guest, question, _NO_ANSWER)
                 self._refuse_first(guest)
                 continue
             self._has_written = wire.is_write(question.data)
-            self._asked = guest, question
+            self._open = guest, question
             return question
         return None
 
     def give_up(self) -> None:
-        """Nobody will tell the reply to the open question."""
-        if self._asked is not None:
-            (guest, question), self._asked = self._asked, None
+        """Refuse the open question: its reply will not come."""
+        if self._open is not None:
+            (guest, question), self._open = self._open, None
             self._refuse(guest, question, _NO_ANSWER)
             self._refuse_first(guest)
 
     def answer(self, reply: bytes | None, time_ns: int) -> None:
-        """The open question is over, if there is one.
+        """End the open question, if there is one.
 
         Args:
-            reply: what was answered, also an exception; None: nothing.
+            reply: what the unit answered, which may be an exception; None: nothing.
             time_ns: now.
         """
-        if self._asked is None:
+        if self._open is None:
             return
-        guest, question = self._asked
+        guest, question = self._open
         if reply is None:
-            self._silent.setdefault(question.unit, Trouble()).again(time_ns)
+            self._silent.setdefault(question.unit, Retry()).failed(time_ns)
             self.give_up()
             return
-        self._asked = None
+        self._open = None
         self._silent.pop(question.unit, None)
         if guest in self._guests:
-            guest.tell(question._replace(data=reply))
+            guest.reply(question._replace(data=reply))
         self._refuse_first(guest)
 
-    def _next_guest(self) -> Guest | None:
-        waiting = [guest for guest in self._guests if guest.waiting]
-        writing = [guest for guest in waiting if wire.is_write(guest.waiting[0].data)]
-        reading = [guest for guest in waiting if guest not in writing]
-        first = reading + writing if self._has_written else writing + reading
-        return first[0] if first else None
-
     def _refuse_first(self, guest: Guest) -> None:
+        """Refuse the questions at the head of a guest's queue that cannot be asked."""
         while guest.waiting and (code := self._refusal(guest.waiting[0])):
             self._refuse(guest, guest.waiting.popleft(), code)
 
@@ -130,4 +148,4 @@ class Guests:
 
     def _refuse(self, guest: Guest, question: Message, code: int) -> None:
         if guest in self._guests:
-            guest.tell(question._replace(data=bytes([question.data[0] | wire.FAILED, code])))
+            guest.reply(question._replace(data=bytes([question.data[0] | wire.FAILED, code])))

@@ -1,11 +1,11 @@
 """Inspire Robots' RH56DFTP hand: 17 matrices with 1062 taxels, over Modbus TCP or RTU. The driver writes nothing.
 
-Source: the maker's manual PRJ-02-TS-U-010 V1.0.0 (and an older one, R1), and the bridge that Unitree publishes.
+Source: the maker's manual PRJ-02-TS-U-010 V1.0.0, an older one (R1), and the bridge that Unitree publishes.
 
 Taxels are in the holding registers from 3000 on, one after the other. *Addresses count bytes*: the register after 3000
-is 3002. Fingers are row-major; the palm is column-major, each column from the last row up. Inferred, not documented:
-that addresses count bytes in all reads, and that a read may go over the border of two matrices; the option
-``by_matrix`` does without both.
+is 3002. Fingers are row-major; the palm is column-major, each column from the last row up. Two rules are inferred, not
+documented: addresses count bytes in all reads, and a read may cross the border of two matrices. The option
+``by_matrix`` needs neither.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
-    unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; over TCP, the manual says 255")] = 1
+    unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; the manual has 255 over TCP")] = 1
     period_ms: Annotated[
         Annotated[float, Meta(ge=1, le=10_000)] | None,
-        Meta(description="time between two readings of the whole hand; default: 20, or what line and hand need"),
+        Meta(description="time between two readings of the whole hand; default: 20, or as long as the line needs"),
     ] = None
     by_matrix: Annotated[
-        bool, Meta(description="read each matrix by itself: 17 questions instead of 9, right whatever addresses count")
+        bool, Meta(description="read each matrix by itself: 17 questions instead of 9, and no rule about addresses")
     ] = False
 
     def __post_init__(self) -> None:
@@ -96,19 +96,22 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
         self.follows_line = options.period_ms is None
         if options.by_matrix:  # no address is computed, and no two matrices are read together
             self.address_step, self.largest_gap = 1, 0
-        self.registers = [_registers(options.unit, number) for number in range(len(_MATRICES))]
+        self.registers = [
+            Registers(each.address, each.rows * each.columns, options.unit, to=_channels(each), patch=0, module=number)
+            for number, each in enumerate(_MATRICES)
+        ]
         self.patches = [Patch(f"{options.side} hand", [_module(number) for number in range(len(_MATRICES))])]
         self.geometry = _places(Hand(options.side))
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """The hand; how long it takes for all its registers is learnt first."""
+        """Measure how long the hand takes for all its registers, then return it."""
         await self.learn_period(link)
         return self.patches
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Matrices that tell nothing but 0, and values that no taxel has."""
+        """Watch for matrices that send only 0, and for values that no taxel has."""
         return OrderWatch(tables, _FULL_SCALE)
 
 
@@ -119,16 +122,9 @@ def _channels(matrix: _Matrix) -> list[int]:
 
 
 def _uids(matrix: _Matrix) -> list[int]:
-    """Number of the register of each taxel, from 3000 on, row by row."""
+    """Return the number of each taxel's register, from 3000 on, row by row."""
     first = (matrix.address - _FIRST) // _BYTES
     return [first + int(place) for place in np.argsort(_channels(matrix))]
-
-
-def _registers(unit: int, number: int) -> Registers:
-    matrix = _MATRICES[number]
-    return Registers(
-        matrix.address, matrix.rows * matrix.columns, unit=unit, to=_channels(matrix), patch=0, module=number
-    )
 
 
 def _module(number: int) -> Module:
@@ -139,7 +135,7 @@ def _module(number: int) -> Module:
 
 
 def _places(hand: Hand) -> Geometry:
-    """Nominal ones: the manual gives no lengths."""
+    """Return nominal places: the manual gives no lengths."""
     found = []
     for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
         matrices = [matrix for matrix in _MATRICES if matrix.part == part]

@@ -1,6 +1,6 @@
-"""Who asks on a line: one question at a time, cycle after cycle; and who only overhears another master.
+"""Ask for registers on a line, one question at a time, cycle after cycle; or overhear another master.
 
-Both take bytes and give bytes and rows. They read no clock and know no port, so every moment can be tested.
+Both take bytes and return bytes and rows. They read no clock and know no port, so that tests choose every moment.
 """
 
 from __future__ import annotations
@@ -14,27 +14,26 @@ from typing import NamedTuple
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.guests import Guests
+from skinware_drivers.modbus.guests import Guests, Retry
 from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
-from skinware_drivers.modbus.trouble import Trouble
 from skinware_drivers.modbus.wire import Message
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 ANSWERS = 0x700
-"""Identifier of the frame that answers a driver's own question: this, and the unit. Its payload is the message."""
+"""Identifier of the frame that answers a driver's own question: this plus the unit. Its payload is the message."""
 _BUSY_NS, _SILENCE_NS = NS_PER_S // 100, NS_PER_S // 500
 _MOST_TRIES = 3
 _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
-"""In the place of a read: a question of the driver's own, and one of another program."""
+"""In place of the number of a read: a question of the driver's own, and one of another program."""
 _MANUALS_COUNT_FROM = 30_001
 _OVERHEARD_NS = NS_PER_S
-"""Registers that another master has read longer ago are not joined with newer ones."""
+"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 class Timing(NamedTuple):
-    """How a device wants to be asked, ns."""
+    """How a device is asked, ns."""
 
     period_ns: int
     timeout_ns: int
@@ -43,10 +42,10 @@ class Timing(NamedTuple):
 
 
 class Talk(ABC):
-    """What happens on one line.
+    """The conversation on one line.
 
     Attributes:
-        rows: frames that have become whole; whoever takes them removes them.
+        rows: frames that have become whole; the reader removes them.
     """
 
     def __init__(self) -> None:
@@ -54,51 +53,110 @@ class Talk(ABC):
 
     @abstractmethod
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Take what has come.
+        """Take bytes that have come.
 
         Raises:
-            ValueError: it is no Modbus, and nothing that follows could be understood.
+            ValueError: they are no Modbus, and bytes that follow could not be understood either.
         """
 
     @abstractmethod
     def say(self, time_ns: int) -> bytes:
-        """What is to be sent now; nothing: it is not the time."""
+        """Return the bytes to be sent now; none if nothing is due."""
 
     @property
     @abstractmethod
     def due_ns(self) -> int | None:
-        """When ``say`` has something to do; None: not before something is heard."""
+        """Time at which ``say`` has something to do; None: not before something is heard."""
 
 
 class Open(NamedTuple):
     """A question that waits for its reply."""
 
     message: Message
-    read: int  # below 0: another question
+    read: int  # below 0: no read of the schedule
     until_ns: int
     tries: int
 
 
-class Master(Talk):
-    """Asks for the registers of a plan, cycle after cycle, at absolute deadlines, and in between what it is told.
+class Schedule:
+    """The reads of a cycle in order, and a cycle in every period, at absolute deadlines.
 
-    A unit that does not answer three times in a row is asked more and more rarely if there are others; so is a read
+    A unit that has not answered three times in a row is asked more and more rarely if there are others; so is a read
     that is answered by an exception.
 
-    After a timeout nothing is asked until the late reply has come, or as much time again has passed. On a serial line,
-    replies do not tell what they answer. Over TCP they have the number of their question; but there are servers which,
-    when two questions are open, answer the first with the number of the second (pymodbus 3.16).
+    Args:
+        reads: of a cycle.
+        period_ns: from one cycle to the next.
+        begun_ns: now.
+
+    Attributes:
+        questions: of the reads.
+        cycle: number of the present cycle; -1 before the first.
+        cycle_ns: when it began.
+        deadline_ns: when the next one begins.
+        next: position of the next read in this cycle.
+        retries: of units ("unit", unit) and reads ("read", position) that fail.
+    """
+
+    def __init__(self, reads: list[Read], period_ns: int, begun_ns: int) -> None:
+        self.reads = reads
+        self.questions = [Message(read.unit, read.question) for read in reads]
+        self.cycle, self.cycle_ns, self.deadline_ns = -1, begun_ns, begun_ns
+        self.next = len(reads)
+        self.retries: dict[Hashable, Retry] = {}
+        self._period_ns = period_ns
+
+    @property
+    def is_within_cycle(self) -> bool:
+        return self.next < len(self.reads)
+
+    def is_due(self, time_ns: int) -> bool:
+        return self.is_within_cycle or (time_ns >= self.deadline_ns and bool(self.reads))
+
+    def take(self, time_ns: int, counters: BusCounters) -> int | None:
+        """Return the position of the read to be asked now, if any; a new cycle begins when it is due."""
+        if not self.is_within_cycle and self.is_due(time_ns):
+            missed = (time_ns - self.deadline_ns) // self._period_ns
+            counters.polls_missed += missed
+            self.deadline_ns += (missed + 1) * self._period_ns
+            self.cycle_ns, self.next = time_ns, 0
+            self.cycle += 1
+        while self.is_within_cycle:
+            position, self.next = self.next, self.next + 1
+            if self.cycle % self.reads[position].every == 0 and not self._rests(position, time_ns):
+                return position
+        return None
+
+    def retry(self, kind: str, number: int) -> Retry:
+        return self.retries.setdefault((kind, number), Retry())
+
+    def _rests(self, position: int, time_ns: int) -> bool:
+        """Return whether a read has failed again and again, and there are others to ask for."""
+        own, unit = self.retries.get(("read", position)), self.reads[position].unit
+        if own is not None and time_ns < own.until_ns and len(self.reads) > 1:
+            return True
+        of_unit = self.retries.get(("unit", unit))
+        others = any(other.unit != unit for other in self.reads)
+        return others and of_unit is not None and time_ns < of_unit.until_ns
+
+
+class Master(Talk):
+    """Ask for the registers of a schedule, and in between for what the driver and other programs ask.
+
+    After a timeout, nothing is asked until the late reply has come or as much time again has passed. On a serial line,
+    a reply does not say which question it answers. Over TCP it has the number of its question, but some servers, when
+    two questions are open, answer the first with the number of the second (pymodbus 3.16).
 
     Between two reads that are due, one question of other programs is asked. Those are never repeated.
 
     Args:
-        wanted: what is asked for.
-        timing: how.
+        wanted: the registers.
+        timing: of the device.
         counters: of the bus.
-        over_tcp: in a connection; else on a serial line.
+        over_tcp: the line is a connection, not a serial line.
         name: of the bus, for messages.
         begun_ns: now.
-        guests: other programs.
+        guests: the other programs.
     """
 
     def __init__(
@@ -113,115 +171,100 @@ class Master(Talk):
         guests: Guests | None = None,
     ) -> None:
         super().__init__()
-        self._timing, self._counters, self._name = timing, counters, name
+        self._timing, self._counters, self._name, self._guests = timing, counters, name, guests
         self._image = Image(wanted)
-        self._reads = wanted.reads()
-        self._questions = [Message(read.unit, read.question) for read in self._reads]
-        self._tcp = wire.TcpMessages(counters.framing) if over_tcp else None
-        self._rtu = None if over_tcp else wire.RtuMessages(counters.framing)
+        self._schedule = Schedule(wanted.reads(), timing.period_ns, begun_ns)
+        self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
+        self._number = 0  # of the last question; over TCP only
         self._commands: deque[Message] = deque()
-        self._guests = guests
         self._was_guest = False
-        self._troubles: dict[Hashable, Trouble] = {}
         self._open: Open | None = None
         self._late: Open | None = None
-        self._has_told_late = False
         self._again: Open | None = None
-        self._number = 0
-        self._free_ns = self._cycle_ns = begun_ns
-        self._deadline_ns = begun_ns
-        self._cycle = -1
-        self._next = len(self._reads)
+        self._free_ns = begun_ns
 
     def command(self, message: Message) -> bool:
-        """Have something asked before the next read; False: there are too many already."""
+        """Queue a question of the driver's own before the next read; return False if too many wait already."""
         if len(self._commands) < _MOST_COMMANDS:
             self._commands.append(message)
             return True
         return False
 
     @property
-    def _has_guests(self) -> bool:
+    def pending(self) -> int:
+        """Bytes that may still become part of a message."""
+        return self._line.pending
+
+    @property
+    def _guests_wait(self) -> bool:
         return self._guests is not None and self._guests.are_waiting
 
     @property
-    def _holds_back(self) -> bool:
-        """Whether something has come that is no whole message."""
-        found = self._tcp if self._rtu is None else self._rtu
-        return found is not None and found.pending > 0
-
-    @property
     def due_ns(self) -> int | None:
-        """A timeout, the end of a pause, or the beginning of a cycle."""
+        """Time of a timeout, of the end of a pause, or of the beginning of a cycle."""
         if self._open is not None:
             return self._open.until_ns
-        if self._commands or self._again is not None or self._next < len(self._reads) or self._has_guests:
+        if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests_wait:
             return self._free_ns
-        return max(self._free_ns, self._deadline_ns) if self._reads else None
+        return max(self._free_ns, self._schedule.deadline_ns) if self._schedule.reads else None
 
     def say(self, time_ns: int) -> bytes:
         if self._open is not None and time_ns >= self._open.until_ns:
             self._give_up(self._open, time_ns)
         if self._open is not None or time_ns < self._free_ns:
             return b""
-        self._end_lateness()
+        if self._late is not None:  # a reply that comes even later is noise, or answers the same question again
+            self._late = None
+            self._drop_from_line()
         if self._again is not None:
             again, self._again = self._again, None
             return self._ask(again.message, again.read, time_ns, again.tries)
         if self._commands:
             return self._ask(self._commands.popleft(), _COMMAND, time_ns)
-        is_due = self._next < len(self._reads) or (time_ns >= self._deadline_ns and bool(self._reads))
-        if self._guests is not None and not (is_due and self._was_guest):
+        if self._guests is not None and not (self._schedule.is_due(time_ns) and self._was_guest):
             question = self._guests.next(time_ns)
             if question is not None:
                 self._was_guest = True
                 return self._ask(question, _GUEST, time_ns)
         self._was_guest = False
-        if self._next == len(self._reads) and time_ns >= self._deadline_ns and self._reads:
-            self._begin_cycle(time_ns)
-        while self._next < len(self._reads):
-            read, self._next = self._next, self._next + 1
-            if self._cycle % self._reads[read].every == 0 and not self._is_left_alone(read, time_ns):
-                return self._ask(self._questions[read], read, time_ns)
-        return b""
+        read = self._schedule.take(time_ns, self._counters)
+        return b"" if read is None else self._ask(self._schedule.questions[read], read, time_ns)
 
     def heard(self, chunk: bytes, time_ns: int) -> None:
         """Look for the reply; see :meth:`Talk.heard`."""
-        if self._tcp is not None:
-            for message in self._tcp.feed(chunk):
-                self._take(message, time_ns)
-        elif self._rtu is not None:
-            self._rtu.feed(chunk)
-            self._look_on_line(self._rtu, time_ns)
-
-    def _look_on_line(self, line: wire.RtuMessages, time_ns: int) -> None:
-        if self._late is not None:
-            found = line.reply_to(self._late.message.unit, self._late.message.data)
-            if found is not None:
-                self._take_late(self._late, found, time_ns)
-        elif self._open is None:
-            line.drop()
-        else:
-            asked, damaged = self._open, self._counters.framing.checksum_errors
-            found = line.reply_to(asked.message.unit, asked.message.data)
-            if found is not None:
-                self._take(found, time_ns)
-                line.drop()  # nobody may speak unasked
-            elif self._counters.framing.checksum_errors > damaged:
-                self._take_damaged(asked, time_ns)
-
-    def _take(self, message: Message, time_ns: int) -> None:
-        asked = self._open
-        if asked is None or message.number != asked.message.number or message.unit != asked.message.unit:
-            if self._late is not None and message.number == self._late.message.number:
-                self._take_late(self._late, message, time_ns)
-            else:
-                self._counters.refused += 1
+        if isinstance(self._line, wire.TcpMessages):
+            for message in self._line.feed(chunk):
+                self._take_numbered(message, time_ns)
             return
+        self._line.feed(chunk)
+        asked = self._late or self._open
+        if asked is None:
+            self._line.drop()
+            return
+        damaged = self._counters.framing.checksum_errors
+        found = self._line.reply_to(asked.message.unit, asked.message.data)
+        if asked is self._late:
+            if found is not None:
+                self._take_late(asked, found, time_ns)
+        elif found is not None:
+            self._take(asked, found, time_ns)
+            self._line.drop()  # no unit may speak unasked
+        elif self._counters.framing.checksum_errors > damaged:
+            self._take_damaged(asked, time_ns)
+
+    def _take_numbered(self, message: Message, time_ns: int) -> None:
+        asked, late = self._open, self._late
+        if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
+            self._take(asked, message, time_ns)
+        elif late is not None and message.number == late.message.number:
+            self._take_late(late, message, time_ns)
+        else:
+            self._counters.refused += 1
+
+    def _take(self, asked: Open, message: Message, time_ns: int) -> None:
         self._open = None
         self._free_ns = time_ns + self._timing.turnaround_ns
-        self._troubles.pop(("unit", message.unit), None)
-        code = wire.exception_of(message.data)
+        self._schedule.retries.pop(("unit", message.unit), None)
         if not wire.is_reply(asked.message.data, message.data):
             self._counters.framing.refused += 1
             self._answer_guest(asked, None, time_ns)
@@ -229,35 +272,35 @@ class Master(Talk):
             self._answer_guest(asked, message.data, time_ns)
         elif asked.read == _COMMAND:
             self.rows.append(Row(time_ns, ANSWERS | message.unit, message.data))
-        elif code:
+        elif code := wire.exception_of(message.data):
             self._take_exception(asked, code, time_ns)
         else:
-            self._troubles.pop(("read", asked.read), None)
-            read = self._reads[asked.read]
-            self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._cycle_ns)
+            self._schedule.retries.pop(("read", asked.read), None)
+            self._take_registers(asked.read, message, time_ns)
+
+    def _take_registers(self, position: int, message: Message, time_ns: int) -> None:
+        read = self._schedule.reads[position]
+        self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._schedule.cycle_ns)
 
     def _take_late(self, asked: Open, message: Message, time_ns: int) -> None:
-        """A reply after its timeout: the device lives, and what it says is shown."""
+        """Use a reply that came after its timeout: the device lives."""
         self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
         self._counters.polls_late += 1
-        self._troubles.pop(("unit", message.unit), None)
-        if not self._has_told_late:
-            self._has_told_late = True
-            late_ms, timeout_ms = (time_ns - asked.until_ns) / 1e6, self._timing.timeout_ns / 1e6
+        self._schedule.retries.pop(("unit", message.unit), None)
+        if self._counters.polls_late == 1:
             log.warning(
                 "%s: unit %d answers %.3g ms after timeout_s = %.3g ms: make timeout_s longer; logged once",
                 self._name,
                 message.unit,
-                late_ms,
-                timeout_ms,
+                (time_ns - asked.until_ns) / 1e6,
+                self._timing.timeout_ns / 1e6,
             )
         is_good = wire.is_reply(asked.message.data, message.data) and not wire.exception_of(message.data)
         if asked.read >= 0 and is_good:
-            read = self._reads[asked.read]
-            self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._cycle_ns)
+            self._take_registers(asked.read, message, time_ns)
 
     def _take_damaged(self, asked: Open, time_ns: int) -> None:
-        """What came is as long as the reply, and is none: ask again once the line is silent."""
+        """Ask again, once the line is silent, after bytes that are as long as the reply and are none."""
         self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
         if asked.read == _GUEST:
             self._answer_guest(asked, None, time_ns)
@@ -273,66 +316,45 @@ class Master(Talk):
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
             return
-        trouble = self._troubles.setdefault(("read", asked.read), Trouble())
-        if not trouble.times:
-            read = self._reads[asked.read]
+        retry = self._schedule.retry("read", asked.read)
+        if not retry.times:
+            read = self._schedule.reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
             log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), _advice(code, read))
-        trouble.again(time_ns)
+        retry.failed(time_ns)
 
     def _give_up(self, asked: Open, time_ns: int) -> None:
         self._open = None
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
-            self._troubles.setdefault(("unit", asked.message.unit), Trouble()).again(time_ns)
+            self._schedule.retry("unit", asked.message.unit).failed(time_ns)
         self._answer_guest(asked, None, time_ns)
         self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns
-        if self._rtu is not None:
-            self._rtu.drop()
+        self._drop_from_line()
 
-    def _end_lateness(self) -> None:
-        """A reply that comes even later than this is taken for noise, or for the reply to the same question again."""
-        if self._late is not None and self._rtu is not None:
-            self._rtu.drop()
-        self._late = None
+    def _drop_from_line(self) -> None:
+        """Drop half a message from a serial line, where no number says which question a reply answers."""
+        if isinstance(self._line, wire.RtuMessages):
+            self._line.drop()
 
     def _ask(self, message: Message, read: int, time_ns: int, tries: int = 0) -> bytes:
-        until_ns = time_ns + self._timing.timeout_ns
-        if self._tcp is not None:
+        self._drop_from_line()
+        over_tcp = isinstance(self._line, wire.TcpMessages)
+        if over_tcp:
             self._number = self._number % 0xFFFF + 1
-        elif self._rtu is not None:
-            self._rtu.drop()
         message = message._replace(number=self._number)
-        self._open = Open(message, read, until_ns, tries + 1)
+        self._open = Open(message, read, time_ns + self._timing.timeout_ns, tries + 1)
         self._counters.sent += 1
-        return wire.rtu_frame(message) if self._tcp is None else wire.tcp_frame(message)
-
-    def _begin_cycle(self, time_ns: int) -> None:
-        period_ns = self._timing.period_ns
-        missed = (time_ns - self._deadline_ns) // period_ns
-        self._counters.polls_missed += missed
-        self._deadline_ns += (missed + 1) * period_ns
-        self._cycle_ns, self._next = time_ns, 0
-        self._cycle += 1
-
-    def _is_left_alone(self, read: int, time_ns: int) -> bool:
-        """Whether it has failed again and again, and there are others."""
-        unit = self._troubles.get(("unit", self._reads[read].unit))
-        own = self._troubles.get(("read", read))
-        if own is not None and time_ns < own.until_ns and len(self._reads) > 1:
-            return True
-        others = any(other.unit != self._reads[read].unit for other in self._reads)
-        return others and unit is not None and time_ns < unit.until_ns
+        return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 
 
 class Overheard:
-    """Joins what another master reads.
+    """Join what another master reads.
 
-    A master that asks what we would ask first begins its cycle there: what it has read before is then not joined with
-    what comes after.
+    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
 
     Args:
-        wanted: what is looked for in the replies.
+        wanted: the registers to look for.
     """
 
     def __init__(self, wanted: Wanted) -> None:
@@ -342,12 +364,12 @@ class Overheard:
         self._cycle_ns = 0
 
     def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
-        """The frames that are whole now.
+        """Take a reply; return the frames that are whole now.
 
         Args:
             asked: the question.
-            registers: bytes of what was replied.
-            time_ns: when.
+            registers: bytes of the registers in the reply.
+            time_ns: when it came.
         """
         if (asked.unit, asked.data) == self._first:
             self._cycle_ns = time_ns
@@ -356,12 +378,12 @@ class Overheard:
 
 
 class Listener(Talk):
-    """Pairs the questions of another master with their replies, on a line that it taps. It never says anything.
+    """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
-    A reply does not tell which registers it holds, so one whose question was not heard is not used.
+    A reply does not say which registers it holds, so a reply is dropped if its question was not heard.
 
     Args:
-        wanted: what is looked for in the replies.
+        wanted: the registers to look for.
         counters: of the bus.
     """
 

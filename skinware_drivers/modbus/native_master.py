@@ -1,7 +1,7 @@
-"""A master whose questions C asks, also while the event loop rests, as long as all replies come as they should.
+"""Let C ask a master's questions, even while the event loop rests, as long as every reply is good and in time.
 
-``asking.c`` does what :meth:`Master.say` and :meth:`Master.heard` do with a good reply, on the same image. Timeouts,
-exceptions, damage, and questions of the driver's own are Python's: C stops there, and Python goes on from its state.
+``asking.c`` does what :meth:`Master.say` and :meth:`Master.heard` do with a good reply, on the same image. C stops at a
+timeout, an exception, a damaged reply or a question of the driver's own, and Python goes on from its state.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import CRC16_MODBUS
 
 _MOST_BLOCKS = 32
-"""Frames that end in one read: a batch has room for them."""
+"""Frames that end in one read: a batch has room for so many."""
 _ROOM = 1024
 
 
 class NativeMaster(Master):
-    """See :class:`skinware_drivers.modbus.master.Master`."""
+    """A master that C can take over; see :class:`skinware_drivers.modbus.master.Master`."""
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
+        self._over_tcp = isinstance(self._line, wire.TcpMessages)
         self._arrays = structs.Arrays()
         self._buffer = np.zeros(_ROOM, np.uint8)
-        rows = [self._compile(read) for read in self._reads]
+        rows = [self._compile(read) for read in self._schedule.reads]
         self._asker = structs.Asker(
-            is_tcp=self._tcp is not None,
+            is_tcp=self._over_tcp,
             n_reads=len(rows),
             reads=self._arrays.structs(structs.AskedRead, rows)[1],
             most_blocks=max((row.n_blocks for row in rows), default=0),
@@ -42,7 +43,7 @@ class NativeMaster(Master):
             buffer=self._arrays.at(self._buffer),
             crc_table=self._arrays.of(CRC16_MODBUS.table, np.uint32),
         )
-        is_plain = self._image.is_plain and all(read.every == 1 for read in self._reads)
+        is_plain = self._image.is_plain and all(read.every == 1 for read in self._schedule.reads)
         self._can = is_plain and 0 < self._asker.most_blocks <= _MOST_BLOCKS
         self._is_stuck = False
 
@@ -51,56 +52,57 @@ class NativeMaster(Master):
         return super().say(time_ns)
 
     def hand_over(self, fd: int, guests_fd: int) -> int | None:
-        """Have C go on, until ``take_back`` is called.
+        """Let C go on until ``take_back`` is called.
 
         Args:
             fd: of the port.
-            guests_fd: readable when another program wants something; -1: none can.
+            guests_fd: is readable when another program wants something; -1: no program can.
 
         Returns:
-            The address of its state; None: there is something that only Python can do.
+            The address of C's state; None: only Python can do what comes next.
         """
-        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows or self._has_guests
+        schedule = self._schedule
+        asks_otherwise = self._commands or self._again or self._late or schedule.retries or self._guests_wait
         is_unusual = self._open is not None and (self._open.read < 0 or self._open.tries > 1)
-        if not self._can or self._is_stuck or asks_otherwise or is_unusual or self._holds_back:
+        if not self._can or self._is_stuck or asks_otherwise or is_unusual or self.rows or self.pending:
             return None
         asker, counters = self._asker, self._counters
         asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, guests_fd, 0, 0
-        asker.open, asker.next = -1, self._next
+        asker.open, asker.next = -1, schedule.next
         if self._open is not None:
             asker.open, asker.until_ns = self._open.read, self._open.until_ns
-            if self._tcp is not None:
+            if self._over_tcp:
                 row = ctypes.cast(asker.reads, ctypes.POINTER(structs.AskedRead))[self._open.read]
                 ctypes.memmove(row.reply, self._number.to_bytes(2, "big"), 2)
-        asker.number, asker.cycle = self._number, self._cycle
-        asker.free_ns, asker.cycle_ns, asker.deadline_ns = self._free_ns, self._cycle_ns, self._deadline_ns
+        asker.number, asker.cycle, asker.free_ns = self._number, schedule.cycle, self._free_ns
+        asker.cycle_ns, asker.deadline_ns = schedule.cycle_ns, schedule.deadline_ns
         asker.sent, asker.polls_missed, asker.frames = counters.sent, counters.polls_missed, counters.frames
         framing = counters.framing
         asker.bytes_in, asker.frame_bytes, asker.found = framing.bytes_in, framing.frame_bytes, framing.frames
         return ctypes.addressof(asker)
 
     def take_back(self) -> bytes:
-        """Go on from where C is; gives what it has read and not understood."""
-        asker, counters = self._asker, self._counters
+        """Go on from C's state; return the bytes that it has read and not understood."""
+        asker, counters, schedule = self._asker, self._counters, self._schedule
         self._is_stuck = bool(asker.is_stuck)
-        self._number, self._cycle, self._next = asker.number, asker.cycle, asker.next
-        self._free_ns, self._cycle_ns, self._deadline_ns = asker.free_ns, asker.cycle_ns, asker.deadline_ns
+        self._number, schedule.cycle, schedule.next = asker.number, asker.cycle, asker.next
+        self._free_ns, schedule.cycle_ns, schedule.deadline_ns = asker.free_ns, asker.cycle_ns, asker.deadline_ns
         counters.sent, counters.polls_missed, counters.frames = asker.sent, asker.polls_missed, asker.frames
         framing = counters.framing
         framing.bytes_in, framing.frame_bytes, framing.frames = asker.bytes_in, asker.frame_bytes, asker.found
-        number = self._number if self._tcp is not None else 0
         self._open = None
         if asker.open >= 0:
-            message = self._questions[asker.open]._replace(number=number)
+            message = schedule.questions[asker.open]._replace(number=self._number if self._over_tcp else 0)
             self._open = Open(message, asker.open, asker.until_ns, 1)
         return self._buffer[: asker.size].tobytes()
 
     def _compile(self, read: Read) -> structs.AskedRead:
         message = Message(read.unit, read.question)
-        question = wire.rtu_frame(message) if self._tcp is None else wire.tcp_frame(message)
+        framed = wire.tcp_frame if self._over_tcp else wire.rtu_frame
+        question = framed(message)
         reply = Message(read.unit, bytes([read.function, 2 * read.count]) + bytes(2 * read.count))
-        whole = wire.rtu_frame(reply) if self._tcp is None else wire.tcp_frame(reply)
-        head = len(whole) - 2 * read.count - (2 if self._tcp is None else 0)
+        whole = framed(reply)
+        head = len(whole) - 2 * read.count - (0 if self._over_tcp else 2)
         area = self._image.areas[read.area]
         blocks = [
             structs.AskedBlock(

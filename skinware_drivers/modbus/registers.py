@@ -1,7 +1,7 @@
-"""Which registers a driver wants, in which reads they are asked for, and what has been heard of them.
+"""Plan the reads for the registers that a driver declares, and keep their newest content.
 
-A driver declares *blocks*: each becomes one frame of its layout. The plan of reads is made from them: near blocks are
-asked for together, long ones in several reads. A frame comes when all registers of its block have.
+A driver declares *blocks*: each becomes one frame of its layout. Blocks that are near each other are asked for
+together, long ones in several reads. A frame is whole when all registers of its block have come.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class Registers:
     """A block of registers with values of one module.
 
     Attributes:
-        address: of the first register, as the protocol counts: from 0.
-        count: of registers.
+        address: of the first register; as in the protocol, addresses begin with 0.
+        count: number of registers.
         unit: address of the device on its line.
-        function: with which it is read: 3 or 4.
+        function: of the read, 3 or 4.
         dtype: of the values: ``u2``, ``i2``, ``u4``, ``i4`` or ``f4``.
-        to: channel of the module that each value belongs to, None = dropped; default: 0, 1, 2 ...
+        to: channel of the module for each value, None = dropped; default: 0, 1, 2 ...
         patch: key of the patch, if a bus has several.
         module: key of the module, if the patch has several.
-        every: it is read in each cycle (1), in every second one (2) ...
-        flags: what sets status bits in it, beside the ``flags`` of the adapter.
-        values: where the values are in the bytes of the block, for blocks that are not values of one ``dtype`` one
-            after the other; then ``dtype`` and ``to`` are not used. Blocks may overlap.
+        every: read it in each cycle (1), in every second one (2) ...
+        flags: conditions that set status bits in this block, besides the ``flags`` of the adapter.
+        values: places of the values in the bytes of the block, unless it holds values of one ``dtype`` one after the
+            other; ``dtype`` and ``to`` are not used then. Blocks may overlap.
     """
 
     address: int
@@ -60,7 +60,7 @@ class Registers:
 
     @property
     def runs(self) -> Sequence[Values]:
-        """Where the values are in the bytes of the block."""
+        """Places of the values in the bytes of the block."""
         return self.values or (Values(0, f">{self.dtype}", self.count // self.words, self.to),)
 
     @property
@@ -69,13 +69,13 @@ class Registers:
         return f"registers {self.address} of unit {self.unit}"
 
     def check(self, step: int = 1) -> None:
-        """Refuse what cannot be.
+        """Check the declaration.
 
         Args:
-            step: by how much the address grows from one register to the next.
+            step: from the address of one register to the next.
 
         Raises:
-            ConfigurationError: what is wrong.
+            ConfigurationError: a field makes no sense; the message says which.
         """
         name = self.name
         for what in ("address", "count", "unit", "function", "every"):
@@ -124,12 +124,12 @@ class Read:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a device is asked for.
+    """The registers that a driver wants, and how they can be read.
 
     Attributes:
         blocks: of registers.
-        step: by how much the address grows from one register to the next: 2 where addresses count bytes.
-        largest_gap: registers that nobody wants, but that are read along rather than ask twice.
+        step: from the address of one register to the next: 2 where addresses count bytes.
+        largest_gap: unwanted registers that are read along at most, to save a question.
         most: registers of a read.
         byte_order: of the bytes of a register.
         word_order: of the registers of a value that has several.
@@ -143,7 +143,7 @@ class Wanted:
     word_order: Order = "big"
 
     def reads(self) -> list[Read]:
-        """The questions of a cycle: as few as possible, in order of address."""
+        """Return the questions of a cycle: as few as possible, in order of address."""
         return [
             Read(
                 area.unit,
@@ -159,7 +159,7 @@ class Wanted:
         ]
 
     def areas(self) -> list[Registers]:
-        """What is read without a gap, as blocks without meaning."""
+        """Return the ranges that are read without a gap, as blocks without values."""
         found: list[Registers] = []
         for block in sorted(self.blocks, key=lambda b: (b.unit, b.function, b.every, b.address)):
             last = found[-1] if found else None
@@ -178,7 +178,7 @@ def _key(block: Registers) -> tuple[int, int, int]:
 
 
 class Row(NamedTuple):
-    """A frame that is whole."""
+    """A whole frame."""
 
     time_ns: int
     identifier: int
@@ -189,10 +189,10 @@ class Area:
     """Registers without a gap between them.
 
     Attributes:
-        where: they are.
+        where: unit, function, first address and count.
         registers: (n, 2) uint8, as they came.
-        heard_ns: (n,) int64, when.
-        blocks: identifier and first register of the blocks in it.
+        heard_ns: (n,) int64, when each came.
+        blocks: identifier, first register and declaration of each block in it.
     """
 
     def __init__(self, where: Registers) -> None:
@@ -203,7 +203,7 @@ class Area:
 
 
 class Image:
-    """What was last heard of all wanted registers.
+    """The newest content of all wanted registers.
 
     Args:
         wanted: the blocks; the identifier of a frame is the number of its block.
@@ -211,7 +211,7 @@ class Image:
     Attributes:
         areas: the registers.
         told_ns: (n_blocks,) int64, when the frame of each was last whole.
-        is_plain: frames are the registers as they come.
+        is_plain: a frame has the bytes of its registers as they come.
     """
 
     def __init__(self, wanted: Wanted) -> None:
@@ -224,17 +224,14 @@ class Image:
             area.blocks.append((number, first, block))
 
     def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
-        """Take registers that were read.
+        """Store registers that were read; return the frames that are whole now.
 
         Args:
-            area: of the plan.
-            first: register in it.
+            area: number of the area.
+            first: their first register in it.
             data: their bytes.
             time_ns: when they came.
-            since_ns: registers that were heard before do not count.
-
-        Returns:
-            The frames that are whole now.
+            since_ns: registers that came before do not count.
         """
         place = self.areas[area]
         end = first + len(data) // 2
@@ -251,7 +248,7 @@ class Image:
         return rows
 
     def overhear(self, unit: int, question: bytes, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
-        """Take registers that another master has read, as far as they are wanted; see :meth:`put`."""
+        """Store the wanted ones of the registers that another master has read; see :meth:`put`."""
         address, count = int.from_bytes(question[1:3], "big"), int.from_bytes(question[3:5], "big")
         rows: list[Row] = []
         for number, area in enumerate(self.areas):
@@ -271,7 +268,7 @@ class Image:
         return (area, first) if is_in else None
 
     def _bytes(self, registers: npt.NDArray[np.uint8], block: Registers) -> bytes:
-        """In the order of the layout: the most significant byte first."""
+        """Return the bytes in the order of the layout: the most significant byte first."""
         if self._wanted.byte_order == "little":
             registers = registers[:, ::-1]
         data = registers.tobytes()
@@ -282,6 +279,6 @@ class Image:
 
 
 def _turned(data: bytes, run: Values) -> bytes:
-    """The values of a run with their registers in the other order."""
+    """Return the values of a run with their registers in the other order."""
     words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
     return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()

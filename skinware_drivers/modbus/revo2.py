@@ -1,7 +1,14 @@
-"""BrainCo's Revo2 hands with touch, in all four editions, over Modbus RTU. The driver asks the hand which one it is.
+"""BrainCo's Revo2 hands with touch, in all four editions, over Modbus RTU. The driver asks the hand for its edition.
 
-See :mod:`skinware_drivers.modbus.revo2_editions` for the registers and their sources. Proximities have 32 bits, the
-high word first, as the maker's program reads them (bc_stark_sdk 2.0.8). One user's report has the low word first
+Sources:
+
+* The maker's program bc_stark_sdk 2.0.8 (PyPI, MIT): its tables ``RegAddrRevo2`` and ``TouchVendor``, and its questions
+  to a server whose registers hold their own numbers, on 2026-11-23.
+* BrainCoTech/stark-serialport-example, commit b27b922 of 2026-04-16: status of a finger
+  (``python/revo2/revo2_touch.py``), 0.01 N a count (``python/gui/realtime_monitor_panel.py``), mN of the Pressure
+  edition (``c/demo/hand_monitor.cpp``) and its three kinds of values (``c/platform/linux/revo2_ec/ec_types.h``).
+
+A proximity has 32 bits, the high word first, as bc_stark_sdk 2.0.8 reads it. One user's report has the low word first
 (BrainCoTech/unitree-g1-brainco-hand, pull request 1, firmware 1.0.14.U); ``word_order=little`` of the bus reads that.
 """
 
@@ -19,18 +26,17 @@ from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware.sensor_types import SensorType
+from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers.bus import Bus
 from skinware_drivers.decoding.skin_state import Updates
-from skinware_drivers.description import Module, Patch, SkinTables
-from skinware_drivers.hand import Grid, Hand
+from skinware_drivers.description import Module, Patch, Sensor, SkinTables, taxels
+from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.layout import AnyFlag, Flag, Sentinel, Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus import revo2_editions as of_hand
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
-from skinware_drivers.modbus.revo2_editions import EDITIONS, EditionName, content
-from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
+from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Notice, Watch, ZeroWatch
@@ -43,6 +49,147 @@ _LEFT_SKUS = (2, 4)
 _SWITCHING_S, _CALIBRATING_S = 0.3, 0.5
 _LOOK_S, _LONGEST_S = 1.0, 60.0
 
+EditionName = Literal["touch", "pressure", "force3d", "array_pressure"]
+_SIDE_AT, _EDITION_AT, _KIND_AT, _FIRMWARE_AT, _SERIAL_AT = 901, 970, 6000, 3000, 3010
+_FORCES_AT = 4200
+_NO_FORCE = 0xFFFF
+_NO_PROXIMITY = 0xFFFF_FFFF
+
+_VENDOR = 0x7E07F << 12
+_TANGENTIAL = SensorType("tangential_force", _VENDOR | 1, "N", scale=1e-2, minimum=0)
+_DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0)
+_SUMS = tuple(SensorType(f"total_force_{axis}", _VENDOR | 3 + n, "counts") for n, axis in enumerate("xyz"))
+_SUM = SensorType("total_force_z", _VENDOR | 5, "N", scale=1e-3, minimum=0)
+_MOMENTS = tuple(SensorType(f"moment_{axis}", _VENDOR | 6 + n, "counts", minimum=0) for n, axis in enumerate("xy"))
+_POINTS_OF_PRESSURE = (
+    PRESSURE.measured(unit="counts", minimum=0),
+    PRESSURE.measured(scale=1000, minimum=0),
+    FORCE_Z.measured(scale=1e-3, minimum=0),
+)
+
+
+class _Edition(NamedTuple):
+    """The command registers of an edition: the first, and how many.
+
+    Attributes:
+        switches: switch its sensors on.
+        calibration: take the present values as untouched.
+        reset: set the sensors' channels up again; None: it has no such registers.
+    """
+
+    switches: tuple[int, int]
+    calibration: tuple[int, int]
+    reset: tuple[int, int] | None = None
+
+
+_EDITIONS: dict[EditionName, _Edition] = {
+    "touch": _Edition((4000, 5), (4010, 5), (4005, 5)),
+    "pressure": _Edition((6200, 6), (6310, 6)),
+    "array_pressure": _Edition((8000, 1), (8010, 1)),
+    "force3d": _Edition((7001, 4), (7006, 4)),
+}
+"""In the order of their numbers in register 970, from 1 on."""
+
+
+class _Content(NamedTuple):
+    """Sensor types, modules, and the registers of each module."""
+
+    types: Sequence[SensorType]
+    modules: Sequence[Module]
+    registers: Sequence[Registers]
+
+
+def _content(edition: EditionName, unit: int, *, kind: int = 0, with_status: bool = True) -> _Content:
+    """Return the content of an edition.
+
+    Args:
+        edition: of the hand.
+        unit: its number on the line.
+        kind: of the values of the Pressure edition: 0 raw, 1 pressure (kPa), 2 force (mN).
+        with_status: read along the status that fingers report.
+    """
+    make = {"touch": _touch, "pressure": _pressure, "force3d": _force3d, "array_pressure": _array_pressure}[edition]
+    return make(unit, kind, with_status)
+
+
+def _touch(unit: int, _kind: int, with_status: bool) -> _Content:
+    force = FORCE_Z.measured(scale=1e-2, minimum=0)
+    types = (force, _TANGENTIAL, _DIRECTION, PROXIMITY.measured(unit="counts", minimum=0))
+    modules, registers = list[Module](), list[Registers]()
+    for finger, name in enumerate(FINGERS):
+        channels = [Sensor(kind.name, finger) for kind in types[:3]]
+        modules.append(Module(channels, finger, "1x1", f"{name} tip"))
+        registers.append(_of_touch(unit, finger, finger, 3 * finger, ">u2", 3, _NO_FORCE, with_status))
+    for finger, name in enumerate(FINGERS):
+        modules.append(Module([Sensor(PROXIMITY.name, finger)], 5 + finger, "1x1", f"{name} proximity"))
+        place = 15 + 2 * finger
+        registers.append(_of_touch(unit, 5 + finger, finger, place, ">u4", 1, _NO_PROXIMITY, with_status))
+    return _Content(types, modules, registers)
+
+
+def _of_touch(
+    unit: int, module: int, finger: int, place: int, dtype: str, count: int, none: int, with_status: bool
+) -> Registers:
+    """Read all thirty registers for some values and a finger's status: 0 normal, 1 abnormal, 2 no sensor."""
+    flags: list[AnyFlag] = [Sentinel(Status.NOT_CONNECTED, none)]
+    if not with_status:
+        words = count * (2 if dtype == ">u4" else 1)
+        return Registers(_FORCES_AT + place, words, unit, READ_INPUT, dtype[1:], patch=0, module=module, flags=flags)
+    said = 2 * (25 + finger)
+    flags += [Flag(Status.NOT_CONNECTED, said, ">u2", mask=2), Flag(Status.SUSPECT, said, ">u2", mask=0xFFFD)]
+    values = [Values(2 * place, dtype, count)]
+    return Registers(_FORCES_AT, 30, unit, READ_INPUT, patch=0, module=module, flags=flags, values=values)
+
+
+def _pressure(unit: int, kind: int, _with_status: bool) -> _Content:
+    """Nine points on each finger and 46 on the palm, and the sum of each of them."""
+    point = _POINTS_OF_PRESSURE[kind]
+    parts = [*((f"{finger} tip", 9) for finger in FINGERS), ("palm", 46)]
+    modules, registers, first = list[Module](), list[Registers](), 6010
+    for key, (name, count) in enumerate(parts):
+        modules.append(Module(taxels(count, point.name, first_uid=key << 8), key, f"{count} points", name))
+        registers.append(Registers(first, count, unit, READ_INPUT, patch=0, module=key))
+        first += count
+    sums = taxels(len(parts), _SUM.name)
+    modules.append(Module(sums, len(parts), "sums", "sums"))
+    registers.append(Registers(6001, len(parts), unit, READ_INPUT, patch=0, module=len(parts)))
+    return _Content((point, _SUM), modules, registers)
+
+
+def _force3d(unit: int, _kind: int, _with_status: bool) -> _Content:
+    """Three forces at 31 points of four fingers, and their sums: x and y in the bytes of a register, z in the next."""
+    axes = tuple(axis.measured(unit="counts") for axis in FORCE)
+    modules, registers = list[Module](), list[Registers]()
+    for finger, name in enumerate(FINGERS[1:]):
+        channels = taxels(31, *(axis.name for axis in axes), first_uid=finger << 8)
+        modules.append(Module(channels, finger, "31 points", f"{name} tip"))
+        registers.append(_of_forces(unit, finger, 7200 + 100 * finger, 31))
+    modules.append(Module(taxels(4, *(axis.name for axis in _SUMS)), 4, "sums", "sums"))
+    registers.append(_of_forces(unit, 4, 7100, 4))
+    return _Content((*axes, *_SUMS), modules, registers)
+
+
+def _of_forces(unit: int, module: int, address: int, points: int) -> Registers:
+    values = []
+    for point in range(points):
+        values += [
+            Values(4 * point, "i1", 2, to=[3 * point, 3 * point + 1]),
+            Values(4 * point + 2, ">u2", 1, to=[3 * point + 2]),
+        ]
+    return Registers(address, 2 * points, unit, READ_INPUT, patch=0, module=module, values=values)
+
+
+def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
+    """Three forces and two moments of five fingers; suspect until the sensors are warm (8021)."""
+    types = (*(axis.measured(unit="counts", minimum=0) for axis in FORCE), *_MOMENTS)
+    cold = Flag(Status.SUSPECT, 2, ">u2", mask=0xFFFF, normal=1)
+    modules, registers = list[Module](), list[Registers]()
+    for finger, name in enumerate(FINGERS):
+        modules.append(Module([Sensor(kind.name, finger) for kind in types], finger, "force", f"{name} tip"))
+        values = [Values(2 * (80 + 5 * finger), ">u2", 5)]
+        registers.append(Registers(8020, 105, unit, READ_INPUT, patch=0, module=finger, flags=[cold], values=values))
+    return _Content(types, modules, registers)
+
 
 class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver.
@@ -54,13 +201,13 @@ class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
-        Meta(description="its number; default: 127 of a right hand, 126 of a left one, whichever answers"),
+        Meta(description="its number; default: 127 of a right hand or 126 of a left one, as one answers"),
     ] = None
     edition: Annotated[
         EditionName | None, Meta(description="which sensors the hand has; default: the hand is asked")
     ] = None
     status: Annotated[
-        bool, Meta(description="touch: read along what each finger says of its sensor; no: the values alone")
+        bool, Meta(description="touch: read along the status of each finger's sensor; no: the values alone")
     ] = True
     period_ms: Annotated[float, Meta(ge=1, le=10_000, description="time between two readings")] = 20
     enable: Annotated[
@@ -72,14 +219,14 @@ class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Revo2Watch(ZeroWatch):
-    """Also says in the log what it means that there are no data."""
+    """Also log, once, why there are no data."""
 
-    _has_told = False
+    _has_logged = False
 
     def look(self, updates: Updates) -> None:
         super().look(updates)
-        if not self._has_told and (updates.status & Status.NOT_CONNECTED).any():
-            self._has_told = True
+        if not self._has_logged and (updates.status & Status.NOT_CONNECTED).any():
+            self._has_logged = True
             log.warning(
                 "fingers have no data: touch is not switched on (--enable, or the operation enable), or the hand says"
                 " that there is no sensor (4225 to 4229)"
@@ -87,7 +234,7 @@ class Revo2Watch(ZeroWatch):
 
 
 class _Said(NamedTuple):
-    """What the hand says of its data: its edition, and the kind of values of the Pressure edition."""
+    """The edition that the hand reports, and the kind of values of the Pressure edition."""
 
     edition: EditionName
     kind: int = 0
@@ -109,16 +256,16 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         super().__init__(options)
 
     def fit(self, bus: Bus) -> None:
-        """Ask for no registers before the hand has said which it has."""
+        """Ask for no registers before the edition of the hand is known."""
         super().fit(bus)
         if not bus.listen_only:
             self.use_registers(())
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand which side and edition it is; where it must not be asked, the options say it.
+        """Ask the hand for its side and edition; while only listening, use the options.
 
         Raises:
-            BusError: it does not answer, or says that it has no sensors that this driver reads.
+            BusError: it does not answer, or has no sensors that this driver reads.
         """
         options, side = self.options, self.options.side
         if not link.listen_only:
@@ -133,15 +280,15 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Fingers that send nothing but 0, and hands without data."""
+        """Watch for fingers that send only 0, and for hands without data."""
         return Revo2Watch(tables)
 
     async def configure(self, link: Link) -> None:
         if self.options.enable:
-            await self._set(link, EDITIONS[self._said.edition].switches, _SWITCHING_S)
+            await self._set(link, _EDITIONS[self._said.edition].switches, _SWITCHING_S)
 
     async def attend(self, link: Link) -> None:
-        """See whether the hand still sends the same; and whether touch is on, if this driver is to switch it on."""
+        """Notice when the hand sends another edition, or when touch is off that this driver has to switch on."""
         pause_s = _LOOK_S
         while not link.listen_only:
             await asyncio.sleep(pause_s)
@@ -155,25 +302,25 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
 
     @operation(sets_up=True)
     async def enable(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Switch touch on: writes 1 into the switches of the edition (4000 to 4004 of touch)."""
-        await self._set(link, EDITIONS[self._said.edition].switches, _SWITCHING_S)
+        """Switch touch on: write 1 to the switches of the edition (4000 to 4004 of touch)."""
+        await self._set(link, _EDITIONS[self._said.edition].switches, _SWITCHING_S)
 
     @operation(sets_up=True)
     async def calibrate(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Take the present values as untouched: nothing may touch the hand; values of the next 10 s are no measure."""
-        await self._set(link, EDITIONS[self._said.edition].calibration, _CALIBRATING_S)
+        """Take the present values as untouched: nothing may touch the hand. Ignore the values of the next 10 s."""
+        await self._set(link, _EDITIONS[self._said.edition].calibration, _CALIBRATING_S)
 
     @operation(sets_up=True)
     async def reset(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Set the channels of the sensors up anew (4005 to 4009, edition touch): nothing may touch the hand."""
-        registers = EDITIONS[self._said.edition].reset
+        """Set the sensors' channels up again (4005 to 4009, edition touch): nothing may touch the hand."""
+        registers = _EDITIONS[self._said.edition].reset
         if registers is None:
             raise BusError(f"hands of the edition {self._said.edition} have no such registers")
         await self._set(link, registers, _CALIBRATING_S)
 
     @operation()
     async def names(self, link: Link, patches: Sequence[Patch]) -> str:  # noqa: ARG002
-        """Serial number and firmware, as the hand says them."""
+        """Return serial number and firmware as the hand reports them."""
         return await self._ask_names(link)
 
     async def _set(self, link: Link, registers: tuple[int, int], takes_s: float) -> None:
@@ -185,7 +332,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         if self.options.unit is not None or self.options.side is not None:
             return self._unit
         try:
-            await self.read(link, of_hand.EDITION_AT, unit=_UNITS["right"])
+            await self.read(link, _EDITION_AT, unit=_UNITS["right"])
         except ModbusException:
             pass
         except HandshakeTimeout:
@@ -193,7 +340,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         return _UNITS["right"]
 
     async def _ask_side(self, link: Link) -> _Side:
-        said = await self._read_or_none(link, of_hand.SIDE_AT)
+        said = await self.read_or_none(link, _SIDE_AT, unit=self._unit)
         if said is None:
             return "left" if self._unit == _UNITS["left"] else "right"
         return "left" if said[0] in _LEFT_SKUS else "right"
@@ -201,44 +348,35 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
     async def _look(self, link: Link) -> _Said:
         edition = self.options.edition
         if edition is None:
-            said = await self._read_or_none(link, of_hand.EDITION_AT)
+            said = await self.read_or_none(link, _EDITION_AT, unit=self._unit)
             number = said[0] if said else 0
-            if number > len(EDITIONS):
+            if number > len(_EDITIONS):
                 raise BusError(f"{link.bus_name}: register 970 says {number}: no edition that this driver reads")
-            edition = list(EDITIONS)[number - 1] if number else "touch"  # 0: firmware that does not say it
+            edition = list(_EDITIONS)[number - 1] if number else "touch"  # 0: old firmware
         if edition != "pressure":
             return _Said(edition)
-        kind = await self._read_or_none(link, of_hand.KIND_AT)
+        kind = await self.read_or_none(link, _KIND_AT, unit=self._unit)
         if kind and kind[0] > 2:
             raise BusError(f"{link.bus_name}: register 6000 says {kind[0]}: neither raw, calibrated nor force")
         return _Said(edition, kind[0] if kind else 0)
 
     async def _is_off(self, link: Link) -> bool:
         if self._said.edition == "touch":
-            forces = await self.read(link, of_hand.FORCES_AT, 15, unit=self._unit, function=READ_INPUT)
-            return bool((forces == of_hand.NO_FORCE).all())
-        address, count = EDITIONS[self._said.edition].switches
+            forces = await self.read(link, _FORCES_AT, 15, unit=self._unit, function=READ_INPUT)
+            return bool((forces == _NO_FORCE).all())
+        address, count = _EDITIONS[self._said.edition].switches
         return not (await self.read(link, address, count, unit=self._unit)).any()
 
     async def _ask_names(self, link: Link) -> str:
         found = []
-        for what, address in (("serial number", of_hand.SERIAL_AT), ("firmware", of_hand.FIRMWARE_AT)):
-            said = await self._read_or_none(link, address, 10, READ_INPUT) or ()
+        for what, address in (("serial number", _SERIAL_AT), ("firmware", _FIRMWARE_AT)):
+            said = await self.read_or_none(link, address, 10, unit=self._unit, function=READ_INPUT) or ()
             text = b"".join(register.to_bytes(2, "big") for register in said).decode("ascii", "replace")
             found.append(f"{what} {''.join(one for one in text if one.isprintable()) or 'not said'}")
         return ", ".join(found)
 
-    async def _read_or_none(
-        self, link: Link, address: int, count: int = 1, function: int = READ_HOLDING
-    ) -> tuple[int, ...] | None:
-        """Registers, or None where the hand says that it has none."""
-        try:
-            return tuple((await self.read(link, address, count, unit=self._unit, function=function)).tolist())
-        except ModbusException:
-            return None
-
     def _declare(self, said: _Said, side: _Side, *, with_status: bool) -> None:
-        what = content(said.edition, self._unit, kind=said.kind, with_status=with_status)
+        what = _content(said.edition, self._unit, kind=said.kind, with_status=with_status)
         self.types: Sequence[SensorType] = what.types
         self.registers: Sequence[Registers] = what.registers
         self.patches: Sequence[Patch] = [Patch(f"{side} hand", what.modules)]
@@ -246,7 +384,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
 
 
 def _places(hand: Hand, modules: Sequence[Module]) -> Geometry:
-    """Nominal ones: points of a fingertip or a palm in rows of three or six, others one at each fingertip."""
+    """Return nominal places: points of a fingertip in rows of three, of a palm in rows of six."""
     found = []
     for module in modules:
         if module.name == "sums":

@@ -1,7 +1,13 @@
-"""BrainCo's Revo3 hand: eleven pads of taxels on palm and fingers, over Modbus RTU.
+"""BrainCo's Revo3 hand: eleven pads of taxels on palm and fingers, over Modbus RTU, with registers in three mappings.
 
-The driver asks the hand what it sends: which pads with how many taxels, whether single taxels or sums of zones, and
-whether counts or forces. See :mod:`skinware_drivers.modbus.revo3_mappings` for the registers and their sources.
+The driver asks the hand for its mapping, for the number of taxels in each pad, whether it sends single taxels or sums
+of zones, and whether counts or forces. Sources:
+
+* BrainCoTech/brainco-revo3-sdk, commit 7ba96eb of 2026-08-03: ``docs/device/REVO3_TOUCH_API.md`` (registers of the
+  mappings Pressure and Matrix) and ``python/gui/touch_panel_revo3.py`` (counts, units, rows and columns of the pads).
+* The maker's programs bc-revo3-sdk 1.5.1, 1.6.3 and 2.3.2 (PyPI) as clients of a server whose registers hold their own
+  numbers, on 2026-11-23: meaning of 101 and 135, the counts in 4037 to 4047, and the mapping ``packed``, which 1.6.3
+  and 2.3.2 read where 1.5.1 reads ``matrix``.
 """
 
 from __future__ import annotations
@@ -9,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import msgspec
@@ -18,17 +25,15 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware.sensor_types import SensorType
+from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.bus import Bus
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Sentinel, Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus import revo3_mappings as map_of
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
-from skinware_drivers.modbus.revo3_mappings import MAPPINGS, PADS, Mapping
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
@@ -41,6 +46,92 @@ _LOOK_S, _AGAIN_S = 1.0, 0.05
 _ADC = 0
 _Name = Literal["pressure", "matrix", "packed"]
 _Side = Literal["right", "left"]
+_PADS = ("palm", *(f"{finger} {part}" for finger in FINGERS for part in ("tip", "pad")))
+_SIDE_AT, _RIGHT = 101, 1
+_FAMILY_AT, _PRESSURE_FAMILY, _MATRIX_FAMILY = 135, 1, 2
+_KIND_AT, _PRESSURE_COUNTS_AT, _SUMS_AT = 4023, 4037, 4100
+_MATRIX_COUNTS_AT, _MODE_AT = 5191, 5202
+_COUNTS_OF_SUMS: tuple[int, ...] = (1, 3, 6, *(3, 5) * 4)
+"""Zones of each pad whose sums a hand of the mapping Pressure can send."""
+
+_COUNTS = PRESSURE.measured(unit="counts", minimum=0)
+_BYTES = PRESSURE.measured(unit="counts", minimum=0, maximum=0xFF)
+_FORCE_COUNTS = FORCE_Z.measured(unit="counts", minimum=0)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """The registers of one mapping.
+
+    Attributes:
+        pads: first register of each pad, and the one after the last pad.
+        counts: taxels of each pad, for hands that do not report them.
+        switches: first of the eleven registers that switch pads on.
+        zero: the register that takes the present values as zero.
+        in_register: values in a register, the first in its high byte if there are two.
+        types: of the values, by the mode that the hand reports: 0, 1 ...
+    """
+
+    pads: Sequence[int]
+    counts: Sequence[int]
+    switches: int
+    zero: int
+    in_register: int
+    types: Sequence[SensorType]
+
+    def count_fits(self, pad: int, count: int) -> bool:
+        return 1 <= count <= self.in_register * (self.pads[pad + 1] - self.pads[pad])
+
+
+_MATRIX_COUNTS = (53, 56, 22, *(22, 27) * 4)
+_MAPPINGS = {
+    "pressure": Mapping(
+        (4200, 4250, 4290, 4350, 4400, 4460, 4500, 4560, 4600, 4660, 4700, 4752),
+        (36, 31, 57, *(21, 52) * 4),
+        switches=4000,
+        zero=4011,
+        in_register=1,
+        types=(_COUNTS, _COUNTS, _FORCE_COUNTS),
+    ),
+    "matrix": Mapping(
+        range(5240, 5901, 60),
+        _MATRIX_COUNTS,
+        switches=5900,
+        zero=5214,
+        in_register=1,
+        types=(_COUNTS, FORCE_Z.measured(scale=1e-4, minimum=0)),
+    ),
+    "packed": Mapping(
+        (5240, *(first + more for first in range(5340, 5841, 100) for more in (0, 40)))[:12],
+        _MATRIX_COUNTS,
+        switches=5900,
+        zero=5214,
+        in_register=2,
+        types=(_BYTES, FORCE_Z.measured(scale=1e-2, minimum=0, maximum=2.55)),
+    ),
+}
+_SUM = FORCE_Z.measured(scale=1e-3, minimum=0)
+
+_TIP = "123 123 1234 1234 1234 5 5 5"
+_PAD = "15 1234 1234 01234" + 5 * " 12345" + 4 * " 567"
+_COLUMNS = {
+    "right palm": "12345 012345 012345 0345 0345 0345 035 045 5",
+    "left palm": "01234 012345 012345 0125 0125 0125 025 015 0",
+    "thumb tip": "0134 01345 012345 012345 012345 6 6 6 6",
+    "thumb pad": 8 * "01234 " + "123 12" + 4 * " 567",
+}
+"""Columns with taxels in each row of a pad of the mapping Pressure, in the order of the taxels."""
+_MATRIX_COLUMNS = 6
+
+
+def places(mapping: str, side: str, pad: int, count: int) -> tuple[Grid, Sequence[int]]:
+    """Return the grid of a pad and the cells of its taxels; without a table of the maker, they fill it in order."""
+    name = _PADS[pad]
+    rows = _COLUMNS.get(f"{side} {name}", _COLUMNS.get(name, _TIP if name.endswith("tip") else _PAD)).split()
+    if mapping != "pressure" or sum(map(len, rows)) != count:
+        return Grid(-(-count // _MATRIX_COLUMNS), _MATRIX_COLUMNS), range(count)
+    columns = 1 + max(int(column) for row in rows for column in row)
+    return Grid(len(rows), columns), [columns * number + int(one) for number, row in enumerate(rows) for one in row]
 
 
 class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,16 +141,15 @@ class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ConfigurationError: an option is out of its limits, or ``points`` are not eleven numbers.
     """
 
-    side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
+    side: Annotated[_Side | None, Meta(description="which hand it is; default: ask the hand")] = None
     unit: Annotated[
-        Annotated[int, Meta(ge=1, le=254)] | None, Meta(description="its number; default: 1, 126 or 127 that answers")
+        Annotated[int, Meta(ge=1, le=254)] | None,
+        Meta(description="its number; default: 1, 126 or 127, as one answers"),
     ] = None
-    mapping: Annotated[_Name | None, Meta(description="which registers the hand has; default: the hand is asked")] = (
-        None
-    )
+    mapping: Annotated[_Name | None, Meta(description="which registers the hand has; default: ask the hand")] = None
     points: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=200)], ...],
-        Meta(description="taxels of the palm, then of tip and pad of each finger from the thumb on; default: asked"),
+        Meta(description="taxels of the palm, then of tip and pad of each finger from the thumb on; default: ask"),
     ] = ()
     period_ms: Annotated[
         Annotated[float, Meta(ge=1, le=10_000)] | None,
@@ -68,19 +158,19 @@ class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         check_options(self)
-        if len(self.points) not in (0, len(PADS)):
-            raise ConfigurationError(f"option points: give {len(PADS)} numbers")
+        if len(self.points) not in (0, len(_PADS)):
+            raise ConfigurationError(f"option points: give {len(_PADS)} numbers")
 
 
 class _Said(NamedTuple):
-    """What the hand says of its data.
+    """The form of the data, as the hand reports it.
 
     Attributes:
         name: of its mapping.
-        function: with which its data are read.
+        function: that reads its data.
         has_sums: it sends sums of zones, not single taxels.
         counts: taxels or zones of each pad.
-        modes: of each pad: 0 counts of the converter, others as the mapping says.
+        modes: of each pad: 0 counts of the converter; the mapping has the others.
     """
 
     name: str
@@ -91,14 +181,14 @@ class _Said(NamedTuple):
 
     @property
     def mapping(self) -> Mapping:
-        return MAPPINGS[self.name]
+        return _MAPPINGS[self.name]
 
     def type_of(self, pad: int) -> SensorType:
-        return map_of.SUM if self.has_sums else self.mapping.types[self.modes[pad]]
+        return _SUM if self.has_sums else self.mapping.types[self.modes[pad]]
 
     @property
     def text(self) -> str:
-        kinds = {f"{self.type_of(pad).name} in {self.type_of(pad).unit}": None for pad in range(len(PADS))}
+        kinds = {f"{self.type_of(pad).name} in {self.type_of(pad).unit}": None for pad in range(len(_PADS))}
         what = "sums of zones" if self.has_sums else "taxels"
         return f"mapping {self.name}, {sum(self.counts)} {what}, {' and '.join(kinds)}"
 
@@ -120,21 +210,21 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         super().__init__(options)
 
     def fit(self, bus: Bus) -> None:
-        """Ask for no registers before the hand has said which it has."""
+        """Ask for no registers before the form of the data is known."""
         super().fit(bus)
         if not bus.listen_only:
             self.use_registers(())
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand which pads it has and what it sends of them; how long it takes for all is learnt then.
+        """Ask the hand for the form of its data, then measure how long it needs for all of them.
 
         Raises:
-            BusError: it does not answer, sends what this driver does not read, or must not be asked.
+            BusError: it does not answer, sends data that this driver does not read, or must not be asked.
         """
         options, side = self.options, self.options.side
         if link.listen_only:
             if options.mapping is None:
-                raise BusError("what a hand sends it tells only when asked, listening is not enough: say mapping")
+                raise BusError("a hand must be asked for its mapping, listening is not enough: say mapping")
             said = _unasked(options.mapping)
         else:
             self._unit = await self._find_unit(link)
@@ -142,7 +232,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
             self._said = said = await self._look(link)
         for pad, count in enumerate(options.points or said.counts):
             if not said.has_sums and not said.mapping.count_fits(pad, count):
-                raise BusError(f"{link.bus_name}: {count} taxels in the {PADS[pad]} do not fit mapping {said.name}")
+                raise BusError(f"{link.bus_name}: {count} taxels in the {_PADS[pad]} do not fit mapping {said.name}")
         log.info("%s: unit %d, %s hand, %s", link.bus_name, self._unit, side or "right", said.text)
         self._declare(said, side or "right", options.points)
         self.use_registers(self.registers)
@@ -150,7 +240,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         return self.patches
 
     async def attend(self, link: Link) -> None:
-        """Notice that the hand sends something else: after a restart, or because another program has set it so."""
+        """Notice when the hand sends another form, after a restart or because another program has changed it."""
         pause_s = _LOOK_S
         while not link.listen_only:
             await asyncio.sleep(pause_s)
@@ -158,7 +248,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
             try:
                 said = await self._look(link)
             except HandshakeTimeout:
-                pause_s = _AGAIN_S  # once it answers again, it may have restarted: that is asked first
+                pause_s = _AGAIN_S  # it may have restarted: ask that first, once it answers again
                 continue
             if self._said is not None and said != self._said:
                 log.warning("%s: the hand sends something else now: %s", link.bus_name, said.text)
@@ -166,13 +256,13 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Pads that send nothing but 0."""
+        """Watch for pads that send only 0."""
         return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def enable(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Switch all pads on: writes 1 into their eleven switches."""
-        await self.write(link, self._mapping.switches, [1] * len(PADS), unit=self._unit)
+        """Switch all pads on: write 1 to their eleven switches."""
+        await self.write(link, self._mapping.switches, [1] * len(_PADS), unit=self._unit)
 
     @operation(sets_up=True)
     async def zero(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
@@ -187,7 +277,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         units = _UNITS if self.options.unit is None else (self.options.unit,)
         for unit in units[:-1]:
             try:
-                await self.read(link, map_of.FAMILY_AT, unit=unit)
+                await self.read(link, _FAMILY_AT, unit=unit)
             except ModbusException:
                 return unit
             except HandshakeTimeout:
@@ -196,76 +286,70 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         return units[-1]
 
     async def _ask_side(self, link: Link) -> _Side:
-        side = await self._read_or_none(link, map_of.SIDE_AT)
-        return "right" if side is None or side[0] == map_of.RIGHT else "left"
+        side = await self.read_or_none(link, _SIDE_AT, unit=self._unit)
+        return "right" if side is None or side[0] == _RIGHT else "left"
 
     async def _look(self, link: Link) -> _Said:
         name: str | None = self.options.mapping
         if name is None:
-            family = await self._read_or_none(link, map_of.FAMILY_AT)
-            if family is None or family[0] not in (map_of.PRESSURE_FAMILY, map_of.MATRIX_FAMILY):
+            family = await self.read_or_none(link, _FAMILY_AT, unit=self._unit)
+            if family is None or family[0] not in (_PRESSURE_FAMILY, _MATRIX_FAMILY):
                 raise BusError(
-                    f"{link.bus_name}: register {map_of.FAMILY_AT} of the hand says {family and family[0]}, neither 1"
-                    " (pressure) nor 2 (matrix): say mapping, if you know it"
+                    f"{link.bus_name}: register {_FAMILY_AT} of the hand says {family and family[0]}, neither 1"
+                    " (pressure) nor 2 (matrix): give the option mapping, if you know it"
                 )
-            name = "pressure" if family[0] == map_of.PRESSURE_FAMILY else None
+            name = "pressure" if family[0] == _PRESSURE_FAMILY else None
         return await (self._look_at_pressure(link) if name == "pressure" else self._look_at_matrix(link, name))
 
     async def _look_at_pressure(self, link: Link) -> _Said:
-        kind, mode = await self.read(link, map_of.KIND_AT, 2, unit=self._unit)
+        kind, mode = await self.read(link, _KIND_AT, 2, unit=self._unit)
         if kind not in (0, 1) or mode not in (0, 1, 2):
-            raise BusError(f"{link.bus_name}: registers 4023 and 4024 say {kind} and {mode}, which means nothing known")
-        counts = map_of.COUNTS_OF_SUMS
+            raise BusError(f"{link.bus_name}: registers 4023 and 4024 say {kind} and {mode}, whose meaning is unknown")
+        counts = _COUNTS_OF_SUMS
         if not kind:
-            said = await self._read_or_none(link, map_of.PRESSURE_COUNTS_AT, len(PADS))
-            counts = said if said is not None and all(said) else tuple(MAPPINGS["pressure"].counts)
-        return _Said("pressure", READ_INPUT, bool(kind), counts, (int(mode),) * len(PADS))
+            said = await self.read_or_none(link, _PRESSURE_COUNTS_AT, len(_PADS), unit=self._unit)
+            counts = said if said is not None and all(said) else tuple(_MAPPINGS["pressure"].counts)
+        return _Said("pressure", READ_INPUT, bool(kind), counts, (int(mode),) * len(_PADS))
 
     async def _look_at_matrix(self, link: Link, name: str | None) -> _Said:
-        """Counts and modes; and by which of two forms the data are, if no option says it."""
+        """Ask for counts and modes, and find out which of the two mappings it is unless an option says so."""
         function, counts = READ_HOLDING, tuple[int, ...]()
         for function in (READ_INPUT, READ_HOLDING) if name != "matrix" else (READ_HOLDING,):
-            counts = await self._read_or_none(link, map_of.MATRIX_COUNTS_AT, len(PADS), function) or ()
+            said = await self.read_or_none(link, _MATRIX_COUNTS_AT, len(_PADS), unit=self._unit, function=function)
+            counts = said or ()
             if counts and all(counts):
                 break
         if not (counts and all(counts)):
-            counts = tuple(MAPPINGS["matrix"].counts)
-        of_all, *of_each = await self._read_or_none(link, map_of.MODE_AT, 1 + len(PADS)) or (_ADC,) * (1 + len(PADS))
+            counts = tuple(_MAPPINGS["matrix"].counts)
+        n_modes = 1 + len(_PADS)
+        of_all, *of_each = await self.read_or_none(link, _MODE_AT, n_modes, unit=self._unit) or (_ADC,) * n_modes
         modes = tuple(mode if mode in (0, 1) else int(of_all == 1) for mode in of_each)
         if name is None:
             name = await self._form(link, function, counts)
         return _Said(name, function, False, counts, modes)
 
     async def _form(self, link: Link, function: int, counts: Sequence[int]) -> str:
-        """``matrix`` or ``packed``, by what is in registers that only one of them has; else as it was, or packed."""
+        """Return ``matrix`` or ``packed``, by the registers that only one of them uses; else as before, or packed."""
         known = "packed" if self._said is None else self._said.name
-        palm, thumb_pad = MAPPINGS["packed"].pads[0], MAPPINGS["packed"].pads[2]
+        palm, thumb_pad = _MAPPINGS["packed"].pads[0], _MAPPINGS["packed"].pads[2]
         middle, end = palm + -(-counts[0] // 2), palm + counts[0]
-        if any(await self._read_or_none(link, middle, end - middle, function) or ()):
+        if await self._any_set(link, middle, end, function):
             return "matrix"
-        begin, end = max(thumb_pad, MAPPINGS["matrix"].pads[2] + counts[2]), thumb_pad + -(-counts[2] // 2)
-        if begin < end and any(await self._read_or_none(link, begin, end - begin, function) or ()):
-            return "packed"
-        return known
+        begin, end = max(thumb_pad, _MAPPINGS["matrix"].pads[2] + counts[2]), thumb_pad + -(-counts[2] // 2)
+        return "packed" if await self._any_set(link, begin, end, function) else known
 
-    async def _read_or_none(
-        self, link: Link, address: int, count: int = 1, function: int = READ_HOLDING
-    ) -> tuple[int, ...] | None:
-        """Registers, or None where the hand says that it has none."""
-        if count < 1:
-            return None
-        try:
-            return tuple((await self.read(link, address, count, unit=self._unit, function=function)).tolist())
-        except ModbusException:
-            return None
+    async def _any_set(self, link: Link, begin: int, end: int, function: int) -> bool:
+        if begin >= end:
+            return False
+        return any(await self.read_or_none(link, begin, end - begin, unit=self._unit, function=function) or ())
 
     def _declare(self, said: _Said, side: _Side, points: Sequence[int]) -> None:
         counts = said.counts if said.has_sums else points or said.counts
-        types = [said.type_of(pad) for pad in range(len(PADS))]
+        types = [said.type_of(pad) for pad in range(len(_PADS))]
         self.types: Sequence[SensorType] = tuple({kind.id: kind for kind in types}.values())
-        first = map_of.SUMS_AT
+        first = _SUMS_AT
         registers, modules = list[Registers](), list[Module]()
-        for pad, (name, count, kind) in enumerate(zip(PADS, counts, types, strict=True)):
+        for pad, (name, count, kind) in enumerate(zip(_PADS, counts, types, strict=True)):
             packed = not said.has_sums and said.mapping.in_register == 2
             registers.append(
                 Registers(
@@ -290,20 +374,18 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
 def _unasked(mapping: _Name | None) -> _Said:
     name = mapping or "pressure"
     function = READ_INPUT if name == "pressure" else READ_HOLDING
-    return _Said(name, function, False, tuple(MAPPINGS[name].counts), (_ADC,) * len(PADS))
+    return _Said(name, function, False, tuple(_MAPPINGS[name].counts), (_ADC,) * len(_PADS))
 
 
 def _geometry(said: _Said, side: _Side, modules: Sequence[Module]) -> Geometry:
-    """Rows and columns as the maker's program draws them; lengths, and how pads lie to each other, are nominal."""
+    """Return rows and columns as the maker's program draws them; lengths and distances of pads are nominal."""
     hand, found = Hand(side), []
     for part in ("palm", *FINGERS):
-        pads = [pad for pad, name in enumerate(PADS) if name.startswith(part)]
+        pads = [pad for pad, name in enumerate(_PADS) if name.startswith(part)]
         drawn = []
         for pad in pads:
             count = len(modules[pad].channels)
-            drawn.append(
-                (Grid(1, count), range(count)) if said.has_sums else map_of.places(said.name, side, pad, count)
-            )
+            drawn.append((Grid(1, count), range(count)) if said.has_sums else places(said.name, side, pad, count))
         for pad, (grid, cells), centre in zip(pads, drawn, hand.down(part, [grid for grid, _ in drawn]), strict=True):
             uids = [pad << 8 | n for n in range(len(modules[pad].channels))]
             found.append(grid.at(centre, [said.type_of(pad).name], uids, cells=cells))

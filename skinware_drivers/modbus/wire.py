@@ -1,7 +1,7 @@
-"""Modbus as bytes: questions, replies, and what is put around them on a serial line (RTU) and over TCP.
+"""Modbus as bytes: questions and replies, and their frames on a serial line (RTU) and over TCP.
 
-A *message* is what both have in common: a function and its data. Sources: MODBUS Application Protocol Specification
-V1.1b3, MODBUS over Serial Line V1.02, MODBUS Messaging on TCP/IP V1.0b.
+A *message* is the part that both have in common: a function and its data. Sources: MODBUS Application Protocol
+Specification V1.1b3, MODBUS over Serial Line V1.02, MODBUS Messaging on TCP/IP V1.0b.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from skinware_drivers.serial.checksums import CRC16_MODBUS
 READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY = 3, 4, 6, 16
 READS = (READ_HOLDING, READ_INPUT)
 MOST_REGISTERS, MOST_WRITTEN = 125, 123
-"""Of one read, and of one write."""
+"""Registers of one read, and of one write."""
 _READ_BITS, _WRITE_BIT, _WRITE_BITS, _MASK, _EXCHANGE = (1, 2), 5, 15, 22, 23
-"""Which this driver never asks; other programs may, through it or beside it."""
+"""Functions that our drivers never use; other programs may use them through the gateway or beside us."""
 _MOST_BITS, _MOST_WRITTEN_BITS, _MOST_EXCHANGED = 2000, 1968, 121
 _ECHOING = {_WRITE_BIT: 5, WRITE_ONE: 5, _WRITE_BITS: 5, WRITE_MANY: 5, _MASK: 7}
-"""Functions whose reply repeats the beginning of the question, and how much of it."""
+"""Functions whose reply repeats the beginning of the question, and how many bytes of it."""
 _COUNTING = (*_READ_BITS, *READS, _EXCHANGE)
-"""Functions whose reply tells how many bytes follow."""
+"""Functions whose reply has a number of bytes that follow."""
 _LENGTH_AT = {_WRITE_BITS: 6, WRITE_MANY: 6, _EXCHANGE: 10}
-"""Where the question of a function says how many bytes follow."""
+"""Place of the number of bytes that follow in the question of a function."""
 LONGEST_MESSAGE = 253
 FAILED = 0x80
 """Bit of the function in a reply that is an exception."""
@@ -48,12 +48,12 @@ _MBAP = struct.Struct(">HHHB")
 
 
 class Message(NamedTuple):
-    """A message of a unit.
+    """A message to or from a unit.
 
     Attributes:
         unit: address of the device, 0 to 255.
-        data: function and what follows it.
-        number: of its transaction; 0 on serial lines, which have none.
+        data: the function and the bytes after it.
+        number: of its transaction; 0 on a serial line, which has none.
     """
 
     unit: int
@@ -62,7 +62,7 @@ class Message(NamedTuple):
 
 
 def question_to_read(function: int, address: int, count: int) -> bytes:
-    """Ask for registers.
+    """Return the question for registers.
 
     Raises:
         ValueError: there is no such question.
@@ -73,7 +73,7 @@ def question_to_read(function: int, address: int, count: int) -> bytes:
 
 
 def is_known(question: bytes) -> bool:
-    """Whether this is a function whose questions and replies we know."""
+    """Return whether the function is one whose questions and replies are known here."""
     return question[0] in _COUNTING or question[0] in _ECHOING
 
 
@@ -82,7 +82,7 @@ def is_write(question: bytes) -> bool:
 
 
 def is_question(question: bytes) -> bool:
-    """Whether a question is as the specification has it: its length, and how much it asks for."""
+    """Return whether a question has the length and asks for the amount that the specification allows."""
     function, size = question[0], len(question)
     count = int.from_bytes(question[3:5], "big")
     if function in READS or function in _READ_BITS:
@@ -98,7 +98,7 @@ def is_question(question: bytes) -> bool:
 
 
 def reply_size(question: bytes) -> int:
-    """Bytes of the reply to a question, unless it is an exception (which has 2); 0: there is no such question."""
+    """Return the bytes of a reply that is no exception (an exception has 2); 0: there is no such question."""
     if not question or not is_question(question):
         return 0
     if question[0] in _COUNTING:
@@ -108,7 +108,7 @@ def reply_size(question: bytes) -> int:
 
 
 def is_reply(question: bytes, reply: bytes) -> bool:
-    """Whether a message can be the reply to a question: a good one, or an exception."""
+    """Return whether a message can be the reply to a question: a good one, or an exception."""
     if reply[:1] == bytes([question[0] | FAILED]):
         return len(reply) == 2
     if reply[:1] != question[:1] or len(reply) != reply_size(question):
@@ -117,7 +117,7 @@ def is_reply(question: bytes, reply: bytes) -> bool:
 
 
 def exception_of(reply: bytes) -> int:
-    """Code of an exception; 0: it is none."""
+    """Return the code of an exception; 0: the reply is none."""
     return reply[1] if reply[0] & FAILED and len(reply) > 1 else 0
 
 
@@ -135,10 +135,10 @@ def tcp_frame(message: Message) -> bytes:
 
 
 class TcpMessages:
-    """Finds the messages in what comes over a connection.
+    """Find the messages in the bytes of a connection.
 
     Args:
-        counters: told what is found.
+        counters: count what is found.
     """
 
     def __init__(self, counters: FramerCounters) -> None:
@@ -146,10 +146,10 @@ class TcpMessages:
         self._rest = b""
 
     def feed(self, chunk: bytes) -> Iterator[Message]:
-        """The messages that a chunk completes.
+        """Yield the messages that a chunk completes.
 
         Raises:
-            ValueError: this is no Modbus: nothing that follows can be found either.
+            ValueError: the bytes are no Modbus, and no later message can be found either.
         """
         self._counters.bytes_in += len(chunk)
         self._rest += chunk
@@ -158,7 +158,7 @@ class TcpMessages:
             if protocol or not 2 <= size <= LONGEST_MESSAGE + 1:
                 self._counters.refused += 1
                 self.drop()
-                raise ValueError("what comes over this connection is no Modbus")
+                raise ValueError("the bytes of this connection are no Modbus")
             end = _MBAP.size - 1 + size
             if len(self._rest) < end:
                 return
@@ -178,10 +178,10 @@ class TcpMessages:
 
 
 class RtuMessages:
-    """Finds messages in what comes over a serial line, on which only lengths and checksums tell where they are.
+    """Find messages in the bytes of a serial line, where only lengths and checksums show their limits.
 
     Args:
-        counters: told what is found.
+        counters: count what is found.
     """
 
     def __init__(self, counters: FramerCounters) -> None:
@@ -193,11 +193,11 @@ class RtuMessages:
         self._rest += chunk
 
     def reply_to(self, unit: int, question: bytes) -> Message | None:
-        """The reply to a question, if it has arrived; what comes before it is skipped."""
+        """Return the reply to a question, if it has arrived; bytes before it are skipped."""
         return self._first((unit, question), also_questions=False)
 
     def next_of(self, asked: Message | None) -> Message | None:
-        """The next message on a line on which others speak: the reply to what was asked before, or a question."""
+        """Return the next message on a line with another master: the reply to ``asked``, or a question."""
         return self._first(None if asked is None else (asked.unit, asked.data), also_questions=True)
 
     @property
@@ -212,7 +212,7 @@ class RtuMessages:
         place, rest, was_damaged = 0, self._rest, False
         beginning = _beginning_of(None if asked is None else (asked[0], asked[1][0]), also_questions)
         while place < len(rest):
-            found = beginning.search(rest, place)  # on a line that babbles hardly a byte begins anything
+            found = beginning.search(rest, place)  # on a babbling line hardly any byte begins a message
             if found is None:
                 place = len(rest)
                 break
@@ -273,7 +273,7 @@ def _sizes_of_reply(here: bytes, unit: int, question: bytes) -> list[int]:
 
 
 def _size_of_question(here: bytes) -> int:
-    """Bytes of the question that may begin here; 0: none does."""
+    """Return the bytes of the question that may begin here; 0: none does."""
     if len(here) < 2 or 1 <= here[1] <= WRITE_ONE:
         return 8
     if here[1] == _MASK:

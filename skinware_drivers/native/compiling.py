@@ -49,25 +49,26 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     Raises:
         ConfigurationError: a frame has values that C does not read.
     """
-    for frame in decoder.frames:
+    compiled, structure, state = decoder.compiled, decoder.tables.structure, decoder.state
+    addresses = compiled.addresses
+    for frame in compiled.frames:
         check_values(frame)
-    structure, state, addresses = decoder.tables.structure, decoder.state, decoder.addresses
     plan.n_buses, plan.n_patches = len(structure.buses), structure.n_patches
     plan.n_modules, plan.n_sensors = structure.n_modules, structure.n_sensors
     plan.value_type, plan.value_bytes = _type(structure.dtype)[0], structure.dtype.itemsize
-    plan.width = decoder.width
+    plan.width = compiled.width
 
     plan.nobody = addresses.nobody
     plan.entry, plan.candidates = arrays.at(addresses.entry), arrays.at(addresses.candidates)
-    plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(decoder.payload_names)
+    plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(compiled.payload_names)
     plan.n_forms, plan.forms = arrays.structs(structs.Form, (_form(form, arrays) for form in addresses.forms))
-    plan.length_columns, plan.length_ok = decoder.length_ok.shape[1], arrays.at(decoder.length_ok)
-    if decoder.header is not None:
-        plan.header_byte, plan.header = decoder.header[0], arrays.at(decoder.header[1])
+    plan.length_columns, plan.length_ok = compiled.length_ok.shape[1], arrays.at(compiled.length_ok)
+    if compiled.header is not None:
+        plan.header_byte, plan.header = compiled.header[0], arrays.at(compiled.header[1])
 
-    assemblies = [*decoder.alone.items()]
+    assemblies = [*compiled.alone.items()]
     made_of = [([number], assembly) for number, assembly in assemblies]
-    made_of += [(cycle.members, cycle.assembly) for cycle in decoder.cycles]
+    made_of += [(cycle.members, cycle.assembly) for cycle in compiled.cycles]
     _, plan.assemblies = arrays.structs(
         structs.Assembly,
         (
@@ -81,7 +82,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
             for members, assembly in made_of
         ),
     )
-    kinds = [_kind(kind, decoder, arrays) for kind in decoder.kinds]
+    kinds = [_kind(kind, decoder, arrays) for kind in compiled.kinds]
     for number, (members, assembly) in enumerate(made_of):
         for place, (member, columns) in enumerate(zip(members, assembly.columns, strict=True)):
             kind = kinds[member]
@@ -91,11 +92,11 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.n_kinds, plan.kinds = arrays.structs(structs.Kind, kinds)
     plan.n_cycles, plan.cycles = arrays.structs(
         structs.Cycle,
-        (_cycle(cycle, len(assemblies) + number, arrays) for number, cycle in enumerate(decoder.cycles)),
+        (_cycle(cycle, len(assemblies) + number, arrays) for number, cycle in enumerate(compiled.cycles)),
     )
     plan.module_patch = arrays.of(structure.module_patch, np.int64)
     plan.n_groups, plan.groups_are_modules = structure.n_groups, structure.groups_are_modules
-    plan.most_groups = decoder.most_groups
+    plan.most_groups = compiled.most_groups
     plan.group_module, plan.group_patch = (
         arrays.of(of, np.int64) for of in (structure.group_module, structure.group_patch)
     )
@@ -105,9 +106,9 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.last_sequence, plan.haste = arrays.at(decoder.sequences.last), arrays.at(decoder.haste)
     plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
 
-    plan.values, plan.status = arrays.at(state.values_and_sink), arrays.at(state.status_and_sink)
-    plan.group_time_ns, plan.updated = arrays.at(state.group_time_ns), arrays.at(state.updated)
-    plan.patch_time_ns, plan.touched = arrays.at(state.patch_time_ns), arrays.at(state.touched)
+    plan.values, plan.status = arrays.at(state.all_values), arrays.at(state.all_status)
+    plan.group_time_ns, plan.updated = arrays.at(state.all_group_time_ns), arrays.at(state.all_updated)
+    plan.patch_time_ns, plan.touched = arrays.at(state.all_patch_time_ns), arrays.at(state.all_touched)
     plan.bus_counters, plan.patch_counters = arrays.at(state.bus_counters), arrays.at(state.patch_counters)
 
 

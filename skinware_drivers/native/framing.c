@@ -1,4 +1,4 @@
-/* Finds frames in the bytes of a serial line: serial/packets.py, framings.py, stuffing.py, checksums.py, stream.py. */
+/* Finds frames in the bytes of a serial line: serial/packets.py, delimited.py, checksums.py, stream.py. */
 #include "framing.h"
 
 struct found { /* a frame */

@@ -1,52 +1,44 @@
-"""Buses that join a running driver, leave it, or come back with other options, while the others go on."""
+"""Buses that join a running driver, leave it, or return with other options, while the others continue."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import select
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from skinware.errors import ConfigurationError, StructureError
-from skinware.status import BusReason
+from skinware.errors import ConfigurationError, DriverError, StructureError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.description import join_types
+from skinware_drivers.running.building import Builder
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.serving import Serving
+
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 
 class BusChanges:
-    """Changes the buses of a running driver, one change at a time. Users see a new generation after each.
+    """Changes the buses of a running driver, one change at a time. Programs see a new generation after each.
 
-    Buses keep their places permanently, and with them the uids of their sensors: the place of one that was removed
-    stays empty, until a bus of the same name is added.
+    A bus keeps its place, and with it the uids of its sensors: the place of a removed bus stays empty until a bus of
+    the same name is added.
 
     Args:
-        lines: the driver's buses, by place.
-        epoll: for those that join.
-        put_in: begins to serve a bus at its place.
-        take_out: ends that.
-        rebuild: makes a structure of what is there.
+        lines: the driver's buses, by place; changed.
+        epoll: where open buses are registered.
+        builder: builds the structure.
+        serving: serves the buses.
     """
 
-    def __init__(
-        self,
-        lines: Sequence[BusLine],
-        epoll: select.epoll,
-        put_in: Callable[[BusLine], Awaitable[None]],
-        take_out: Callable[[BusLine], Awaitable[None]],
-        rebuild: Callable[[], Awaitable[None]],
-    ) -> None:
-        self._lines = lines
-        self._epoll = epoll
-        self._put_in = put_in
-        self._take_out = take_out
-        self._rebuild = rebuild
+    def __init__(self, lines: list[BusLine], epoll: select.epoll, builder: Builder, serving: Serving) -> None:
+        self._lines, self._epoll, self._builder, self._serving = lines, epoll, builder, serving
         self._changing = asyncio.Lock()
 
     async def change_to(self, wanted: Mapping[str, AnyAdapter], make_bus: Callable[[str, AnyAdapter], Bus]) -> None:
-        """Have these buses from now on: add what is new, open anew what has other options, remove the rest.
+        """Change to these buses: add the new ones, reopen those with other options, remove the rest.
 
         All is checked before anything is changed.
 
@@ -55,7 +47,7 @@ class BusChanges:
             make_bus: makes a bus of a name, for the driver's object.
 
         Raises:
-            ConfigurationError: a bus cannot be what it is wanted to be.
+            ConfigurationError: two buses contradict each other, or none with sensors would be left.
         """
         async with self._changing:
             leaving = [line for line in self._present if line.name not in wanted]
@@ -67,7 +59,7 @@ class BusChanges:
                     if same.adapter.options != adapter.options:
                         replaced[name] = same
                     continue
-                old = next((line for line in leaving if place_of_bus(line.name) == place_of_bus(name)), None)
+                old = next((line for line in leaving if BusName.of(line.name).place == BusName.of(name).place), None)
                 if old is None:
                     coming.append(name)
                 else:
@@ -87,15 +79,15 @@ class BusChanges:
                 await self._put_in(line)
             for line in leaving:
                 await self._take_out(line)
-                await self._rebuild()
+                await self._builder.build()
 
     @property
     def _present(self) -> list[BusLine]:
-        return [line for line in self._lines if line.reason != BusReason.REMOVED]
+        return [line for line in self._lines if not line.is_removed]
 
     def _places(self, names: Sequence[str]) -> list[int]:
-        """Where buses go that join: to their old places if they had some, else behind all others."""
-        free = {line.name: line.ordinal for line in self._lines if line.reason == BusReason.REMOVED}
+        """Return places for buses that join: their old ones if they had some, else behind all others."""
+        free = {line.name: line.ordinal for line in self._lines if line.is_removed}
         behind_all = itertools.count(len(self._lines))
         return [free[name] if name in free else next(behind_all) for name in names]
 
@@ -110,3 +102,20 @@ class BusChanges:
             join_types([line.adapter.types for line in lines.values()])
         except StructureError as error:
             raise ConfigurationError(str(error)) from None
+
+    async def _put_in(self, line: BusLine) -> None:
+        async with self._builder.built:
+            line.begin_lost()
+            self._lines[line.ordinal : line.ordinal + 1] = [line]
+            self._builder.rebuild(forced=True)  # before anything of it arrives
+        self._serving.begin(line)
+
+    async def _take_out(self, line: BusLine) -> None:
+        """Stop the devices of a bus, and close it. Its sensors stay in the structure until the next build."""
+        await self._serving.end(line)
+        try:
+            await line.stop()
+        except DriverError as error:
+            log.warning("%s", str(error))  # the bus is removed all the same
+        async with self._builder.built:
+            line.remove()

@@ -15,7 +15,7 @@ from skinware.service.messages import ACQUIRE
 from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.guard import hook
+from skinware_drivers.running.guard import Ending, hook
 from skinware_drivers.running.publisher import NOBODY_WAITS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -31,7 +31,7 @@ class RequestDesk:
         lines: the driver's buses.
         listen_only: nothing may be sent: operations are refused.
         changed: called after an operation with its bus, its patches, and whether it set them up anew.
-        fail: called with what goes wrong here and is no fault of an operation.
+        ending: of the driver, for errors that are no fault of an operation.
     """
 
     def __init__(
@@ -40,13 +40,13 @@ class RequestDesk:
         lines: Sequence[BusLine],
         listen_only: bool,
         changed: Changed,
-        fail: Callable[[BaseException], None],
+        ending: Ending,
     ) -> None:
         self._server = server
         self._lines = lines
         self._listen_only = listen_only
         self._changed = changed
-        self._fail = fail
+        self._ending = ending
         self._waiting: list[tuple[int, Request]] = []
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -59,13 +59,8 @@ class RequestDesk:
             else:
                 task = asyncio.get_running_loop().create_task(self._carry_out(request))
                 self._tasks.add(task)
-                task.add_done_callback(self._done)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        error = None if task.cancelled() else task.exception()
-        if error is not None:
-            self._fail(error)
+                task.add_done_callback(self._tasks.discard)
+                task.add_done_callback(self._ending.watch)
 
     @property
     def wanted_ns(self) -> int:
@@ -123,7 +118,7 @@ class RequestDesk:
         async with line.busy:
             if request.cancelled:
                 return None
-            if line.lost.is_set():
+            if line.connection.lost.is_set():
                 raise ConfigurationError("the bus is away")
             try:
                 with hook(request.operation, line.name):
@@ -135,7 +130,7 @@ class RequestDesk:
         try:
             self._changed(line, patches, job.operation.sets_up)
         except Exception as error:
-            self._fail(error)
+            self._ending.fail(error)
             raise
         return result
 

@@ -14,12 +14,11 @@ from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
-from skinware.status import BusReason, BusState
+from skinware.status import BusState
 from skinware_drivers.native import structs
 from skinware_drivers.native.kernel_bus import KernelBus, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
-from skinware_drivers.running.guard import bus_failure
 
 _NEVER_NS = (1 << 63) - 1
 _OTHER_BUS, _NEWS, _NO_MEMORY = range(2, 5)  # of flow.c
@@ -60,7 +59,7 @@ def flow_of(
     take: Callable[[], object],
     fail: Callable[[BaseException], None],
 ) -> Flow | None:
-    buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
+    buses = [line.bus for line in generation.lines if not line.is_removed]
     if not any(is_read_natively(bus) for bus in buses):
         return None
     return Flow(generation, epoll_fd, latency_s, take, fail)
@@ -145,23 +144,23 @@ class Flow:
             source.stream = source.asker = None
             if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
                 source.bus = line.ordinal
-                source.heard_ns = line.heard_ns
-                source.is_watched = line.state != BusState.LIVE
+                source.heard_ns = line.condition.heard_ns
+                source.is_watched = line.condition.state != BusState.LIVE
                 self._handed.append((line, line.bus, source))
         n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
         self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)
 
     def _take_back(self) -> None:
         for line, bus, source in self._handed:
-            line.heard_ns = source.heard_ns
+            line.condition.heard_ns = source.heard_ns
             bus.take_back(source)
 
     def _heard(self) -> None:
         for line, _, source in self._handed:
-            line.heard_ns = source.heard_ns
+            line.condition.heard_ns = source.heard_ns
         self._generation.update_bus_states()
         for line, _, source in self._handed:
-            source.is_watched = line.state != BusState.LIVE
+            source.is_watched = line.condition.state != BusState.LIVE
 
     def _bus(self, ordinal: int) -> KernelBus:
         return next(bus for line, bus, _ in self._handed if line.ordinal == ordinal)
@@ -178,5 +177,5 @@ class Flow:
         line = self._lines[bus]
         try:
             self._bus(bus).nothing_received(number)
-        except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
-            line.lose(bus_failure(line.name, "receive", error))
+        except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)
+            line.lose("receive", error)

@@ -18,7 +18,7 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.guard import failure
+from skinware_drivers.running.guard import hook
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.news import Doubles, PatchChange
 from skinware_drivers.running.publisher import Publisher
@@ -41,24 +41,19 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
 
 
 def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
-    """The driver's look at a skin, which knows already of the patches that report errors.
+    """Return the driver's watch, which knows already of the patches that report errors.
 
     Raises:
-        DriverError: its code failed.
+        DriverError: the driver's own code failed.
     """
-    try:
+    with hook("watch", *(line.name for line in lines), of_all=True):
         watch = lines[0].adapter.watch(tables)
-    except Exception as error:
-        raise failure("watch", f"buses {', '.join(line.name for line in lines)}", error) from error
     for line in lines:
         for key in line.suspects:
             patch = tables.patch_key.get((line.ordinal, key))
-            if patch is None:
-                continue
-            try:
-                watch.suspect(patch)
-            except Exception as error:
-                raise failure("Watch.suspect", f"bus {line.name}", error) from error
+            if patch is not None:
+                with hook("Watch.suspect", line.name, of_all=True):
+                    watch.suspect(patch)
     return watch
 
 
@@ -93,7 +88,7 @@ class Generation:
     _doubles: Doubles = field(init=False)
 
     def __post_init__(self) -> None:
-        self.batch = make_batch(self.lines, self.decoder.headroom)
+        self.batch = make_batch(self.lines, self.decoder.compiled.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patches.state.copy()
         self._doubles = Doubles(self.tables.structure, self.publisher.pace.period_ns)
@@ -149,12 +144,12 @@ class Generation:
         if settled:
             self._look_ns = now_ns() + _LOOK_PAUSE_NS
         for line in self.lines:
-            if not settled and line.is_in_order:
+            if not settled and line.condition.is_in_order:
                 continue
             line.look(self.publisher.pace.silence_ns)
-            buses, number = self.publisher.buses, line.ordinal
-            buses.state[number], buses.reason[number], buses.since_ns[number] = line.state, line.reason, line.since_ns
-            buses.load[number] = line.limits.permille
+            buses, number, condition = self.publisher.buses, line.ordinal, line.condition
+            buses.state[number], buses.reason[number] = condition.state, condition.reason
+            buses.since_ns[number], buses.load[number] = condition.since_ns, condition.limits.permille
             buses.samples[number] = line.bus.samples.rows
             in_c = self.flows and is_read_natively(line.bus)
             buses.data_path[number] = DataPath.NATIVE if in_c else DataPath.PYTHON
@@ -171,7 +166,7 @@ class Generation:
         state = self.publisher.patches.state[self.tables.structure.patch_bus == line.ordinal]
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
-    def tell_patches(self) -> Iterator[PatchChange]:
+    def note_patches(self) -> Iterator[PatchChange]:
         """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
         now, before = self.publisher.patches.state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():

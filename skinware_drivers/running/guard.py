@@ -1,4 +1,11 @@
-"""Contain failures: of hooks of an adapter, of attempts that are repeated, and of libraries that do not return."""
+"""What a failure costs, by one rule; and calls that are repeated, or that may hang.
+
+* An ``Expand`` function fails: the frame is lost, and counted as bad content (``decoding.frame_kind``).
+* A device fails (``BusError`` or ``OSError`` in a hook): the attempt is repeated, for its patch or its bus.
+* A bus fails, whatever its methods raise: it is closed, and opened again (``BusLine.lose``).
+* The driver's own code fails in a hook of one bus: that bus is set aside while another one is served (``Serving``).
+* Anything else ends the driver (:class:`Ending`).
+"""
 
 from __future__ import annotations
 
@@ -10,85 +17,108 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from skinware.errors import BusError, BusNotAvailable, ConfigurationError, DriverError, SkinwareError
-from skinware.status import BusReason
+from skinware.errors import BusError, ConfigurationError, DriverError, SkinwareError
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 
 @contextmanager
-def hook(name: str, bus: str) -> Iterator[None]:
-    """Call a hook of an adapter.
+def hook(name: str, *buses: str, of_all: bool = False) -> Iterator[None]:
+    """Call a hook of an adapter or of its watch.
 
     Args:
         name: of the hook.
-        bus: name of the bus that it is called for.
+        buses: names of the buses that it is called for.
+        of_all: it concerns all buses of the driver, also if it is called for one.
 
     Raises:
         BusError: as the hook raised it, or for an ``OSError``.
         ConfigurationError: as the hook raised it.
-        DriverError: for anything else.
+        DriverError: for anything else; ``bus`` is set if it concerns no other bus.
     """
+    where = f"bus{'es' if len(buses) > 1 else ''} {', '.join(buses)}"
     try:
         yield
     except (BusError, ConfigurationError):
         raise
     except OSError as error:
-        raise BusError(f"bus {bus}: `{name}` failed: {_cause(error)}") from error
-    except asyncio.CancelledError as error:
-        task = asyncio.current_task()
-        if task is None or task.cancelling():
-            raise
-        raise failure(name, f"bus {bus}", error, only=bus) from error  # of its own making: nobody asked for it
-    except (Exception, SystemExit) as error:
-        raise failure(name, f"bus {bus}", error, only=bus) from error
+        raise BusError(f"{where}: `{name}` failed: {cause(error)}") from error
+    except (asyncio.CancelledError, Exception, SystemExit) as error:
+        if isinstance(error, asyncio.CancelledError):
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise  # somebody else asked for it
+        log.info("%s: `%s` failed", where, name, exc_info=error)
+        only = "" if of_all else buses[0]
+        raise DriverError(f"{where}: `{name}` failed: {cause(error)}", bus=only) from error
 
 
-def failure(name: str, where: str, error: BaseException, *, only: str = "") -> DriverError:
-    """What to raise for a hook that failed.
-
-    Args:
-        name: of the hook.
-        where: the bus or buses that it was called for, for people.
-        error: what it raised.
-        only: name of the bus that the failure concerns, if it concerns no other.
-    """
-    log.info("%s: `%s` failed", where, name, exc_info=error)
-    return DriverError(f"{where}: `{name}` failed: {_cause(error)}", bus=only)
-
-
-def end_of_driver(error: BaseException) -> BaseException:
-    """What a driver ends with when an error came out of its event loop."""
-    if isinstance(error, (SkinwareError, BrokenPipeError)):  # nobody reads the output any more
-        return error
-    log.info("the driver failed", exc_info=error)
-    ended = DriverError(f"the driver failed: {_cause(error)}")
-    ended.__cause__ = error
-    return ended
-
-
-def bus_failure(bus: str, method: str, error: Exception) -> BusNotAvailable:
-    """A bus whose own code failed counts as lost, and is opened again."""
-    if isinstance(error, BusNotAvailable):
-        return error
-    return BusNotAvailable(f"bus {bus}: `{method}` failed: {_cause(error)}", reason=BusReason.FAILED)
-
-
-def _cause(error: BaseException) -> str:
-    """``KeyError: 'oops' (my.py, line 38)``: the error, and where it was raised."""
+def cause(error: BaseException) -> str:
+    """Return an error with the place where it was raised: ``KeyError: 'oops' (my.py, line 38)``."""
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return "".join(traceback.format_exception_only(error)).strip().replace("\n", " ") + where
 
 
+class Ending:
+    """Whether a driver is to end, and with which error.
+
+    Attributes:
+        error: the first error that ends it; None: there is none.
+        has_come: set when it is to end.
+    """
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+        self.has_come = asyncio.Event()
+
+    def fail(self, error: BaseException) -> None:
+        """End the driver with an error; only the first one counts."""
+        if self.error is None:
+            self.error = error
+            if not isinstance(error, (SkinwareError, BrokenPipeError)):  # the latter: nothing reads the output any more
+                log.info("the driver failed", exc_info=error)
+                self.error = DriverError(f"the driver failed: {cause(error)}")
+                self.error.__cause__ = error
+        self.has_come.set()
+
+    def guard(self, callback: Callable[[], object]) -> Callable[[], None]:
+        """Return a callback of the event loop that ends the driver if it fails, and does nothing afterwards."""
+
+        def call() -> None:
+            if self.error is not None:
+                return
+            try:
+                callback()
+            except (Exception, SystemExit) as error:  # noqa: BLE001  (the event loop would log it and go on)
+                self.fail(error)
+
+        return call
+
+    def watch(self, task: asyncio.Task[Any]) -> None:
+        """End the driver if this task fails; a callback for ``add_done_callback``."""
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self.fail(error)
+
+    def handle(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """End the driver with what failed outside of every guard; an exception handler for the event loop."""
+        error = context.get("exception")
+        if error is None:
+            log.warning("%s", context["message"])
+        else:
+            self.fail(error)
+
+
 class Backoff:
-    """Longer and longer pauses.
+    """Pauses between attempts, each twice as long as the one before.
 
     Args:
-        first_s: the first one; the next is twice as long, and so on.
-        longest_s: the longest.
-        at_once: no pause at all comes first.
+        first_s: the first pause.
+        longest_s: the longest pause.
+        at_once: the first attempt needs no pause.
     """
 
     def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
@@ -99,7 +129,7 @@ class Backoff:
 
     @property
     def longest_s(self) -> float:
-        """The longest pause. What went well for that long is over: see ``begin_again``."""
+        """The longest pause; after so long without trouble, call ``begin_again``."""
         return self._longest_s
 
     def next_s(self) -> float:
@@ -111,7 +141,7 @@ class Backoff:
 
 
 class SlowCall:
-    """A call that has begun, in a thread that a program need not wait for when it ends.
+    """A call in a thread that does not keep the program from ending.
 
     Args:
         name: of the thread.
@@ -129,23 +159,26 @@ class SlowCall:
         self._thread.start()
 
     async def is_over(self, patience_s: float) -> bool:
-        """Whether it comes back within a time, s."""
+        """Wait for the call to return, at most for a time, s; return whether it did."""
         over, _ = await asyncio.wait([self._over], timeout=patience_s)
         if over:
             self._thread.join()  # which has nothing left to do
         return bool(over)
 
     def check(self) -> None:
-        """Once it is over: raise what it raised."""
+        """Raise what the call raised; to be called once it is over."""
         error = self._over.result()
         if error is not None:
             raise error
 
     def leave(self, afterwards: Callable[[], object]) -> bool:
-        """Leave it to itself, if it is not over; something is done in its thread when it has come back after all.
+        """Stop waiting for the call.
+
+        Args:
+            afterwards: called in its thread if it returns after all.
 
         Returns:
-            Whether it was left; False: it is over, and nothing is done.
+            False: the call is already over, and nothing is done.
         """
         with self._lock:
             if not self._has_returned:
@@ -156,12 +189,12 @@ class SlowCall:
         failure = None
         try:
             self._call()
-        except Exception as error:  # noqa: BLE001  (for whoever asks)
+        except Exception as error:  # noqa: BLE001  (``check`` raises it)
             failure = error
         with self._lock:
             self._has_returned = True
         if self._afterwards is not None:
             with contextlib.suppress(Exception):
                 self._afterwards()
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody asks any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._over.set_result, failure)

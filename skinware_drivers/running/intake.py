@@ -10,7 +10,6 @@ from typing import Literal
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.guard import bus_failure
 
 _TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
 _REST, _REST_WHILE_ASKING, _REST_IN_STEP = 16, 4, 1
@@ -59,12 +58,17 @@ class Intake:
         self._by_fd: dict[int, BusLine] = {}
 
     def start(self) -> None:
+        self._end_rest()  # two looks pending would be one that stop() does not know
         asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._look)
 
     def stop(self) -> None:
         asyncio.get_running_loop().remove_reader(self._epoll.fileno())
+        self._end_rest()
+
+    def _end_rest(self) -> None:
         if self._rest is not None:
             self._rest.cancel()
+            self._rest = None
 
     def take(self) -> Literal["nothing", "all", "some"]:
         """Take what has arrived, now. ``some``: more is waiting."""
@@ -113,12 +117,12 @@ class Intake:
             batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
             try:
                 if line.bus.receive(batch, line.ordinal):
-                    line.heard_ns = time_ns
+                    line.condition.heard_ns = time_ns
                     if not batch.free:
                         is_all = False
                         self.read_until_ns = min(self.read_until_ns, int(batch.time_ns[batch.stop - 1]) - 1)
-            except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
-                line.lose(bus_failure(line.name, "receive", error))
+            except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)
+                line.lose("receive", error)
         return is_all
 
     def _line_of(self, fd: int) -> BusLine | None:

@@ -163,7 +163,7 @@ class PatchCare:
         timer = Periodic(_DATA_CHECKS_HZ)
         silent = self._patches_in(PatchState.EXPECTED)
         for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * self._line.adapter.period_s))):
-            if not self._line.lost.is_set() and not silent:
+            if not self._line.connection.lost.is_set() and not silent:
                 return
             await asyncio.sleep((timer.deadline_ns - now_ns()) / NS_PER_S)
             timer.advance(now_ns())
@@ -177,10 +177,10 @@ class PatchCare:
 
     async def recover_silent(self) -> None:
         line, generation = self._line, self._generation()
-        if generation is None or self._listen_only or line.lost.is_set() or line.busy.locked():
+        if generation is None or self._listen_only or line.connection.lost.is_set() or line.busy.locked():
             return
         silence_ns = generation.publisher.pace.silence_ns
-        if now_ns() - max(line.opened_ns, generation.begun_ns) < 2 * silence_ns:
+        if now_ns() - max(line.connection.opened_ns, generation.begun_ns) < 2 * silence_ns:
             return  # nobody listened, the boards may send: to set them up again would move their baseline
         states = [PatchState.STALE, PatchState.EXPECTED]
         if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
@@ -208,7 +208,7 @@ class PatchCare:
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         line, set_ups = self._line, self._set_ups.get(patch.key)
-        if (set_ups is not None and not set_ups.are_due) or not line.limits.knows_load_since(line.set_up_ns):
+        if (set_ups is not None and not set_ups.are_due) or not line.condition.limits.knows_load_since(line.set_up_ns):
             return False
         try:
             with hook("probe", line.name):
@@ -219,7 +219,7 @@ class PatchCare:
             return False
         if set_ups is None:
             set_ups = self._set_ups[patch.key] = _SetUps()
-            if line.limits.is_full:
+            if line.condition.limits.is_full:
                 set_ups.put_off()
                 log.warning(
                     "%s: %s answers, but its data finds no room: the bus is full; fewer boards, or a longer period"
@@ -279,7 +279,7 @@ class PatchCare:
 
     def _tell(self, text: str) -> None:
         """What went wrong in attending, once in a row, unless it is that the bus is away."""
-        if text != self._told and not self._line.lost.is_set():
+        if text != self._told and not self._line.connection.lost.is_set():
             self._told = text
             log.warning("%s: %s; attending to it again", self._line.name, text)
 

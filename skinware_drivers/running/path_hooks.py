@@ -152,7 +152,7 @@ class PathHooks:
 
     def _on_expand(self, number: int, updates_at: int, rows_at: int, failed_at: int, n: int) -> None:
         updates, rows = _view(updates_at, n, np.int64), _view(rows_at, n, np.int64)
-        kind, columns = self._decoder.kinds[number], self._decoder.columns_of(number)
+        kind, columns = self._decoder.compiled.kinds[number], self._decoder.compiled.columns_of(number)
         taken, how = self._batch.wire[rows], kind.frame.values
         if not isinstance(how, Expand):
             return
@@ -183,7 +183,7 @@ class PathHooks:
 
 
 def _update_dtype(decoder: Decoder) -> np.dtype[np.void]:
-    width, values = decoder.width, decoder.tables.structure.dtype
+    width, values = decoder.compiled.width, decoder.tables.structure.dtype
     sensors_at = structs.UPDATE.itemsize
     values_at = -(-(sensors_at + 4 * width) // 8) * 8
     status_at = values_at + width * values.itemsize

@@ -17,8 +17,7 @@ from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, SkinState, Updates
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.attention import HoldUp
-from skinware_drivers.running.guard import failure
+from skinware_drivers.running.guard import hook
 from skinware_drivers.running.patch_timing import PatchTiming
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
@@ -173,17 +172,19 @@ class Publisher:
         self.patches.lives_until_ns[patch] = 0
         self.patches.state[patch] = state
 
-    def excuse(self, hold_up: HoldUp) -> None:
-        """Count silence from now on, of patches that lived when this process was held up.
+    def excuse(self, since_ns: int, asleep_ns: int) -> None:
+        """Count silence from now on, for patches that lived when this process was held up.
 
-        Data from before the machine slept is older by as much as it slept.
+        Args:
+            since_ns: when it last ran, CLOCK_MONOTONIC ns.
+            asleep_ns: how long the machine was suspended: older data is older by that time.
         """
         lives_until_ns = self.patches.lives_until_ns
-        lived = lives_until_ns > hold_up.since_ns
+        lived = lives_until_ns > since_ns
         until_ns = np.maximum(lives_until_ns, now_ns() + self.pace.silence_ns)
         lives_until_ns[lived] = until_ns[lived]
         times_ns = self.state.group_time_ns
-        times_ns[:] = np.where(times_ns > 0, np.maximum(1, times_ns - hold_up.asleep_ns), 0)
+        times_ns[:] = np.where(times_ns > 0, np.maximum(1, times_ns - asleep_ns), 0)
 
     def silent_ns(self, patch: int) -> int:
         """For how long a patch has been silent beyond its age limit, while this process attended."""
@@ -203,7 +204,7 @@ class Publisher:
         """
         try:
             self.watch.look(updates)
-        except Exception as error:
+        except (Exception, SystemExit):
             buses = np.unique(self._structure.patch_bus[self.state.group_patch[updates.group]]).tolist()
-            names = ", ".join(self._structure.buses[bus] for bus in buses)
-            raise failure("Watch.look", f"bus {names}", error) from error
+            with hook("Watch.look", *(self._structure.buses[bus] for bus in buses), of_all=True):
+                raise

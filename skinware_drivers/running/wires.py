@@ -16,9 +16,9 @@ import numpy.typing as npt
 from skinware import wire
 from skinware.errors import SkinwareError
 from skinware.memory.announcement import is_wished, living_readers
-from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
+from skinware_drivers.running.building import Identity
 from skinware_drivers.running.bus_line import BusLine
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -38,27 +38,15 @@ class Wires:
     """The service with the wires of a driver. A frame of it has what went over one bus since the one before.
 
     Args:
-        name: of the driver.
-        driver_type: of the driver.
+        identity: of the driver.
         lines: its buses; the list may change.
-        listen_only: nothing is sent.
-        namespace, group: as of the driver.
     """
 
-    def __init__(
-        self,
-        name: str,
-        driver_type: str,
-        lines: Sequence[BusLine],
-        listen_only: bool,
-        namespace: Namespace,
-        group: str | None,
-    ) -> None:
-        self._name, self._lines, self._namespace, self._group = name, lines, namespace, group
-        self._driver_type, self._listen_only = driver_type, listen_only
+    def __init__(self, identity: Identity, lines: Sequence[BusLine]) -> None:
+        self._identity, self._lines, self._namespace = identity, lines, identity.namespace
         self._writer: ServiceWriter | None = None
         self._until_ns = 0
-        self._told: dict[str, npt.NDArray[np.bytes_]] = {}
+        self._published: dict[str, npt.NDArray[np.bytes_]] = {}
         self._task: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
@@ -81,12 +69,12 @@ class Wires:
                         break
                     await asyncio.sleep(_FINDING_S)
         except (SkinwareError, OSError) as error:
-            self._tell_trouble(error)
+            self._log_trouble(error)
         self._withdraw()
 
     def _is_read(self) -> bool:
         """Whether anybody has found it: who has can take all of it, also when the service has ended."""
-        name = wire.service_name(self._name)
+        name = wire.service_name(self._identity.name)
         return any(record.service == name for record in living_readers(self._namespace))
 
     async def _serve(self) -> None:
@@ -102,7 +90,7 @@ class Wires:
                     self._withdraw()
                     await asyncio.sleep(_LOOK_S)
         except (SkinwareError, OSError) as error:  # the driver goes on
-            self._tell_trouble(error)
+            self._log_trouble(error)
             self._withdraw()
 
     async def _publish_for_a_while(self) -> None:
@@ -125,34 +113,34 @@ class Wires:
 
     def _writer_for(self) -> ServiceWriter:
         static = {
-            "driver": np.array([self._name.encode()]),
+            "driver": np.array([self._identity.name.encode()]),
             "bus_name": np.array([line.name.encode() for line in self._lines]),
             "about": np.array([msgspec.json.encode(self._about())]),
         }
         rate_hz = len(self._lines) / _TURN_S
         if self._writer is None:
             self._writer = ServiceWriter(
-                wire.service_name(self._name),
+                wire.service_name(self._identity.name),
                 wire.COLUMNS,
                 static,
                 namespace=self._namespace,
                 kind=wire.KIND,
                 slots=_SLOTS,
                 rate_hz=rate_hz,
-                group=self._group,
-                description=f"what goes over the wires of {self._name}",
+                group=self._identity.group,
+                description=f"what goes over the wires of {self._identity.name}",
             )
             self._until_ns = now_ns() + round(_MOST_S * NS_PER_S)
-        elif any(static[name].tolist() != self._told[name].tolist() for name in static):
+        elif any(static[name].tolist() != self._published[name].tolist() for name in static):
             self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
-        self._told = static
+        self._published = static
         return self._writer
 
     def _about(self) -> dict[str, object]:
         options = [msgspec.to_builtins(line.adapter.options) for line in self._lines]
         return {
-            "driver_type": self._driver_type,
-            "listen_only": self._listen_only,
+            "driver_type": self._identity.driver_type,
+            "listen_only": self._identity.listen_only,
             "versions": _versions(),
             "buses": [
                 {"medium": line.adapter.medium, "options": own} for line, own in zip(self._lines, options, strict=True)
@@ -170,8 +158,8 @@ class Wires:
         if writer is not None:
             writer.close()
 
-    def _tell_trouble(self, error: Exception) -> None:
-        log.warning("what goes over the wires of %s is not published: %s", self._name, error)
+    def _log_trouble(self, error: Exception) -> None:
+        log.warning("what goes over the wires of %s is not published: %s", self._identity.name, error)
 
 
 @cache

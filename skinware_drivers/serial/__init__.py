@@ -1,7 +1,6 @@
 """Serial lines: the adapter that drivers of serial devices subclass, framings, and checksums."""
 
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers, Refused
+from skinware_drivers.serial.adapter import Answers, Refused, SerialAdapter
 from skinware_drivers.serial.checksums import (
     CRC8,
     CRC16_CCITT_FALSE,
@@ -18,12 +17,11 @@ from skinware_drivers.serial.checksums import (
     Sum,
     Xor,
 )
+from skinware_drivers.serial.delimited import COBS, HDLC, LINES, SLIP, Delimited
 from skinware_drivers.serial.framing import Field, Unframed
-from skinware_drivers.serial.framings import Delimited, LengthFirst, Recurring
+from skinware_drivers.serial.framings import LengthFirst, Recurring, TextMatrix
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from skinware_drivers.serial.stream import Part, Split, by_length
-from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
-from skinware_drivers.serial.text_matrix import TextMatrix
 
 __all__ = [
     "COBS",

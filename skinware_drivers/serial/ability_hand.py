@@ -1,12 +1,13 @@
-"""PSYONIC's Ability Hand: 30 force-sensitive resistors, six on each finger, over its UART. Nothing here moves it.
+"""PSYONIC's Ability Hand: 30 force-sensitive resistors, six on each finger, over its UART. It never moves the hand.
 
-Wire format: the maker's programs (github.com/psyonicinc/ability-hand-api, MIT), with byte stuffing switched on as they
-need it. A message stands between ``7E``; ``7D`` and the byte with bit 5 inverted replace 7E and 7D in it; its last byte
-makes the sum of all others 0. A question is the hand's address and a command. The commands A0, A1 and A2 are *read
-only* (``read_only.py`` of the maker's): no target follows them, as it does those that move the hand. All answers have a
-header, whose lower four bits say what comes, six positions and six currents (0) or speeds (1), i16, the sensors of
-index, middle, ring, little finger and thumb, of 12 bits, the lower ones first, and a byte of temperatures. Those with 2
-have no touch.
+Wire format: the maker's programs (github.com/psyonicinc/ability-hand-api, MIT), with the byte stuffing that they need.
+A message stands between ``7E``; ``7D`` and the byte with bit 5 inverted replace 7E and 7D in it; its last byte makes
+the sum of all bytes 0. A question is the hand's address and a command. The commands A0, A1 and A2 are *read only*
+(``read_only.py`` of the maker): unlike the commands that move the hand, they carry no target.
+
+An answer has a header, whose lower four bits are its kind: six positions and six currents (kind 0) or speeds (1), i16;
+the sensors of index, middle, ring, little finger and thumb, 12 bits each, the lower ones first; and a byte of
+temperatures. Answers of kind 2 have no touch.
 """
 
 from __future__ import annotations
@@ -33,27 +34,26 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Poll
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.delimited import HDLC, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.serial.stuffing import HDLC
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
 _FINGERS = ("index", "middle", "ring", "little", "thumb")
 _SITES_M = ((0.0, 0.0), (0.0, 0.006), (-0.004, 0.006), (-0.004, 0.020), (0.004, 0.006), (0.004, 0.020))
-"""Across and down the finger, from its outermost sensor: upper and lower tip, upper and lower left, and right. After
-``fsrlocs_to_xml.py`` of the maker's, of fingers of the large hand; which side is seen as the left one is not told."""
+"""Across and down the finger, from its outermost sensor: upper and lower tip, upper and lower left, and right. Source:
+the maker's ``fsrlocs_to_xml.py``, fingers of the large hand; it does not say which side is the left one."""
 _N = len(_SITES_M)
 _TOUCH_AT, _FINGER_BYTES, _BODY = 24, 9, 70
 _MOST = 4095
 _FINGER = 0x100
-"""Identifiers of the parts of an answer; below are headers and addresses."""
+"""First identifier of the parts of an answer; lower ones are headers and addresses."""
 _WITHOUT_TOUCH = Match(0x02, 0x70F)
 _IDENTIFY_S = 0.3
 _C1, _C2, _DIVIDER_OHM = 121591.0, 0.878894, 1e4
-"""Placeholders: the maker says that nothing is calibrated."""
+"""Placeholders: the maker says that the sensors are not calibrated."""
 
 _Bytes = npt.NDArray[np.uint8]
 
@@ -64,7 +64,7 @@ class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     address: Annotated[int, Meta(ge=0, le=0xFF, description="of the hand")] = 0x50
     period_ms: Annotated[int, Meta(ge=2, description="time from question to question, ms")] = 10
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for views")] = "right"
-    zero: Annotated[Literal["suspect", "good"], Meta(description="what a sensor is that reads 0")] = "suspect"
+    zero: Annotated[Literal["suspect", "good"], Meta(description="status of a sensor that reads 0")] = "suspect"
     force: Annotated[
         Literal["no", "published", "divider"],
         Meta(description="newton instead of counts, by the maker's uncalibrated formula; divider: with its other sign"),
@@ -75,7 +75,7 @@ class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 def _by_finger(header: int, body: bytes) -> Iterable[tuple[int, bytes]]:
-    """An answer with touch in five parts; anything else as it is."""
+    """Split an answer with touch into five parts, one for each finger."""
     if header & 0x0F > 1 or len(body) != _BODY:
         return [(header, body)]
     touch = body[_TOUCH_AT:]
@@ -126,7 +126,7 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Ask for positions, as the maker's program does on every port when it looks for a hand."""
+        """Ask for positions, as the maker's program does on every port when it searches for a hand."""
         address = AbilityHandOptions().address
         await link.request(address, _READ_NO_TOUCH, _WITHOUT_TOUCH, timeout_s=_IDENTIFY_S)
         return f"Ability Hand at address {address:#x}"
@@ -142,7 +142,7 @@ def _places(hand: Hand, type_name: str) -> Geometry:
 
 
 def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:
-    """C1 / R + C2, where R = 33000 / V + sign * 10000 and V = 3.3 * counts / 4096; 0 of 0 counts."""
+    """Return C1 / R + C2, where R = 33000 / V + sign * 10000 and V = 3.3 * counts / 4096; 0 for 0 counts."""
     over_r = counts / (_DIVIDER_OHM * (_MOST + 1 + sign * counts))
     return np.where(counts > 0, _C1 * over_r + _C2, 0).astype(np.float32)
 

@@ -1,19 +1,19 @@
-"""Devices that speak the AGNI serial protocol (Bielefeld University): they say themselves which sensors they have.
+"""Devices that speak the AGNI serial protocol (Bielefeld University), and report which sensors they have.
 
 Wire format: agni_serial_protocol, ``serial_protocol_defines.h`` and ``serial_protocol.cpp`` (BSD). All messages:
 ``F0 C4 | id | ... | exclusive or of all bytes before``.
 
-* Commands to the device (id 0): number, and for C0 (configuration), F1 (start), 00 (stop), F0 (alive?) nothing more;
-  for D0 (period): count u16 LE, then sensor u8 and period u16 LE, in 0.1 ms, for each (service_set_period_cb in
-  ubi-agni/agni_serial_protocol 18b224d, 2024-06-25). Only C0 and F0 are answered.
+* Commands to the device (id 0): a number: C0 (configuration), F1 (start), 00 (stop), F0 (alive?); D0 (period) adds
+  count u16 LE, then sensor u8 and period u16 LE, in 0.1 ms, for each (service_set_period_cb in
+  ubi-agni/agni_serial_protocol 18b224d, 2024-06-25). The device answers C0 and F0 only.
 * Configuration (id 0): version 01, device u8, count n, n descriptors: type u16, payload length u16. Little-endian in
   the newer program, big-endian in an older one: option ``descriptors``. Sensor k of them (from 1) sends under id k.
-* Data (id 1 to C9): time u32, payload. Their length is known only from the configuration.
-* Alive (id F0): nothing more. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; other lengths of
-  errors are not in that program: they are skipped as noise.
+* Data (id 1 to C9): time u32, payload; only the configuration gives their length.
+* Alive (id F0): empty. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; errors of other lengths
+  are not in that program, and are skipped as noise.
 
-What the values of a sensor type are stands in files of that program, not on the wire: the option ``values`` says it for
-all sensors of a line. The unit of the device's time no file of that program says: option ``time_unit_us``.
+The wire does not say of which type the values of a sensor are: option ``values``, for all sensors of a line. That
+program does not say of which unit the device's time is: option ``time_unit_us``.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     period_ms: Annotated[
-        int, Meta(ge=0, le=_LONGEST_MS, description="time between two messages; 0: as the device has it")
+        int, Meta(ge=0, le=_LONGEST_MS, description="time between two messages; 0: leave the device's own")
     ] = 0
-    usual_period_ms: Annotated[int, Meta(ge=1, description="what that is, if period_ms is 0")] = 10
+    usual_period_ms: Annotated[int, Meta(ge=1, description="the device's own period, if period_ms is 0")] = 10
     descriptors: Annotated[Literal["little", "big"], Meta(description="byte order of the sensor descriptors")] = (
         "little"
     )
     values: Annotated[
         Literal["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<f4"], Meta(description="numpy dtype of the values")
     ] = "<u2"
-    time_unit_us: Annotated[float, Meta(ge=0, description="of the devices' time; 0: use the time of receipt")] = 0.0
+    time_unit_us: Annotated[float, Meta(ge=0, description="unit of the device's time; 0: the time of receipt")] = 0.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -108,10 +108,10 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         return _MOST_BYTES + 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the device what it has; it may still be sending for somebody before us.
+        """Ask the device for its sensors; it may still be sending for an earlier program.
 
         Raises:
-            BusError: it does not answer, says what cannot be, or must not be asked.
+            BusError: it does not answer, its answer is impossible, or it must not be asked.
         """
         if link.listen_only:
             raise BusError("a device reports the length of its messages only on request: listening is not enough")
@@ -151,7 +151,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Its number and how many sensors it has, which it tells also while it sends."""
+        """Ask for its number and its number of sensors, which it answers also while it sends."""
         _, device, n_sensors = (await cls._ask(link))[:3]
         return f"AGNI device {device} with {n_sensors} sensors"
 
@@ -164,14 +164,14 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             await link.send(0, command(_PERIOD, struct.pack("<H", self._n_sensors) + each))
 
     async def start(self, link: Link) -> None:
-        """Have all sensors send; no answer tells whether they will."""
+        """Start all sensors; the device does not answer."""
         await link.send(0, command(_START))
 
     async def stop(self, link: Link) -> None:
         await link.send(0, command(_STOP))
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
+        """Return whether the same device answers: then it was reset, and no longer sends by itself."""
         described = self.framing
         self.change_framing(type(self).framing)
         try:
@@ -191,7 +191,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @operation()
     async def period(self, link: Link, patches: Sequence[Patch], ms: int) -> None:  # noqa: ARG002
-        """Set the time between two messages of every sensor; the device does not say whether it can."""
+        """Set the time between two messages of every sensor; the device does not answer."""
         if not 1 <= ms <= _LONGEST_MS:
             raise ValueError(f"{ms} ms: give 1 to {_LONGEST_MS}")
         self._period_ms = ms
@@ -200,6 +200,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @operation(looks=True)
     async def alive(self, link: Link, patches: Sequence[Patch]) -> bool:  # noqa: ARG002
+        """Return whether the device answers."""
         try:
             await link.request(0, command(_ALIVE), Match(_ALIVE), timeout_s=_TIMEOUT_S)
         except HandshakeTimeout:
@@ -208,10 +209,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @staticmethod
     async def _ask(link: Link, tries: int = _TRIES) -> bytes:
-        """The configuration.
-
-        Raises:
-            HandshakeTimeout: no answer.
-        """
+        """Return the configuration."""
         reply = await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S, tries=tries)
         return reply.payload

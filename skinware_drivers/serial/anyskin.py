@@ -1,11 +1,11 @@
 """AnySkin and ReSkin: magnetometers under a magnetic skin, on the serial port of a microcontroller.
 
 Wire format: the maker's firmware, ``arduino/5X_binary_burst_stream`` (github.com/raunaqbhirangi/anyskin). 115200 baud
-on USB. A message is, for each magnetometer, temperature, x, y and z as little-endian float32, and then 0D 0A at the
-end of all: 82 bytes for five. The library that the firmware uses gives degrees Celsius and microtesla.
+on USB. A message is, for each magnetometer, temperature, x, y and z as little-endian float32, and 0D 0A behind them
+all: 82 bytes for five. The library that the firmware uses gives degrees Celsius and microtesla.
 
-There is no beginning of a message, no checksum, no counter and no command. 0D 0A can also lie within values, so a
-message counts after any doubt only if it ends with 0D 0A and the 82 bytes behind it do, too.
+A message has no beginning, no checksum and no counter, and the board takes no command. 0D 0A can also occur within
+values: after any error a message counts only if it ends with 0D 0A and the 82 bytes behind it do, too.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class AnySkinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AnySkinDriver(SerialAdapter[AnySkinOptions]):
-    """One board on a serial line: one module, since a message tells all of it.
+    """One board on a serial line: one module, as a message has all of it.
 
-    The four sensors of a magnetometer share its number as their uid. Values are as the board sends them; what is no
-    number is shown with ``SUSPECT``.
+    The four sensors of a magnetometer share its number as their uid. Values are as the board sends them; those that are
+    no number are ``SUSPECT``.
     """
 
     types: Sequence[SensorType] = (

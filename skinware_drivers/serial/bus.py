@@ -1,4 +1,4 @@
-"""A serial line as a bus: bytes are read in chunks as large as they come, and become frames in a stream."""
+"""A serial line as a bus: bytes are read in chunks as they come, and become frames in a stream."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from skinware_drivers.serial.stream import CHUNK, Stream
 
 _MORE_WAITS = 2048  # a read that gave so much is followed by another
 _SPAN_NS = NS_PER_S
-"""What was skipped is held against what was good so often."""
+"""Time between two comparisons of skipped with good bytes."""
 
 
 class SerialBus(KernelBus):
     """A serial line.
 
     Its name is ``serial:PATH?key=value`` (or only ``/dev/...``), where PATH is a device or one of pyserial's URLs;
-    with ``serial_number`` or ``vid_pid`` the port of that USB device, under whatever path it has when it is opened.
+    with ``serial_number`` or ``vid_pid`` the port of that USB device, at its path when it is opened.
 
     Every frame has the time at which its last byte was read. Frames arrive in the order of the stream. Damaged ones
     are counted in ``counters.errors``, and in more detail in ``counters.framing``.
 
     Args:
-        channel: path or URL; empty if the options say which USB device.
+        channel: path or URL; empty if the options name a USB device.
         options: see :class:`skinware_drivers.serial.opening.SerialOptions`.
-        payload_size: longest body that fits into a batch; longer ones are counted as refused.
+        payload_size: bytes of the longest body that fits into a batch; longer ones are counted as refused.
         listen_only: refuse every ``send``.
 
     Raises:
@@ -72,37 +72,37 @@ class SerialBus(KernelBus):
         self._unsent = b""
         self._stream: Stream = stream_of(self._framing, payload_size, self.counters)
         self._handed: tuple[NativeStream, DescriptorPort] | None = None  # to C
-        self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
+        self._judged, self._judged_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     @property
     def baudrate(self) -> int:
-        """Bits per second, as the bus' name says or ``use`` did; a bus that is open may still have the one before."""
+        """Bits per second, by the name of the bus or ``use``; an open bus may still have an earlier rate."""
         return self._serial_options.baudrate or self._baudrate
 
     def use(self, framing: Framing, commands: Encoding | None = None, baudrate: int | None = None) -> None:
-        """Say what is on the line. What was received but not fetched is dropped.
+        """Set the framing. Bytes that were received but not fetched are dropped.
 
         Args:
             framing: how frames are received.
             commands: how they are sent, if in another way.
-            baudrate: unless the bus' name says another; takes effect when it is opened next.
+            baudrate: unless the name of the bus gives another; takes effect when the bus is opened next.
         """
         self._framing, self._commands = framing, commands or framing
         self._baudrate = baudrate or self._baudrate
-        self._begin_anew()
+        self._restart()
 
     def open(self) -> None:
-        """Open the port for us alone, raw, with nothing in its buffers.
+        """Open the port exclusively, raw, with empty buffers.
 
         Raises:
-            BusNotAvailable: not there, not permitted or taken; the message says what to do.
+            BusNotAvailable: missing, not permitted or taken; the message says what to do.
             ConfigurationError: no such kind of port, or it has no such baud rate.
         """
         if self._port is not None:
             return
         port = self._open_port()
         self._port = port
-        self._begin_anew()
+        self._restart()
         self._unsent = b""
         self._woken = False
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -119,10 +119,10 @@ class SerialBus(KernelBus):
         return -1 if self._epoll is None else self._epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that have arrived, at most ``batch.free``; the others stay, and the bus stays readable.
+        """Append the frames that have arrived, at most ``batch.free``; if others remain, the bus stays readable.
 
         Raises:
-            BusNotAvailable: the port went away, or nothing on it can be understood any more until it is opened again.
+            BusNotAvailable: the port went away, or must be opened again before frames can be found.
         """
         if self._port is None:
             raise BusNotAvailable(f"{self!r} is not open")
@@ -134,18 +134,18 @@ class SerialBus(KernelBus):
         if damaged := self._stream.take_damaged():
             self.samples.note(Unused.REFUSED, 0, damaged)
         if self._stream.is_lost and not taken:
-            raise BusNotAvailable(f"{self.name}: out of step: what came is no answer; beginning anew")
+            raise BusNotAvailable(f"{self.name}: out of step: the bytes received are no answer; opening it again")
         self._stay_readable(self._stream.is_behind or self._stream.is_lost)
-        self._tell_garbled(now_ns())
+        self._judge(now_ns())
         return taken
 
     @property
     def reads_natively(self) -> bool:
-        """Whether C finds the frames of what is on the line, and reads the port, as far as it is known which it is."""
+        """Whether C finds the frames and reads the port, as far as the port is known."""
         return isinstance(self._stream, NativeStream) and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Tell C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Describe to C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
         stream, port = self._stream, self._port
         if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
             return False
@@ -163,10 +163,10 @@ class SerialBus(KernelBus):
             self._handed = None
         if self._port is not None:
             self._stay_readable(self._stream.is_behind)
-        self._tell_garbled(now_ns())
+        self._judge(now_ns())
 
     def nothing_received(self, number: int) -> int:
-        """What an error of the kernel in the place of bytes means.
+        """Interpret an error of the kernel in the place of bytes; return 0 if more may come.
 
         Raises:
             BusNotAvailable: the port went away.
@@ -176,10 +176,10 @@ class SerialBus(KernelBus):
         raise self._handed[1].gone(number)
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; what the port does not take at once follows when it can.
+        """Send one frame; bytes that the port does not take at once follow later.
 
         Raises:
-            BusSendError: not open, only listening, nothing that can be sent, or the port takes nothing any more.
+            BusSendError: closed, opened to listen only, no such frame, or the port takes no more bytes.
         """
         try:
             self._send(identifier, payload)
@@ -198,25 +198,25 @@ class SerialBus(KernelBus):
             self._port = None
 
     def reason(self, time_ns: int) -> BusReason:
-        """``BUS_ERRORS`` while most of what is received belongs to no frame: another baud rate, or another device."""
-        return BusReason.BUS_ERRORS if self._is_garbled and time_ns < self._told_ns + 2 * _SPAN_NS else BusReason.NONE
+        """Return ``BUS_ERRORS`` while most bytes belong to no frame: another baud rate, or another device."""
+        return BusReason.BUS_ERRORS if self._is_garbled and time_ns < self._judged_ns + 2 * _SPAN_NS else BusReason.NONE
 
     @property
     def note(self) -> str:
-        """What a person should know about the port."""
+        """Advice about the port."""
         return "" if self._port is None else self._port.note
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self.counters.framing.skipped_bytes += self._stream.pending
         self._stream = stream_of(self._framing, self.payload_size, self.counters)
-        self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
+        self._judged, self._judged_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     def _read(self, port: Port) -> None:
         chunk = more = port.read(CHUNK)
         while len(more) >= _MORE_WAITS and len(chunk) < CHUNK:
             try:
                 more = port.read(CHUNK - len(chunk))
-            except BusNotAvailable:  # which the next read says again
+            except BusNotAvailable:  # the next read raises it again
                 break
             chunk += more
         if chunk:
@@ -226,13 +226,13 @@ class SerialBus(KernelBus):
         self.tap.keep_bytes(time_ns, chunk)
         self._stream.add(chunk, time_ns)
 
-    def _tell_garbled(self, time_ns: int) -> None:
-        """Whether more was skipped than was good since it was last told, which is to be told now and then."""
-        now, before = self.counters.framing, self._told
-        if now.bytes_in == before.bytes_in or time_ns <= self._told_ns + _SPAN_NS:
+    def _judge(self, time_ns: int) -> None:
+        """Judge now and then whether more bytes were skipped than were good."""
+        now, before = self.counters.framing, self._judged
+        if now.bytes_in == before.bytes_in or time_ns <= self._judged_ns + _SPAN_NS:
             return
         self._is_garbled = now.skipped_bytes - before.skipped_bytes > now.frame_bytes - before.frame_bytes
-        self._told, self._told_ns = replace(now), time_ns
+        self._judged, self._judged_ns = replace(now), time_ns
 
     def _send(self, identifier: int, payload: bytes) -> None:
         port = self.may_send_by(self._port)
@@ -255,7 +255,7 @@ class SerialBus(KernelBus):
                 raise BusSendError(str(error)) from None
 
     def _send_on(self) -> None:
-        """Write what waits, as far as the port takes it, and be woken when it takes more."""
+        """Write the bytes that wait, as far as the port takes them, and wake up when it takes more."""
         port, epoll = self._port, self._epoll
         if port is None or epoll is None:
             return
@@ -281,7 +281,7 @@ class SerialBus(KernelBus):
 class PtyBus(SerialBus):
     """A serial port that others can open: the device's end, for emulators. Its name is ``pty`` or ``pty:LINK``.
 
-    ``note`` tells the path. What is sent while nobody reads fills the kernel's buffer and is then refused.
+    ``note`` has the path. Bytes that no program reads fill the kernel's buffer; further ones are refused.
     """
 
     def _open_port(self) -> Port:
@@ -289,7 +289,7 @@ class PtyBus(SerialBus):
 
 
 def _split_options(channel: str, options: dict[str, str]) -> tuple[dict[str, str], str]:
-    """Our options, and those that belong to a URL of pyserial's, as its query."""
+    """Return the options of the bus, and the others as the query of a URL of pyserial's."""
     if "://" not in channel:
         return dict(options), ""
     own = set(SerialOptions.__struct_fields__)

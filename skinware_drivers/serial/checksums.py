@@ -10,7 +10,7 @@ import binascii
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -24,22 +24,24 @@ class Checksum(ABC):
     """A checksum that frames carry.
 
     Attributes:
+        width: in bits.
         order: byte order in which it is sent.
     """
 
+    width: int
     order: Order = "little"
 
     @property
-    @abstractmethod
     def size(self) -> int:
-        """Bytes it takes in a frame."""
+        """Bytes that it takes in a frame."""
+        return -(-self.width // 8)
 
     @abstractmethod
     def of(self, data: bytes) -> int:
-        """Of one piece of data."""
+        """Return the checksum of data."""
 
     def to_bytes(self, data: bytes) -> bytes:
-        """As it is sent for some data."""
+        """Return the checksum of data as it is sent."""
         return self.of(data).to_bytes(self.size, self.order)
 
 
@@ -48,18 +50,14 @@ class Xor(Checksum):
     """Exclusive or of all bytes, one byte.
 
     Attributes:
-        init: what it begins with.
+        init: initial value.
     """
 
+    width: int = field(default=8, init=False)
     init: int = 0
 
-    @property
-    def size(self) -> int:
-        """One byte."""
-        return 1
-
     def of(self, data: bytes) -> int:
-        """Of one piece of data."""
+        """Return the checksum of data."""
         value = self.init
         for byte in data:
             value ^= byte
@@ -72,7 +70,7 @@ class Sum(Checksum):
 
     Attributes:
         width: in bits: 8, 16 or 32.
-        init: what it begins with.
+        init: initial value.
         negative: the sum is sent with its sign changed (two's complement), so that a whole frame adds up to 0.
     """
 
@@ -80,13 +78,8 @@ class Sum(Checksum):
     init: int = 0
     negative: bool = False
 
-    @property
-    def size(self) -> int:
-        """Bytes it takes in a frame."""
-        return self.width // 8
-
     def of(self, data: bytes) -> int:
-        """Of one piece of data."""
+        """Return the checksum of data."""
         value = self.init + sum(data)
         return (-value if self.negative else value) & ((1 << self.width) - 1)
 
@@ -102,109 +95,69 @@ class Crc(Checksum):
         reflected_in: the lowest bit of each byte comes first.
         reflected_out: the result's bits are reversed.
         xor_out: final exclusive or.
+        plain_table: with ``reflected_in``, the table of the polynomial that is not reflected (Weiss Robotics).
 
     Raises:
         ConfigurationError: another width.
     """
 
-    width: int
     polynomial: int
     init: int = 0
     reflected_in: bool = False
     reflected_out: bool = False
     xor_out: int = 0
+    plain_table: bool = False
 
     def __post_init__(self) -> None:
         if not 8 <= self.width <= 32:
             raise ConfigurationError(f"a CRC of {self.width} bits: 8 to 32 can be had")
 
-    @property
-    def size(self) -> int:
-        """Bytes it takes in a frame."""
-        return -(-self.width // 8)
-
     def of(self, data: bytes) -> int:
-        """Of one piece of data."""
+        """Return the checksum of data."""
         if self.native is not None:
             return self.native(data)
-        return self._finish(self._after(data, self.first_state))
-
-    @cached_property
-    def native(self) -> Callable[[bytes | memoryview], int] | None:
-        """What the standard library has for these parameters, if it has something."""
-        if self == CRC32.with_order(self.order):
-            return zlib.crc32
-        if type(self) is Crc and self.width == 16 and self.polynomial == 0x1021 and not self._reflects:
-            init, xor_out = self.init, self.xor_out
-            return lambda data: binascii.crc_hqx(data, init) ^ xor_out
-        return None
-
-    def with_order(self, order: Order) -> Crc:
-        """The same, sent in another byte order."""
-        own = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return type(self)(**{**own, "order": order})
-
-    # The register as the update uses it: with reflected input it is reversed.
-
-    @property
-    def _reflects(self) -> bool:
-        return self.reflected_in or self.reflected_out
-
-    @property
-    def first_state(self) -> int:
-        """Before the first byte."""
-        return _reversed(self.init, self.width) if self.reflected_in else self.init
-
-    @cached_property
-    def table(self) -> list[int]:
-        """What each value of a byte does to it."""
-        return _reflected_table(self) if self.reflected_in else _normal_table(self)
-
-    def _after(self, data: bytes, state: int) -> int:
-        table = self.table
+        state, table = self.first_state, self.table
         if self.reflected_in:
             for byte in data:
                 state = table[(state ^ byte) & 0xFF] ^ state >> 8
-            return state
-        shift, mask = self.width - 8, (1 << self.width) - 1
-        for byte in data:
-            state = (state << 8 & mask) ^ table[(state >> shift ^ byte) & 0xFF]
-        return state
-
-    def _finish(self, state: int) -> int:
+        else:
+            shift, mask = self.width - 8, (1 << self.width) - 1
+            for byte in data:
+                state = (state << 8 & mask) ^ table[(state >> shift ^ byte) & 0xFF]
         if self.reflected_in != self.reflected_out:
             state = _reversed(state, self.width)
         return state ^ self.xor_out
 
+    @cached_property
+    def native(self) -> Callable[[bytes | memoryview], int] | None:
+        """The function of the standard library for these parameters, if there is one."""
+        if self == replace(CRC32, order=self.order):
+            return zlib.crc32
+        if self.width == 16 and self.polynomial == 0x1021 and not (self.reflected_in or self.reflected_out):
+            init, xor_out = self.init, self.xor_out
+            return lambda data: binascii.crc_hqx(data, init) ^ xor_out
+        return None
 
-class _WeissCrc(Crc):
-    """Updated as if reflected, with the table of the polynomial that is not."""
+    @property
+    def first_state(self) -> int:
+        """The register before the first byte; with reflected input it is reversed."""
+        return _reversed(self.init, self.width) if self.reflected_in else self.init
 
     @cached_property
     def table(self) -> list[int]:
-        return _normal_table(self)
-
-
-def _normal_table(crc: Crc) -> list[int]:
-    top, mask = 1 << crc.width - 1, (1 << crc.width) - 1
-    table = []
-    for byte in range(256):
-        state = byte << crc.width - 8
-        for _ in range(8):
-            state = (state << 1 ^ (crc.polynomial if state & top else 0)) & mask
-        table.append(state)
-    return table
-
-
-def _reflected_table(crc: Crc) -> list[int]:
-    polynomial = _reversed(crc.polynomial, crc.width)
-    table = []
-    for byte in range(256):
-        state = byte
-        for _ in range(8):
-            state = state >> 1 ^ (polynomial if state & 1 else 0)
-        table.append(state)
-    return table
+        """The change of the register by each value of a byte."""
+        reflected, top, mask = self.reflected_in and not self.plain_table, 1 << self.width - 1, (1 << self.width) - 1
+        polynomial = _reversed(self.polynomial, self.width) if reflected else self.polynomial
+        table = []
+        for byte in range(256):
+            state = byte if reflected else byte << self.width - 8
+            for _ in range(8):
+                if reflected:
+                    state = state >> 1 ^ (polynomial if state & 1 else 0)
+                else:
+                    state = (state << 1 ^ (polynomial if state & top else 0)) & mask
+            table.append(state)
+        return table
 
 
 def _reversed(value: int, width: int) -> int:
@@ -233,5 +186,5 @@ CRC32C = Crc(
     width=32, polynomial=0x1EDC6F41, init=0xFFFFFFFF, reflected_in=True, reflected_out=True, xor_out=0xFFFFFFFF
 )
 """CRC-32/ISCSI, Castagnoli's."""
-CRC16_WEISS = _WeissCrc(width=16, polynomial=0x1021, init=0xFFFF, reflected_in=True, reflected_out=True)
-"""Of Weiss Robotics' WTS and Schunk's DSACON32: in no catalogue. ``b"123456789"`` gives 0x6EB4."""
+CRC16_WEISS = Crc(width=16, polynomial=0x1021, init=0xFFFF, reflected_in=True, reflected_out=True, plain_table=True)
+"""CRC of Weiss Robotics' WTS and Schunk's DSACON32, which is in no catalogue. ``b"123456789"`` gives 0x6EB4."""

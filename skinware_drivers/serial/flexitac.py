@@ -1,14 +1,15 @@
-"""FlexiTac and 3D-ViTac: a matrix of resistive cells, read by an Arduino that sends it without being asked.
+"""FlexiTac and 3D-ViTac: a matrix of resistive cells, read by an Arduino that sends by itself.
 
 Wire format, 2,000,000 baud: the makers' firmware, ``32_16_fast.ino`` of FlexiTac/FlexiTac_Hardware_Repo and
 ``template.ino`` of WT-MM/PyFlexiTac: ``AA 55`` and a byte for each cell, row by row, without a pause between frames.
-There is no checksum, no counter, no size and no command; AA 55 also occurs among the cells. So a frame counts only if
-the next one begins right behind it. The older firmware (``MatrixArray.ino`` of binghao-huang/3D-ViTac_Tactile_Hardware)
-sends text: a line for each row, ``12 0 255`` and a space, and an empty line behind each matrix; they end with 0D 0A.
+A frame has no checksum, counter or size, and AA 55 also occurs among the cells: a frame counts only if the next one
+begins right behind it. The board takes no command. The older firmware (``MatrixArray.ino`` of
+binghao-huang/3D-ViTac_Tactile_Hardware) sends text: a line for each row, ``12 0 255`` and a space, and an empty line
+behind each matrix; lines end with 0D 0A.
 
-How many cells there are is heard: from one marker to the next. How they lie is known of the sizes that are published.
-Cells of a sound pad rest at 10 to 40 counts (PyFlexiTac), and all are 0 where wires are broken (an issue of the
-maker's): so 0 is marked as doubtful, unless an option says otherwise.
+The distance from one marker to the next gives the number of cells, and the published sizes give rows and columns.
+Cells of a sound pad rest at 10 to 40 counts (PyFlexiTac), and cells with broken wires read 0 (an issue of the maker's):
+0 is marked as doubtful, unless an option says otherwise.
 """
 
 from __future__ import annotations
@@ -36,9 +37,8 @@ from skinware_drivers.options import check_options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.framings import Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.serial.text_matrix import TextMatrix
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -48,7 +48,7 @@ _SIZES = {256: (16, 16), 384: (12, 32), 512: (16, 32), 1024: (32, 32)}
 _MOST_LINES, _FEWEST_CELLS, _MOST_CELLS = 64, 16, max(_SIZES)
 _LISTEN_S = 3.0
 """An Arduino that was reset because its port was opened is silent for two seconds."""
-_PERIOD_MS = {"binary": 10, "text": 31}  # as heard of 16 x 32 cells, and of 16 x 16 in text
+_PERIOD_MS = {"binary": 10, "text": 31}  # as reported for 16 x 32 cells, and for 16 x 16 in text
 _FRAME = "pad_nominal"
 
 
@@ -60,12 +60,12 @@ class FlexiTacOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     size: Annotated[
-        str, Meta(pattern=r"^(\d{1,2}x\d{1,2})?$", description="ROWSxCOLUMNS, as 12x32; default: as is heard")
+        str, Meta(pattern=r"^(\d{1,2}x\d{1,2})?$", description="ROWSxCOLUMNS, as 12x32; default: by listening")
     ] = ""
     firmware: Annotated[Literal["binary", "text"], Meta(description="text: of the older 3D-ViTac boards")] = "binary"
-    zero: Annotated[Literal["suspect", "good"], Meta(description="what a cell is that reads 0")] = "suspect"
+    zero: Annotated[Literal["suspect", "good"], Meta(description="status of a cell that reads 0")] = "suspect"
     period_ms: Annotated[
-        int, Meta(ge=0, description="nominal time between two frames, ms; 0: 10, or 31 of text firmware")
+        int, Meta(ge=0, description="nominal time between two frames, ms; 0: 10, or 31 for text firmware")
     ] = 0
     pitch_mm: Annotated[float, Meta(gt=0, description="distance of neighbouring cells, for views")] = 2.0
 
@@ -76,17 +76,12 @@ class FlexiTacOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Rows and columns; empty: as is heard."""
+        """Rows and columns; empty: by listening."""
         return tuple(int(n) for n in self.size.split("x")) if self.size else ()
 
 
 class HeardSize(NamedTuple):
-    """How large a matrix is.
-
-    Attributes:
-        cells: how many.
-        shape: rows and columns, where they are known.
-    """
+    """The size of a matrix: its number of cells, and its rows and columns if they are known."""
 
     cells: int
     shape: tuple[int, int] | None
@@ -113,14 +108,14 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
     @property
     def payload_size(self) -> int:
-        """Of the largest matrix: which one it is, is known only when it was heard."""
+        """Bytes of the largest matrix; the size is known only after listening."""
         return -(-self._hearing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Hear how many cells there are.
+        """Listen for the number of cells.
 
         Raises:
-            BusError: nothing is heard, or no size that is known, or another one than the options say.
+            BusError: no matrix is heard, its size is unknown, or another than the option's.
         """
         self._heard = None
         self._heard = heard = await self.hear_size(link)
@@ -139,21 +134,21 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Only listens: a matrix of a size that is known."""
+        """Listen for a matrix of a known size."""
         heard = await cls(FlexiTacOptions()).hear_size(link)
         return None if heard.shape is None else f"FlexiTac with {_in_words([heard.shape])} cells"
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether another board was plugged in. None of them hears anything: there is nothing to be set up again."""
+        """Check whether another board was plugged in; boards take no command, so none can be set up again."""
         if await self.hear_size(link) != self._heard:
             self.tell(patch, Notice.CHANGED)
         return False
 
     async def hear_size(self, link: Link) -> HeardSize:
-        """Listen for a matrix.
+        """Listen for a matrix and return its size.
 
         Raises:
-            HandshakeTimeout: none was heard.
+            HandshakeTimeout: no matrix is heard.
         """
         self.change_framing(self._hearing)
         try:
@@ -188,7 +183,7 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return known
 
     def _read_on(self) -> None:
-        """Find frames of the size that was heard: the binary ones also in C."""
+        """Change to the framing of the size that was heard; C finds the binary frames."""
         if self._heard is None:
             return
         if self.options.firmware == "text":

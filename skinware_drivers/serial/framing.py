@@ -1,14 +1,14 @@
-"""From a stream of bytes to frames: what every framing has in common. No input or output here.
+"""From a stream of bytes to frames: the common part of all framings. No input or output here.
 
-A :class:`Framing` is a declaration: how frames lie in a stream, and which part of them is the body. Its
-:class:`Framer` is fed whatever arrives, in pieces of any size, and gives back the frames that are complete.
+A :class:`Framing` declares how frames lie in a stream, and which part of them is the body. Its :class:`Framer` is fed
+the bytes that arrive, in pieces of any size, and returns the frames that are complete.
 
-* How the stream is cut into pieces never changes what is found, nor the counters.
-* Wire input never raises. Every byte is accounted for:
+* The cuts between pieces change neither the frames that are found nor the counters.
+* Wire input never raises. Every byte is counted:
   ``bytes_in == frame_bytes + idle_bytes + skipped_bytes + framer.pending``.
-* What is held back is bounded by the longest frame of the declaration.
+* The bytes held back are bounded by the longest frame of the declaration.
 
-Frames are looked for one by one, in plain Python over ``bytes`` methods: docs/decisions/0009 says why.
+Frames are found one by one, in plain Python over ``bytes`` methods: docs/decisions/0009 says why.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Field:
         offset: first byte.
         size: 1, 2 or 4 bytes.
         order: byte order.
-        mask: bits of it that count.
+        mask: the bits that count.
 
     Raises:
         ConfigurationError: another size or order.
@@ -57,13 +57,13 @@ class Field:
         return self.offset + self.size
 
     def of(self, frame: bytes, start: int = 0) -> int:
-        """Its value in the frame that begins at ``start``."""
+        """Return the value in the frame that begins at ``start``."""
         if self.size == 1:
             return frame[start + self.offset] & self.mask
         return int.from_bytes(frame[start + self.offset : start + self.end], self.order) & self.mask
 
     def put(self, frame: bytearray, value: int) -> None:
-        """Write its value into the frame; the bits outside the mask stay.
+        """Write a value into the frame; the bits outside the mask stay.
 
         Raises:
             ValueError: the value does not fit.
@@ -76,7 +76,7 @@ class Field:
 
 
 class Framed(NamedTuple):
-    """A frame that was found.
+    """A frame found in a stream.
 
     Attributes:
         identifier: number that distinguishes kinds of frames; 0 if the framing has none.
@@ -99,11 +99,11 @@ def fill_rows(wire: npt.NDArray[np.void], frames: Sequence[Framed]) -> None:
 
 
 class Encoding(ABC):
-    """How commands are sent."""
+    """The way in which commands are sent."""
 
     @abstractmethod
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent.
+        """Return a frame as it is sent.
 
         Raises:
             ValueError: there is no such frame; the message says why.
@@ -111,7 +111,7 @@ class Encoding(ABC):
 
 
 class Framing(Encoding):
-    """How frames are arranged in a stream of bytes.
+    """The arrangement of frames in a stream of bytes.
 
     Attributes:
         maximum_body: bytes of the longest body.
@@ -121,21 +121,21 @@ class Framing(Encoding):
 
     @abstractmethod
     def framer(self) -> Framer:
-        """Something to feed a stream to, from its very beginning."""
+        """Return a framer for a stream, from its beginning."""
 
 
 class Framer(ABC):
     """Finds the frames of one stream.
 
     Attributes:
-        counters: what it has seen; several that follow each other on one line can be given the same.
+        counters: counts of bytes and frames; framers that follow each other on one line can share them.
     """
 
     def __init__(self) -> None:
         self.counters: FramerCounters = FramerCounters()
         self._rest = b""
         self._before = 0  # bytes of the stream before the rest
-        self._wanted = 0  # the rest cannot be decided before it has so many bytes
+        self._wanted = 0  # bytes without which the rest cannot be judged
 
     @property
     def position(self) -> int:
@@ -149,14 +149,14 @@ class Framer(ABC):
 
     @property
     def is_lost(self) -> bool:
-        """Whether nothing more is found, whatever comes, so that the bus must be opened again; most find on."""
+        """Whether no more frames can be found, so that the bus must be opened again; False for most framings."""
         return False
 
-    def asked(self) -> None:  # noqa: B027  (most frames are found whatever the host has said)
-        """The host is about to ask something: what is held back belongs to no answer to that."""
+    def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
+        """Note that the host sends a question: bytes held back are no part of the answer."""
 
     def feed(self, chunk: bytes) -> list[Framed]:
-        """Take the next bytes of the stream; gives the frames that they complete, in the order of the stream."""
+        """Take the next bytes of the stream and return the frames that they complete, in order."""
         self.counters.bytes_in += len(chunk)
         stream = self._rest + chunk if self._rest else chunk
         if len(stream) < self._wanted:
@@ -171,25 +171,24 @@ class Framer(ABC):
 
     @abstractmethod
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        """The frames of a stream, and how many of its bytes are done with (and counted)."""
+        """Return the frames of a stream, and the number of bytes that are judged (and counted)."""
 
 
 @dataclass(frozen=True)
 class Unframed(Framing):
-    """Bytes as they come, for consoles and emulators; and for commands that are sent as they are.
+    """Bytes as they come, for consoles and emulators, and for commands that are sent as they are.
 
-    What was received at once is one frame, or several if it is longer than ``maximum_body``: here, and only here,
-    frames depend on how the stream was cut into pieces.
+    Bytes received together are one frame, or several if they are more than ``maximum_body``: here, and only here,
+    frames depend on how the stream is cut into pieces.
     """
 
     maximum_body: int = 64
 
     def framer(self) -> Framer:
-        """Pieces as they come."""
         return _Pieces(self.maximum_body)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:  # noqa: ARG002
-        """The payload itself."""
+        """Return the payload."""
         return payload
 
 
@@ -207,10 +206,10 @@ class _Pieces(Framer):
 
 
 def check_body(identifier: int, payload: bytes, field: Field | None, minimum: int, maximum: int) -> None:
-    """Refuse what cannot be sent.
+    """Refuse a frame that cannot be sent.
 
     Raises:
-        ValueError: the payload is too short or too long, or the identifier is not what frames can carry.
+        ValueError: the payload is too short or too long, or frames cannot carry the identifier.
     """
     if not minimum <= len(payload) <= maximum:
         raise ValueError(f"a payload of {len(payload)} bytes; frames of this device have {minimum} to {maximum}")

@@ -1,160 +1,25 @@
-"""Find frames that end with a delimiter, begin with their length, or recur after a marker."""
+"""Find frames that begin with their length, that recur after a marker, or that are matrices of text."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from itertools import accumulate, pairwise
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.checksums import Checksum
 from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
-from skinware_drivers.serial.stuffing import Stuffing
-
-
-@dataclass(frozen=True)
-class Delimited(Framing):
-    """Frames that end with a delimiter: header, body and checksum, stuffed.
-
-    The rest of a damaged frame ends at the next delimiter, and the frame after it is found.
-
-    Attributes:
-        stuffing: ``LINES``, ``COBS``, ``SLIP`` or ``HDLC``.
-        maximum_body: bytes of the longest body. Bodies that are longer are skipped.
-        minimum_body: bytes of the shortest. 0: empty lines are frames.
-        checksum: of header and body, at the end.
-        identifier: number in the header that tells kinds of frame apart.
-        header: bytes before the body; default: up to the end of ``identifier``.
-        trusts_first: what arrives before the first delimiter is a frame if it looks like one. Default: only with a
-            checksum; without one it may as well be the end of a frame.
-
-    Raises:
-        ConfigurationError: the identifier is not in the header, or the lengths are impossible.
-    """
-
-    stuffing: Stuffing
-    maximum_body: int
-    minimum_body: int = 1
-    checksum: Checksum | None = None
-    identifier: Field | None = None
-    header: int | None = None
-    trusts_first: bool | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.minimum_body <= self.maximum_body:
-            raise ConfigurationError(f"bodies of {self.minimum_body} to {self.maximum_body} bytes cannot be")
-        if self.identifier is not None and self.identifier.end > self.body_start:
-            raise ConfigurationError(f"the identifier is not within the header of {self.body_start} bytes")
-
-    @property
-    def body_start(self) -> int:
-        """Bytes before the body."""
-        if self.header is not None:
-            return self.header
-        return self.identifier.end if self.identifier is not None else 0
-
-    @property
-    def overhead(self) -> int:
-        """Bytes of header and checksum."""
-        return self.body_start + (self.checksum.size if self.checksum is not None else 0)
-
-    @property
-    def is_first_trusted(self) -> bool:
-        """Whether what arrives before the first delimiter may be a frame."""
-        return self.checksum is not None if self.trusts_first is None else self.trusts_first
-
-    def framer(self) -> Framer:
-        """Something to feed a stream to."""
-        return DelimitedFramer(self)
-
-    def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent; the header is zero except for the identifier.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
-        check_body(identifier, payload, self.identifier, self.minimum_body, self.maximum_body)
-        header = bytearray(self.body_start)
-        if self.identifier is not None:
-            self.identifier.put(header, identifier)
-        content = bytes(header) + payload
-        if self.checksum is not None:
-            content += self.checksum.to_bytes(content)
-        return self.stuffing.encode(content)
-
-
-class DelimitedFramer(Framer):
-    """Finds the frames of a stream with delimiters."""
-
-    def __init__(self, framing: Delimited) -> None:
-        super().__init__()
-        self._framing = framing
-        self._shortest = framing.minimum_body + framing.overhead
-        self._longest = framing.maximum_body + framing.overhead
-        self._longest_segment = framing.stuffing.longest(self._longest)
-        self._delimiter = bytes([framing.stuffing.delimiter])
-        self._decode = framing.stuffing.decode
-        self._checksum_size = framing.checksum.size if framing.checksum is not None else 0
-        self._discarding = not framing.is_first_trusted  # everything up to the next delimiter
-
-    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        *segments, rest = stream.split(self._delimiter)
-        ends = list(accumulate([len(segment) + 1 for segment in segments], initial=self._before))
-        if self._discarding and segments:
-            self._discarding = False
-            self.counters.skipped_bytes += len(segments[0]) + 1
-            del segments[0], ends[0]
-        first, field = self._framing.body_start, self._framing.identifier
-        found: list[Framed] = []
-        for segment, (begin, end) in zip(segments, pairwise(ends), strict=True):
-            content = self._content(segment)
-            if content is not None:
-                self.counters.frame_bytes += end - begin
-                found.append(Framed(0 if field is None else field.of(content), content[first:], end))
-        return found, len(stream) - self._keep(len(rest))
-
-    def _content(self, segment: bytes) -> bytes | None:
-        """Header and body of a segment; None, and counted, if it is no frame."""
-        content = self._decode(segment) if len(segment) <= self._longest_segment else None
-        if content is not None and self._shortest <= len(content) <= self._longest:
-            checksum = self._framing.checksum
-            if checksum is None:
-                return content
-            size = self._checksum_size
-            covered = content[:-size]
-            if checksum.of(covered) == int.from_bytes(content[-size:], checksum.order):
-                return covered
-            self.counters.checksum_errors += 1
-        elif content == b"":
-            self.counters.idle_bytes += len(segment) + 1
-            return None
-        else:
-            self.counters.refused += 1
-        self.counters.skipped_bytes += len(segment) + 1
-        return None
-
-    def _keep(self, rest: int) -> int:
-        """How many of the bytes behind the last delimiter are kept; none of a frame that is too long already."""
-        if not self._discarding and rest > self._longest_segment:
-            self._discarding = True
-            self.counters.refused += 1
-        if self._discarding:
-            self.counters.skipped_bytes += rest
-            return 0
-        return rest
-
 
 _MOST_IN_VAIN = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class LengthFirst(Framing):
-    """Frames of a length field, a command, and a body.
+    """Frames of a length field, a command, and a body, from a device that only answers.
 
     Attributes:
         length: bytes of the whole frame.
         identifier: command.
-        answers: command and bytes of the whole frame of every answer that there can be.
+        answers: command and bytes of the whole frame of every possible answer.
 
     Raises:
         ConfigurationError: an answer is shorter than its header.
@@ -178,11 +43,10 @@ class LengthFirst(Framing):
         return max(self.length.end, self.identifier.end)
 
     def framer(self) -> Framer:
-        """Something to feed a stream to."""
         return _Steps(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A question, which need not be as long as an answer.
+        """Return a question, which need not be as long as an answer.
 
         Raises:
             ValueError: there is no such frame.
@@ -195,7 +59,7 @@ class LengthFirst(Framing):
 
 
 class _Steps(Framer):
-    """Goes from length to length."""
+    """Steps from length to length; out of step, it skips everything until the next question."""
 
     def __init__(self, framing: LengthFirst) -> None:
         super().__init__()
@@ -208,7 +72,7 @@ class _Steps(Framer):
         return self._vain >= _MOST_IN_VAIN
 
     def asked(self) -> None:
-        """Half an answer to an earlier question is never completed by one to this."""
+        """Drop half an answer to an earlier question: no answer to this one completes it."""
         if self._rest:
             self._stumble(len(self._rest))
             self._before += len(self._rest)
@@ -244,21 +108,21 @@ class _Steps(Framer):
 
 
 _TIMES = 3
-"""Another marker has to follow so often at the same distance: bytes of a body can look like a marker, too."""
+"""Further markers that must follow at the same distance: bytes of a body can look like a marker, too."""
 
 
 @dataclass(frozen=True)
 class Recurring(Framing):
-    """Frames of one length, which is not known: it is the distance at which the marker comes again and again.
+    """Frames of one unknown length: the distance at which the marker recurs.
 
-    For devices that are asked nothing and tell nothing: a driver hears with this framing how long frames are, and goes
-    over to a :class:`~skinware_drivers.serial.packets.Packet` of that length (``SerialAdapter.change_framing``).
+    A driver listens with this framing until it knows the length of the frames, and then changes to a
+    :class:`~skinware_drivers.serial.packets.Packet` of that length (``SerialAdapter.change_framing``).
 
     Attributes:
         marker: first bytes of every frame.
-        maximum_body: bytes of the longest body that can be.
+        maximum_body: bytes of the longest possible body.
         minimum_body: bytes of the shortest.
-        identifier: of all frames that are found, so that no layout takes them for those of a known length.
+        identifier: of all frames that are found, so that no layout takes them for frames of the known length.
     """
 
     marker: bytes
@@ -267,11 +131,10 @@ class Recurring(Framing):
     identifier: int = 1
 
     def framer(self) -> Framer:
-        """Something to feed a stream to."""
         return _RecurringFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent.
+        """Return a frame as it is sent.
 
         Raises:
             ValueError: there is no such frame.
@@ -308,7 +171,7 @@ class _RecurringFramer(Framer):
         return found, len(stream) - kept
 
     def _distance(self, stream: bytes, place: int) -> int | None:
-        """From this marker to the next one of a row at equal distances; 0: there is no such row, None: nobody knows."""
+        """Return the distance of this marker from the next of a row; 0: no such row, None: more bytes must come."""
         marker, other = self._framing.marker, place + self._least - 1
         while True:
             other = stream.find(marker, other + 1)
@@ -323,3 +186,103 @@ class _RecurringFramer(Framer):
                     break
             else:
                 return distance
+
+
+_ROW = re.compile(rb"[0-9]{1,3}(?: +[0-9]{1,3})* *\r?")
+_EMPTY = (b"", b"\r")
+_LONGEST_NUMBER = 4  # with the space behind it
+_LONGEST_END = 2
+
+
+@dataclass(frozen=True)
+class TextMatrix(Framing):
+    """A line for each row, with decimal numbers from 0 to 255, and an empty line behind the last row.
+
+    The body of a frame has two bytes for the numbers of rows and columns, and then the numbers, row by row. Matrices
+    whose rows differ in length are skipped; so are bytes before the first empty line, which may be the end of a matrix.
+
+    Attributes:
+        rows: most rows, up to 255.
+        columns: most columns, up to 255.
+        identifier: of all frames that are found.
+    """
+
+    rows: int
+    columns: int
+    identifier: int = 0
+    maximum_body: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "maximum_body", 2 + self.rows * self.columns)
+
+    def framer(self) -> Framer:
+        return _TextMatrixFramer(self)
+
+    def encode(self, identifier: int, payload: bytes) -> bytes:
+        """Return the lines of a matrix.
+
+        Raises:
+            ValueError: there is no such frame.
+        """
+        check_body(identifier - self.identifier, payload, None, 3, self.maximum_body)
+        rows, columns, *numbers = payload
+        if len(numbers) != rows * columns or not self.is_possible(rows, columns):
+            raise ValueError(f"a payload that says {rows} x {columns} and has {len(numbers)} numbers")
+        lines = (numbers[row * columns :][:columns] for row in range(rows))
+        return b"".join(b" ".join(b"%d" % number for number in line) + b"\n" for line in lines) + b"\n"
+
+    def is_possible(self, rows: int, columns: int) -> bool:
+        """Return whether a matrix can have this size."""
+        return 0 < rows <= self.rows and 0 < columns <= self.columns
+
+
+class _TextMatrixFramer(Framer):
+    def __init__(self, framing: TextMatrix) -> None:
+        super().__init__()
+        self._framing = framing
+        self._longest = framing.rows * (framing.columns * _LONGEST_NUMBER + _LONGEST_END)
+        self._discarding = True  # everything up to the next empty line
+
+    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
+        found: list[Framed] = []
+        begin = line = 0
+        while (end := stream.find(b"\n", line)) >= 0:
+            if stream[line:end] in _EMPTY:
+                self._take(stream[begin:line], end + 1 - begin, self._before + end + 1, found)
+                begin = end + 1
+            line = end + 1
+        if not self._discarding and len(stream) - begin > self._longest + _LONGEST_END:
+            self._discarding = True
+            self.counters.refused += 1
+        if self._discarding:
+            kept = max(line, len(stream) - 2)  # distinguishes an empty line from the end of another
+            self.counters.skipped_bytes += kept - begin
+            begin = kept
+        return found, begin
+
+    def _take(self, text: bytes, size: int, end: int, found: list[Framed]) -> None:
+        """Judge the text before an empty line; ``size`` counts that line."""
+        if self._discarding:
+            self._discarding = False
+        elif not text:
+            self.counters.idle_bytes += size
+            return
+        elif (body := self._body(text)) is not None:
+            self.counters.frame_bytes += size
+            found.append(Framed(self._framing.identifier, body, end))
+            return
+        else:
+            self.counters.refused += 1
+        self.counters.skipped_bytes += size
+
+    def _body(self, text: bytes) -> bytes | None:
+        lines = text.split(b"\n")[:-1] if len(text) <= self._longest else []
+        if not all(_ROW.fullmatch(line) for line in lines):
+            return None
+        numbers = [[int(number) for number in line.split()] for line in lines]
+        columns = {len(row) for row in numbers}
+        if len(columns) != 1 or not self._framing.is_possible(len(numbers), *columns):
+            return None
+        if max(map(max, numbers)) > 0xFF:
+            return None
+        return bytes((len(numbers), *columns, *(number for row in numbers for number in row)))

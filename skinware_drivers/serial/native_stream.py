@@ -1,4 +1,4 @@
-"""A stream whose frames are found in C (``framing.c``): what a framing compiles to, and the state between two takes."""
+"""A stream whose frames are found in C (``framing.c``): the compiled framing, and the state between two takes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch
 from skinware_drivers.serial.checksums import Checksum, Crc, Sum, Xor
+from skinware_drivers.serial.delimited import Cobs, Delimited, Escaped, Lines
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.packets import Length, LengthTable, Packet, Pattern, values_of
 from skinware_drivers.serial.stream import CHUNK, PythonStream, Stream
-from skinware_drivers.serial.stuffing import Cobs, Escaped, Lines
 
 _XOR, _SUM, _CRC_FROM_HIGH, _CRC_FROM_LOW = range(4)
 _PACKETS, _LINES, _COBS, _ESCAPED = range(4)
@@ -25,15 +24,15 @@ _COUNTED = {name: name for name in ("bytes_in", "frame_bytes", "idle_bytes", "sk
     "frames": "found",
     "refused": "bad_form",
 }
-"""Counters of a framer, and what C calls them."""
+"""Counters of a framer, and their names in C."""
 
 
 def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Stream:
-    """A stream in C where C can find these frames, else in Python.
+    """Return a stream in C if C can find these frames, else in Python.
 
     Args:
-        framing: what is on the line.
-        payload_size: of bodies, at most; frames with longer ones are counted as refused.
+        framing: of the line.
+        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
         counters: of the bus.
     """
     made = NativeStream if can_compile(framing) else PythonStream
@@ -41,17 +40,14 @@ def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Str
 
 
 def can_compile(framing: Framing) -> bool:
-    """Whether C can find these frames: not those of a class that is none of ours, nor of a strange declaration."""
+    """Return whether C can find these frames: not those of other people's classes, nor of a strange declaration."""
     if type(framing) is Delimited:
         can = type(framing.stuffing) in (Lines, Cobs, Escaped) and framing.body_start >= 0
     else:
         can = type(framing) is Packet and _stays_within(framing)
     checksum, identifier = getattr(framing, "checksum", None), getattr(framing, "identifier", None)
-    return can and _is_known(checksum) and _is_plain(identifier)
-
-
-def _is_known(checksum: Checksum | None) -> bool:
-    return checksum is None or type(checksum).of in (Xor.of, Sum.of, Crc.of)
+    is_known = checksum is None or type(checksum).of in (Xor.of, Sum.of, Crc.of)
+    return can and is_known and _is_plain(identifier)
 
 
 def _is_plain(field: Field | None) -> bool:
@@ -59,7 +55,7 @@ def _is_plain(field: Field | None) -> bool:
 
 
 def _stays_within(framing: Packet) -> bool:
-    """Whether all that is looked at in a frame lies within it, whatever its length says."""
+    """Return whether every byte that is looked at lies within the frame, whatever the length field says."""
     least = least_checked = framing.shortest
     ends = [framing.body_start, len(framing.sync), len(framing.trailer)]
     if isinstance(framing.length, Length):
@@ -83,16 +79,22 @@ def _stays_within(framing: Packet) -> bool:
 
 def _compile(framing: Framing, arrays: structs.Arrays) -> structs.Framing:
     compiled = structs.Framing()
+    if not isinstance(framing, Delimited | Packet):
+        return compiled
+    compiled.body_start = framing.body_start
+    if framing.identifier is not None:
+        compiled.identifier = _field(framing.identifier)
+    if framing.checksum is not None:
+        compiled.checksum = _checksum(framing.checksum, arrays)
     if isinstance(framing, Delimited):
         _compile_delimited(framing, compiled, arrays)
-    elif isinstance(framing, Packet):
+    else:
         _compile_packet(framing, compiled, arrays)
     return compiled
 
 
 def _compile_delimited(framing: Delimited, compiled: structs.Framing, arrays: structs.Arrays) -> None:
     stuffing = framing.stuffing
-    _compile_common(framing, compiled, arrays)
     compiled.shortest = framing.minimum_body + framing.overhead
     compiled.longest = framing.maximum_body + framing.overhead
     compiled.delimiter, compiled.longest_segment = stuffing.delimiter, stuffing.longest(compiled.longest)
@@ -104,7 +106,6 @@ def _compile_delimited(framing: Delimited, compiled: structs.Framing, arrays: st
 
 
 def _compile_packet(framing: Packet, compiled: structs.Framing, arrays: structs.Arrays) -> None:
-    _compile_common(framing, compiled, arrays)
     compiled.form = _PACKETS
     compiled.shortest, compiled.longest, compiled.behind = framing.shortest, framing.longest, framing.behind
     compiled.n_sync, compiled.sync = _pattern(framing.sync, arrays)
@@ -124,20 +125,12 @@ def _compile_packet(framing: Packet, compiled: structs.Framing, arrays: structs.
     compiled.covered_from, compiled.covered_to = framing.covered(0)
 
 
-def _compile_common(framing: Delimited | Packet, compiled: structs.Framing, arrays: structs.Arrays) -> None:
-    compiled.body_start = framing.body_start
-    if framing.identifier is not None:
-        compiled.identifier = _field(framing.identifier)
-    if framing.checksum is not None:
-        compiled.checksum = _checksum(framing.checksum, arrays)
-
-
 def _field(field: Field) -> structs.WireField:
     return structs.WireField(field.offset, field.size, field.order == "big", field.mask & 0xFFFF_FFFF)
 
 
 def _pattern(pattern: Pattern, arrays: structs.Arrays) -> tuple[int, int]:
-    """How long it is, and the address of (n, 256) bool: whether a byte fits."""
+    """Return the length of a pattern, and the address of (n, 256) bool: whether a byte fits."""
     table = np.zeros((max(1, len(pattern)), _BYTE_VALUES), bool)
     for row, what in zip(table, pattern, strict=False):
         row[values_of(what)] = True
@@ -164,8 +157,8 @@ class NativeStream(Stream):
     """A stream whose frames C finds, also while the event loop rests.
 
     Args:
-        framing: what is on the line; one that C can find.
-        payload_size: of bodies, at most; frames with longer ones are counted as refused.
+        framing: of the line; ``can_compile`` must be true for it.
+        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
         counters: of the bus.
     """
 
@@ -209,7 +202,6 @@ class NativeStream(Stream):
         self._add(ctypes.byref(self._stream), chunk, size, time)
 
     def fill(self, batch: FrameBatch, ordinal: int) -> int:
-        """Find frames, until the batch is full."""
         if batch is not self._batch:
             self._batch, self._rows = batch, compile_batch(batch, structs.Arrays())
         rows = self._rows
@@ -228,16 +220,13 @@ class NativeStream(Stream):
         return ctypes.string_at(stream.chunk, stream.chunk_bytes)
 
     def hand_over(self, fd: int, batch: FrameBatch) -> int:
-        """Have C read it, from this descriptor into this batch, until ``count`` is called.
-
-        Returns:
-            Its address.
-        """
+        """Let C read from this descriptor into this batch until ``count`` is called; return the stream's address."""
         self._fit(batch)
         self._stream.fd = fd
         return ctypes.addressof(self._stream)
 
     def count(self) -> None:
+        """Take over the counters of C."""
         counters, stream = self.counters, self._stream
         counters.frames = stream.frames
         counters.refused += stream.too_long - self._too_long  # the bus itself may refuse something, too

@@ -1,4 +1,4 @@
-"""Which port a name means, and opening it: every refusal says what to do about it."""
+"""Find the port that a name means, and open it; every refusal says what to do."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a serial bus."""
 
     baudrate: Annotated[
-        Annotated[int, Meta(ge=1)] | None, Meta(description="bits per second; default: what the driver says")
+        Annotated[int, Meta(ge=1)] | None, Meta(description="bits per second; default: the driver's")
     ] = None
     serial_number: Annotated[str, Meta(description="of the USB device, in place of a path")] = ""
     vid_pid: Annotated[str, Meta(description="vendor and product of the USB device, as 0483:5700")] = ""
@@ -41,11 +41,11 @@ class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def find_port(channel: str, options: SerialOptions) -> str:
-    """The path or URL that is meant now: a USB device may have another path than the last time.
+    """Return the present path or URL: a USB device may have another path than the last time.
 
     Raises:
         BusNotAvailable: no such device is plugged in, or several are.
-        ConfigurationError: nothing says which port, or too much does.
+        ConfigurationError: no port is named, or path and USB device are.
     """
     if not options.serial_number and not options.vid_pid:
         if not channel:
@@ -76,7 +76,7 @@ def find_port(channel: str, options: SerialOptions) -> str:
 
 
 def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
-    """Open a port for us alone.
+    """Open a port exclusively.
 
     Args:
         path: device path or pyserial's URL.
@@ -84,7 +84,7 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
         baudrate: bits per second.
 
     Raises:
-        BusNotAvailable: not there, not permitted, taken, or no serial port at all.
+        BusNotAvailable: missing, not permitted, taken, or no serial port.
         ConfigurationError: pyserial knows no such URL, or the port has no such setting.
     """
     is_url = "://" in path
@@ -100,7 +100,7 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
             rtscts=options.rtscts,
             exclusive=None if is_url else True,
             timeout=_READ_TIMEOUT_S,
-            write_timeout=None if path.startswith("rfc2217:") else _WRITE_TIMEOUT_S,  # which knows none
+            write_timeout=None if path.startswith("rfc2217:") else _WRITE_TIMEOUT_S,  # it has none
         )
     except (serial.SerialException, ValueError) as error:
         networks = "; over a network: tcp://HOST:PORT, udp://HOST:PORT or websocket:ws://HOST:PORT"
@@ -115,16 +115,11 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
     else:
         port = ThreadedPort(path, line)
     if options.low_latency and not is_url and not os.path.realpath(path).startswith("/dev/pts/"):
-        port.note = _low_latency(path, line)
+        try:
+            line.set_low_latency_mode(True)
+        except (ValueError, OSError, NotImplementedError):
+            port.note = f"{path}: no low-latency mode; an adapter may hold back bytes for some milliseconds"
     return port
-
-
-def _low_latency(path: str, line: Any) -> str:
-    try:
-        line.set_low_latency_mode(True)
-    except (ValueError, OSError, NotImplementedError):
-        return f"{path}: no low-latency mode; an adapter may hold back bytes for some milliseconds"
-    return ""
 
 
 def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | ConfigurationError:
@@ -147,7 +142,7 @@ def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | Co
 
 
 def group_that_may(info: os.stat_result) -> grp.struct_group | None:
-    """The group whose members may read and write."""
+    """Return the group whose members may read and write."""
     if info.st_mode & (stat.S_IRGRP | stat.S_IWGRP) != stat.S_IRGRP | stat.S_IWGRP or info.st_gid == 0:
         return None
     try:

@@ -1,7 +1,6 @@
-"""Driver of patches that speak the open patch protocol: they say themselves what they are.
+"""Patches that speak the open patch protocol, and describe themselves; one patch on each serial line.
 
-The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch is
-attached to each serial line.
+The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md.
 """
 
 from __future__ import annotations
@@ -23,11 +22,10 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers, Refused
+from skinware_drivers.serial.adapter import Answers, Refused, SerialAdapter
 from skinware_drivers.serial.checksums import CRC32
+from skinware_drivers.serial.delimited import COBS, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     MAJOR,
@@ -39,7 +37,6 @@ from skinware_drivers.serial.openpatch_description import (
     Report,
     read_description,
 )
-from skinware_drivers.serial.stuffing import COBS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -49,7 +46,7 @@ _REPLY = 0x40
 
 _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
-_TRIES_AFTER_RESET = 10  # opening a port resets many boards, which hear nothing while their boot loader waits
+_TRIES_AFTER_RESET = 10  # opening a port resets many boards, which are deaf while their boot loader waits
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _MOST_MATTERS = 50
 _OTHER_DESCRIPTION = 8
@@ -74,7 +71,7 @@ class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
     rate_hz: Annotated[
-        float, Meta(ge=0, le=1e6, description="cycles per second, as the patches are told; 0: what each does by itself")
+        float, Meta(ge=0, le=1e6, description="cycles per second, as set in the patches; 0: leave each patch's own")
     ] = 0.0
 
 
@@ -94,22 +91,20 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
         self._disabled: set[int] = set()
         self._number = 0
-        self._n_samples: int | None = None  # taken since its reset, when it was last silent and asked
+        self._n_samples: int | None = None  # taken since its reset, as it answered when it was last silent
         self._report: Report | None = None
-        self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
+        self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
 
     @property
     def payload_size(self) -> int:
-        """Longest payload of the protocol: what the patch will send is known only when it was asked."""
+        """Bytes of the longest payload of the protocol; those of the patch are known only after it was asked."""
         return MOST_PAYLOAD
 
-    # -- setting up -----------------------------------------------------------------------------------------------
-
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the patch what it is.
+        """Ask the patch for its description.
 
         Raises:
-            BusError: it does not answer, says what cannot be, or must not be asked.
+            BusError: it does not answer, its description is impossible, or it must not be asked.
         """
         if link.listen_only:
             raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
@@ -151,16 +146,14 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """The patch's name; whether it streams makes no difference to what is asked."""
+        """Ask for the patch's name; no question disturbs a patch that streams."""
         asking = cls(OpenPatchOptions())
         await asking._greet(link, tries=_TRIES_AFTER_RESET)
         [patch] = await asking.describe(link)
         return f"open patch: {patch.name}"
 
-    # -- looking after it -----------------------------------------------------------------------------------------
-
     async def attend(self, link: Link) -> None:
-        """Hear when it restarts, what it counts, and what it has to say to people."""
+        """Follow its announcements: restarts, reports and notes."""
         with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
             while True:
                 message = await heard.get()
@@ -175,10 +168,10 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                     self._say(link, logging.WARNING, "announcement", str(error))
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Whether the silent patch has restarted. One that says that it streams, and does not, has not.
+        """Return whether the silent patch has restarted; a patch that says that it streams has not.
 
-        Its sampling hangs if it has counted no sample since it was last asked, though not all modules are off; if it
-        has, this machine or the line is slow.
+        If it streams and has counted no sample since the last question, though some modules are on, its sampling
+        hangs. If it has counted samples, this machine or the line is slow.
         """
         greeting = await self._greet(link, tries=1)
         if greeting.crc != self._crc:
@@ -216,29 +209,27 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if payload:
             text = payload[1:].decode("utf-8", "backslashreplace")
             text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-            matter = f"note {text}" if len(self._notices) < _MOST_MATTERS else "note"
+            matter = f"note {text}" if len(self._log) < _MOST_MATTERS else "note"
             self._say(link, _SEVERITIES[min(payload[0], 2)], matter, f"says: {text}")
 
     def _changed(self, link: Link) -> None:
-        self._say(link, logging.WARNING, "changed", "is not what it was: reading its description anew")
+        self._say(link, logging.WARNING, "changed", "has changed: reading its description again")
         if self._patch is not None:
             self.tell(self._patch, Notice.CHANGED)
 
     def _say(self, link: Link, level: int, matter: str, text: str) -> None:
-        """One line in the log, at most one every ten seconds about one matter."""
-        told_ns, kept_back = self._notices.get(matter, (-_QUIET_NS, 0))
-        if now_ns() - told_ns < _QUIET_NS:
-            self._notices[matter] = told_ns, kept_back + 1
+        """Log a line, at most one every ten seconds about one matter."""
+        logged_ns, kept_back = self._log.get(matter, (-_QUIET_NS, 0))
+        if now_ns() - logged_ns < _QUIET_NS:
+            self._log[matter] = logged_ns, kept_back + 1
             return
-        self._notices[matter] = now_ns(), 0
+        self._log[matter] = now_ns(), 0
         more = f" ({kept_back} more of these since)" if kept_back else ""
         log.log(level, "%s: %s %s%s", link.bus_name, self._patch.name if self._patch else "the patch", text, more)
 
-    # -- operations -----------------------------------------------------------------------------------------------
-
     @operation()
     async def rate(self, link: Link, patches: Sequence[Patch], hz: float) -> float:  # noqa: ARG002
-        """Set the cycles per second; returns what it became."""
+        """Set the cycles per second; return the rate that the patch has now."""
         if not 0 < hz <= 1e6:
             raise ValueError(f"{hz:g} Hz: give more than 0, up to 1000000")
         await self._set_period(link, round(1e6 / hz))
@@ -252,7 +243,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         on: bool = True,
         module: int = ALL_MODULES,
     ) -> None:
-        """Switch a module, or all, on or off; those that are off are shown as masked."""
+        """Switch a module, or all, on or off; modules that are off are published as masked."""
         modules = self._modules(module)
         await self._ask(link, ENABLE, bytes((module, on)))
         self._disabled = self._disabled - modules if on else self._disabled | modules
@@ -270,7 +261,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     @operation()
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:  # noqa: ARG002
-        """What the patch counts: uptime_s, sent, dropped, bad_requests."""
+        """Return the patch's counters: uptime_s, sent, dropped, bad_requests."""
         return asdict(Report.read(await self._ask(link, STATUS)))
 
     def _modules(self, module: int) -> set[int]:
@@ -293,20 +284,18 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._wanted_us = became_us
         self.period_s = became_us / 1e6
 
-    # -- asking ---------------------------------------------------------------------------------------------------
-
     async def _greet(self, link: Link, tries: int = _TRIES) -> Greeting:
         return Greeting.read(await self._ask(link, HELLO, bytes((MAJOR, MINOR)), tries=tries))
 
     async def _ask(
         self, link: Link, request: int, arguments: bytes = b"", *, timeout_s: float = _TIMEOUT_S, tries: int = _TRIES
     ) -> bytes:
-        """The answer to a request, which may be sent several times: all of them can be repeated.
+        """Send a request, again if necessary (every request can be repeated), and return the answer.
 
         Raises:
             HandshakeTimeout: no answer.
-            Refused: the patch does not do it.
-            BusSendError: the line takes nothing.
+            Refused: the patch refuses.
+            BusSendError: the line takes no bytes.
         """
         self._number = self._number % 255 + 1
         number = bytes((self._number,))

@@ -1,7 +1,7 @@
-"""What an open patch says of itself: its greeting and the items of its description, read and checked.
+"""The greeting, the reports and the description of an open patch, read and checked.
 
-The protocol is docs/protocols/patch-serial.md. Everything here comes from a wire: whatever it says, the outcome is a
-description that can be trusted or a :class:`BadDescription` that tells what is wrong.
+The protocol is docs/protocols/patch-serial.md. Everything here comes from a wire: the outcome is a description that can
+be trusted, or a :class:`BadDescription` with the fault.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ _RESETS = ("unknown", "power-up", "reset pin", "watchdog", "brown-out", "softwar
 
 
 class BadDescription(BusError):
-    """A patch says something of itself that cannot be."""
+    """A patch has sent an impossible description."""
 
 
 @dataclass(frozen=True)
 class Greeting:
-    """What a patch answers to a greeting, and announces after it was reset.
+    """The answer to a greeting, and the announcement after a reset.
 
     Attributes:
         major, minor: version of the protocol that it speaks.
-        reset: why it was last reset, in words.
-        streaming: it has been told to send.
+        reset: reason of its last reset, in words.
+        streaming: it was started.
         uptime_s: since that reset, s.
         crc: of its description.
-        n_items: how many items that has.
+        n_items: number of items of its description.
     """
 
     major: int
@@ -78,7 +78,7 @@ class Greeting:
 
     @classmethod
     def read(cls, data: bytes) -> Greeting:
-        """From the wire.
+        """Read a greeting from the wire.
 
         Raises:
             BadDescription: another major version, or no greeting.
@@ -96,7 +96,7 @@ class Greeting:
 
 @dataclass(frozen=True)
 class Report:
-    """Figures that a patch keeps.
+    """The counters of a patch.
 
     Attributes:
         uptime_s: since its last reset, s.
@@ -112,7 +112,7 @@ class Report:
 
     @classmethod
     def read(cls, data: bytes) -> Report:
-        """From the wire.
+        """Read a report from the wire.
 
         Raises:
             BadDescription: too short.
@@ -127,8 +127,8 @@ class Kind:
 
     Attributes:
         name: for people.
-        dtype: how its values are sent, a numpy dtype.
-        taxels: sensor type of each value of each taxel, by name; None: the value means nothing.
+        dtype: of its values as they are sent, a numpy dtype.
+        taxels: sensor type of each value of each taxel, by name; None: the value has no meaning.
     """
 
     name: str
@@ -146,11 +146,11 @@ class Kind:
 
 @dataclass(frozen=True)
 class Description:
-    """Everything that a patch says of itself.
+    """The description of a patch.
 
     Attributes:
         product, serial_number, firmware: for people.
-        period_us: of a cycle, unless it is told another; and the shortest and the longest that it can do.
+        period_us: of a cycle, unless another is set; with the shortest and the longest possible.
         types: the sensor types.
         kinds: the kinds of module.
         modules: kind of each module.
@@ -178,7 +178,7 @@ class Description:
 
     @property
     def patch(self) -> Patch:
-        """What users see of it. The taxels of all its modules are numbered in one row: these are their uids."""
+        """The patch as it is published; uids number the taxels of all modules, in order."""
         uid, modules = 0, []
         for number, kind in enumerate(self.kinds[k] for k in self.modules):
             channels: list[Sensor | None] = []
@@ -194,10 +194,10 @@ class Description:
 
 
 def read_description(items: Sequence[bytes], crc: int) -> Description:
-    """Put the items of a description together.
+    """Read the items of a description.
 
     Raises:
-        BadDescription: they are not what the patch promised, or say what cannot be.
+        BadDescription: they do not fit their checksum, or are impossible.
     """
     if zlib.crc32(b"".join(items)) != crc:
         raise BadDescription("the description changed while it was being read")
@@ -226,7 +226,7 @@ def read_description(items: Sequence[bytes], crc: int) -> Description:
 
 
 def _patch(reader: _Reader, types: list[SensorType], kinds: list[Kind], modules: list[int]) -> Description:
-    """What is said first; the lists are filled by what is said then."""
+    """Read the first item; the lists are filled by the items behind it."""
     period_us, shortest_us, longest_us = reader.take("<III")
     product, serial_number, firmware = (reader.text(MAX_NAME_BYTES) for _ in range(3))
     if not 0 < shortest_us <= period_us <= longest_us:
@@ -327,8 +327,6 @@ def _frame(number: int, kind: Kind) -> Frame:
 
 
 class _Reader:
-    """Takes a message apart."""
-
     def __init__(self, data: bytes, what: str) -> None:
         self._data = data
         self._what = what
@@ -346,7 +344,7 @@ class _Reader:
         return values
 
     def real(self) -> float:
-        """A float of 32 bits, as a person would have written it."""
+        """Return a float of 32 bits as the shortest decimal number that rounds to it."""
         (bits,) = self.take("<I")
         return float(str(np.uint32(bits).view(np.float32)))
 

@@ -1,4 +1,4 @@
-"""Frames that begin with a known pattern and say, or are known to have, a length."""
+"""Find frames with a known beginning and a length that is known or in the frame."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, chec
 _GOOD, _REFUSED, _INCOMPLETE = range(3)
 
 Pattern = Sequence[int | Collection[int]]
-"""What each byte is, or which values it can have."""
+"""The value of each byte, or the values that it can have."""
 
 
 @dataclass(frozen=True)
 class Length:
-    """A field says how long a frame is, apart from a constant number of bytes.
+    """A field with the length of a frame, apart from a constant number of bytes.
 
     Attributes:
         field: place of the length.
@@ -32,11 +32,11 @@ class Length:
 
 @dataclass(frozen=True)
 class LengthTable:
-    """A byte of the header determines how long a frame is, or where the frame says it.
+    """A byte of the header determines the length of a frame, or the place of the length.
 
     Attributes:
         offset: place of the byte.
-        total: bytes of the whole frame, or a field that says them, for each value that the byte can have.
+        total: bytes of the whole frame, or a field with them, for each value that the byte can have.
     """
 
     offset: int
@@ -44,7 +44,7 @@ class LengthTable:
 
     @property
     def has_fields(self) -> bool:
-        """Whether some frames say how long they are."""
+        """Whether some frames have a length field."""
         return any(isinstance(total, Length) for total in self.total.values())
 
 
@@ -58,20 +58,20 @@ class Packet(Framing):
 
     Attributes:
         sync: first bytes of every frame.
-        length: bytes of a whole frame, or where the frame says it.
+        length: bytes of a whole frame, or the place of the length in it.
         maximum: bytes of the longest whole frame; needed with :class:`Length`, also in a table.
         checksum: of the bytes ``covers``.
         checksum_at: place of the checksum in the header; default: behind the body.
-        covers: bytes that the checksum is of: (start, end); end counts from the end of the frame and is at most 0.
+        covers: the bytes under the checksum: (start, end); end counts from the end of the frame and is at most 0.
             Default: everything before the checksum, or (with ``checksum_at``) everything behind it.
-        bare_when_empty: a frame whose length field says 0 has no checksum (Schunk DSACON32).
+        bare_when_empty: a frame whose length field is 0 has no checksum (Schunk DSACON32).
         trailer: last bytes of every frame.
         identifier: number in the header that distinguishes kinds of frames.
         header: bytes before the body; default: up to the last of sync, length, identifier and checksum in front.
         confirmed: a frame that does not follow another one at once counts only if the next one begins right behind
-            it (and, with a trailer, ends as it should). For devices without a checksum; costs one frame of delay
-            after every fault. ``"each"``: every frame is confirmed so, always; for devices whose frames have so little
-            that can be checked that a shortened one passes together with the beginning of the next.
+            it (and, with a trailer, ends correctly). For devices without a checksum; costs one frame of delay after
+            every fault. ``"each"``: every frame is confirmed in this way; for devices whose frames offer so little to
+            check that a shortened one passes together with the beginning of the next.
 
     Raises:
         ConfigurationError: the declaration contradicts itself.
@@ -96,8 +96,9 @@ class Packet(Framing):
                 raise ConfigurationError(f"sync and trailer are bytes: write b{what!r}, not {what!r}")
         object.__setattr__(self, "maximum_body", self.longest - self.body_start - self.behind)
         if not self.sync and not self.trailer and self.checksum is None:
-            raise ConfigurationError("frames without sync, trailer and checksum cannot be told from anything else")
-        if self._has_length_field and not self.maximum:
+            raise ConfigurationError("frames without sync, trailer and checksum cannot be recognized")
+        has_field = isinstance(self.length, LengthTable) and self.length.has_fields
+        if (has_field or isinstance(self.length, Length)) and not self.maximum:
             raise ConfigurationError("frames say how long they are: say how long they can be (maximum)")
         if self.confirmed and not isinstance(self.length, int):
             raise ConfigurationError("only frames of one length can be confirmed by the next")
@@ -108,10 +109,6 @@ class Packet(Framing):
             raise ConfigurationError(f"the checksum covers bytes {self.covered(most)} of a frame of {most}")
         if self.bare_when_empty and (not isinstance(self.length, Length) or self.checksum_at is not None):
             raise ConfigurationError("bare_when_empty needs a length field, and a checksum at the end")
-
-    @property
-    def _has_length_field(self) -> bool:
-        return isinstance(self.length, Length) or (isinstance(self.length, LengthTable) and self.length.has_fields)
 
     @property
     def body_start(self) -> int:
@@ -171,13 +168,12 @@ class Packet(Framing):
         return self.longest if self.trailer else len(self.sync)
 
     def framer(self) -> Framer:
-        """Something to feed a stream to."""
         return PacketFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent; what the declaration leaves open in the header is zero.
+        """Return a frame as it is sent; bytes of the header that the declaration leaves open are zero.
 
-        Identifier and length are written where they are, also over the payload.
+        Identifier and length are written at their places, also over the payload.
 
         Raises:
             ValueError: there is no such frame.
@@ -188,7 +184,7 @@ class Packet(Framing):
         total = self.body_start + len(payload) + self.behind
         has_checksum = self.checksum is not None
         if len(frame) < max(0 if self.identifier is None else self.identifier.end, self.known_from):
-            raise ValueError(f"{len(payload)} bytes of payload have no room for what says what the frame is")
+            raise ValueError(f"{len(payload)} bytes of payload have no room for identifier and length")
         if self.identifier is not None:
             self.identifier.put(frame, identifier)
         length = self._length_field(frame)
@@ -216,18 +212,18 @@ class Packet(Framing):
         return made
 
     def _length_field(self, header: bytes | bytearray) -> Length | None:
-        """Where frames that begin so say how long they are; None if they do not."""
+        """Return the length field of frames with this header; None if they have none."""
         length: int | Length | LengthTable = self.length
         if isinstance(length, LengthTable):
             length = length.total.get(header[length.offset], 0) if length.has_fields else 0
         return length if isinstance(length, Length) else None
 
     def checksum_place(self, total: int) -> int:
-        """Where the checksum begins in a frame of so many bytes."""
+        """Return where the checksum begins in a frame of ``total`` bytes."""
         return total - self.behind if self.checksum_at is None else self.checksum_at
 
     def covered(self, total: int) -> tuple[int, int]:
-        """First byte that the checksum covers, and one past the last, in a frame of so many bytes."""
+        """Return the first byte under the checksum, and one past the last, in a frame of ``total`` bytes."""
         if self.covers is not None:
             return self.covers[0], total + self.covers[1]
         if self.checksum_at is None or self.checksum is None:
@@ -236,7 +232,7 @@ class Packet(Framing):
 
 
 def values_of(what: int | Collection[int]) -> list[int]:
-    """Which values a byte of a pattern can have, ascending."""
+    """Return the values that a byte of a pattern can have, ascending."""
     return [what] if isinstance(what, int) else sorted(what)
 
 
@@ -275,7 +271,7 @@ class PacketFramer(Framer):
         ], done
 
     def _search(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
-        """Judge what may be a beginning, from ``place`` on, until one cannot be judged yet; gives its place."""
+        """Judge possible beginnings from ``place`` on; return the place of the first that needs more bytes."""
         counters, size = self.counters, len(stream)
         while True:
             match = self._begin.search(stream, place)
@@ -310,14 +306,14 @@ class PacketFramer(Framer):
             place += 1
 
     def _total(self, stream: bytes, place: int) -> tuple[int, bool]:
-        """Bytes of the frame that begins here, 0 if it cannot be; and whether it has no checksum."""
+        """Return the bytes of the frame that begins here, 0 if impossible; and whether it has no checksum."""
         framing = self._framing
         length: int | Length | LengthTable = framing.length
         if isinstance(length, LengthTable):
             length = length.total.get(stream[place + length.offset], 0)
         if isinstance(length, int):
             total, is_bare = length, False
-        elif len(stream) - place < length.field.end:  # so much at least
+        elif len(stream) - place < length.field.end:  # at least
             return length.field.end, False
         else:
             says = length.field.of(stream, place)
@@ -326,7 +322,7 @@ class PacketFramer(Framer):
         return (total if framing.shortest <= total <= framing.longest else 0), is_bare
 
     def _form(self, stream: bytes, place: int, total: int, follows: bool) -> int:
-        """Whether the frame ends as it should and, if it must, is followed by another."""
+        """Judge the trailer of the frame and, unless it follows another one, the beginning of the next."""
         n = len(self._framing.trailer)
         if n and not self._whole_trailer.match(stream, place + total - n):
             return _REFUSED
@@ -353,7 +349,7 @@ def _one_of(values: Sequence[int]) -> bytes:
 
 
 def _prefixes(pattern: Sequence[Sequence[int]]) -> bytes:
-    """Regular expression of the pattern, or of its beginning at the end of the stream."""
+    """Return a regular expression of the pattern, or of its beginning at the end of the stream."""
     if not pattern:
         return b""
     rest = _prefixes(pattern[1:])

@@ -1,12 +1,12 @@
 """Paxini's PX-6AX GEN3: tactile modules of three axes, behind a serial converter board or behind a high-speed board.
 
 Wire formats: the requests of Paxini's own programs, captured and published; three published programs that read the
-sensors (github.com/riverfog7/paxini-utils, adnan-saood/paxini_ros2, yknxh/paxini-toolkit). They are told where they are
-spoken: :mod:`.paxini_converter`, :mod:`.paxini_high_speed`. Both boards speak at 921600 baud, 8N1.
+sensors (github.com/riverfog7/paxini-utils, adnan-saood/paxini_ros2, yknxh/paxini-toolkit). The formats are described in
+:mod:`.paxini_converter` and :mod:`.paxini_high_speed`. Both boards speak at 921600 baud, 8N1.
 
-What is not known, and what is done about it: whether one board minds a question in the other one's protocol is not
-published [INF: it does not; the option ``board`` names the board, and nothing is asked in the other protocol]. What the
-error byte of the high-speed board's frames means is not public: values of a frame that has one are ``SUSPECT``.
+Not known: whether a question in the other board's protocol disturbs a board (it is assumed not to; with the option
+``board`` none is asked), and the meaning of the error byte in the high-speed board's frames (if it is not 0, all values
+of the frame are ``SUSPECT``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
 from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, Board
 
 _HEADERS = 48
-"""More than there is around the taxels in any body."""
+"""At least the bytes around the taxels in any body."""
 _LISTEN_S, _TIMEOUT_S, _TRIES = 0.1, 0.2, 2
 _VERSIONS: Framing = Packet(
     sync=(0xAA, 0x55, (0, 110)),
@@ -48,9 +48,9 @@ _VERSIONS: Framing = Packet(
     identifier=IDENTIFIER,
     header=5,
 )
-"""Replies of either board to the question for its version, and nothing else."""
+"""Replies of either board to the question for its version, and no other frames."""
 _HEADER_OF_HIGH_SPEED = paxini_high_speed.version_request()[:8]
-"""Of its reply, but for the first two bytes."""
+"""Header of the reply of a high-speed board, except for the first two bytes."""
 _VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEADER_OF_HIGH_SPEED[5:])
 
 
@@ -62,7 +62,7 @@ class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     board: Annotated[
-        Literal["auto", "converter", "high_speed"], Meta(description="which board it is; auto: listen and ask")
+        Literal["auto", "converter", "high_speed"], Meta(description="the kind of board; auto: listen and ask")
     ] = "auto"
     sensors: Annotated[
         tuple[Annotated[int, Meta(ge=SENSORS[0], le=SENSORS[-1])], ...],
@@ -75,7 +75,7 @@ class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=1, le=1000, description="converter board: time between two questions to a sensor, ms")
     ] = 10
     hand: Annotated[
-        Literal["right", "left"], Meta(description="high-speed board: of which hand its modules are, for their places")
+        Literal["right", "left"], Meta(description="high-speed board: the hand with its modules, for their places")
     ] = "right"
 
     def __post_init__(self) -> None:
@@ -100,31 +100,31 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
             self._is_away,
             period_s=options.period_ms / 1e3,
             use=self.change_framing,
-            tell=self.tell,
+            report=self.tell,
         )
-        self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, tell=self.tell)
+        self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
         self._board: Board | None = None
         self._is_asking = False
 
     @property
     def payload_size(self) -> int:
-        """Of the largest module: which ones there are, is known only when they were asked for."""
+        """Bytes of the largest module; the modules are known only after the board was asked."""
         return -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """What a converter board is asked; a high-speed board sends by itself."""
+        """Questions to a converter board; a high-speed board sends by itself."""
         return () if self._board is None else self._board.polls
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board what is attached to it.
+        """Ask the board for its modules.
 
         Raises:
-            BusError: it does not answer, says what cannot be, or must not be asked.
+            BusError: it does not answer, its answer is impossible, or it must not be asked.
         """
         if link.listen_only:
-            raise BusError("Paxini's boards tell what is attached to them only on request: listening is not enough")
-        self._board, self._is_asking = None, True  # nothing else is asked meanwhile
+            raise BusError("Paxini's boards report their modules only on request: listening is not enough")
+        self._board, self._is_asking = None, True  # no other question meanwhile
         try:
             board = await self._find(link)
             self.change_framing(board.framing)
@@ -137,7 +137,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """The version of the first sensor of a converter board, or of a high-speed board; both tell it at any time."""
+        """Ask the sensors of a converter board, then a high-speed board, for a version; it does no harm at any time."""
         for sensor in SENSORS:
             try:
                 return f"Paxini sensor {sensor}: {await ask_version(link, sensor)}"
@@ -153,7 +153,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
             await self._board.stop(link)
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether a silent patch answers, and is what it was; if nobody knows what is there, that is asked again."""
+        """Return whether a silent patch answers and is the same; if no board is known, ask which it is."""
         if self._board is not None:
             return await self._board.probe(link, patch)
         if not self._is_asking:
@@ -161,20 +161,19 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return False
 
     async def attend(self, link: Link) -> None:
-        """Hear what the board says beside its data, whichever it is."""
+        """Follow the frames of either board that are no data."""
         async with asyncio.TaskGroup() as attending:
             for board in (self._converter, self._high_speed):
                 attending.create_task(board.attend(link))
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:  # noqa: ARG002
-        """Ask what is attached now, and have it send again."""
+        """Ask for the modules that are attached now, and start the data again."""
         patches = await self.describe(link)
         await self.start(link)
         return patches
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Modules that tell nothing but 0."""
         return ZeroWatch(tables)
 
     @operation(sets_up=True)
@@ -192,11 +191,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return self._line is not None and self._line.fileno() < 0
 
     async def _find(self, link: Link) -> Board:
-        """The board that the options name, or that is there.
-
-        Raises:
-            HandshakeTimeout: neither is.
-        """
+        """Return the board of the options, or the one that streams or answers."""
         if self.options.board == "converter":
             return self._converter
         if self.options.board == "high_speed" or await self._high_speed.is_streaming(link, _LISTEN_S):

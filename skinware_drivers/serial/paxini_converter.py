@@ -1,15 +1,15 @@
-"""Paxini's serial converter board, or a single sensor with a serial port: sensors that answer what they are asked.
+"""Paxini's serial converter board, or a single sensor with a serial port: sensors that only answer.
 
 All numbers are little-endian; LRC is minus the sum of all bytes before it.
 
 * Request: ``55 AA | bytes from here to the LRC u16 | sensor | 00 | function | address u32 | count u16 | data | LRC``.
   Functions: FB reads, 79 writes.
 * Reply: ``AA 55`` and the same up to the count, then a status u8, data, LRC. Function 7E is an error.
-* Addresses, decimal: 1008 the resultant, 3 bytes, then 27 bytes of something else, then the taxels, from 1038; 6100
+* Addresses, decimal: 1008 the resultant, 3 bytes, then 27 bytes of unknown meaning, then the taxels, from 1038; 6100
   100 characters with the part code; 3 write 1 to take the present forces as zero.
 
-This board puts status 1, which is an error of the length, into every good reply to a read. So the status of reads says
-nothing, that of writes does. It sends nothing by itself.
+This board puts status 1, an error of the length, into every good reply to a read. So the status of reads is ignored;
+the status of writes counts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.polling import Notice, Poll
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -46,8 +46,8 @@ SENSORS: Sequence[int] = range(9)
 VERSION_BYTES = 100
 
 IDENTIFIER = Field(4, 4, mask=0x07_04_00_FF)
-"""The sensor, and those bits of function and address that are 0 in data, and not in any other reply that is expected:
-what is no data is of no module then, and reaches whoever waits for it."""
+"""The sensor, and the bits of function and address that are 0 in data, but not in any other expected reply: other
+replies then belong to no module, and reach the method that waits for them."""
 
 _READ, _WRITE, _ERROR = 0xFB, 0x79, 0x7E
 _SENSOR_MASK, _ERROR_MASK = 0xFF, 0x04 << 16
@@ -77,7 +77,7 @@ def _identifier(sensor: int, function: int, address: int) -> int:
 
 
 async def ask_version(link: Link, sensor: int, *, tries: int = 1) -> str:
-    """What a sensor says it is: ``PAXINI PXSR-STDDP03F-v1.0.5``.
+    """Ask a sensor for its version: ``PAXINI PXSR-STDDP03F-v1.0.5``.
 
     Raises:
         HandshakeTimeout: no such sensor.
@@ -92,7 +92,7 @@ def version_in(reply: bytes) -> str:
 
 
 class Head(NamedTuple):
-    """What a reply begins with; -1 where it is too short to have one."""
+    """The beginning of a reply; -1 if the reply is too short."""
 
     function: int
     address: int
@@ -110,12 +110,12 @@ class Head(NamedTuple):
 
 
 class ConverterBoard(Board):
-    """The sensors on one line. A sensor that fell silent is asked who it is, before it is asked for data again.
+    """The sensors on one line. A sensor that fell silent is asked for its version before it is asked for data again.
 
     Args:
-        sensors: ids of those that must be there; none: all that answer.
-        points: taxels of each; 0: as their part codes say.
-        is_away: tells whether the line is closed.
+        sensors: ids of the sensors that must answer; none: all that answer.
+        points: taxels of each; 0: by their part codes.
+        is_away: returns whether the line is closed.
         how: see :class:`Board`; ``period_s`` is the time between two questions to the same sensor.
     """
 
@@ -139,12 +139,16 @@ class ConverterBoard(Board):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """The data of every sensor, or the version of one that fell silent."""
-        if self._is_away():  # what is plugged in next may be another one
+        """Questions for the data of every sensor, or for the version of a silent one."""
+        if self._is_away():  # other sensors may be plugged in meanwhile
             self._silent = set(self._polls)
-        return [self._ask_who(sensor) if sensor in self._silent else poll for sensor, poll in self._polls.items()]
+        return [
+            self._poll(sensor, _VERSION, VERSION_BYTES) if sensor in self._silent else poll
+            for sensor, poll in self._polls.items()
+        ]
 
     async def is_there(self, link: Link) -> bool:
+        """Return whether a sensor answers."""
         for sensor in self._wanted or SENSORS:
             try:
                 await ask_version(link, sensor)
@@ -157,7 +161,7 @@ class ConverterBoard(Board):
         """Ask for the sensors; each is a patch.
 
         Raises:
-            BusError: nobody answers, one that must be there does not, or one says that it is a model that is not known.
+            BusError: no sensor answers, one of the options does not, or one is of an unknown model.
         """
         found: dict[int, str] = {}
         for sensor in self._wanted or SENSORS:
@@ -175,21 +179,22 @@ class ConverterBoard(Board):
         return self.know(points)
 
     def know(self, points: Mapping[int, int]) -> Sequence[Patch]:
-        """The patches of sensors with these ids, and so many taxels."""
+        """Return the patches of sensors with these ids and numbers of taxels."""
         self.layout = Layout([_frame(sensor, count) for sensor, count in points.items()])
-        self._polls = {sensor: self._ask_data(sensor, count) for sensor, count in points.items()}
+        sizes = {sensor: _BEFORE_TAXELS + TAXEL * count for sensor, count in points.items()}
+        self._polls = {sensor: self._poll(sensor, _DATA, size) for sensor, size in sizes.items()}
         self._patches = {
             sensor: Patch(f"sensor {sensor}", [module(sensor, count)], sensor) for sensor, count in points.items()
         }
         return list(self._patches.values())
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Ask a silent sensor who it is from now on, in its turn: whoever waited for it would hold up the others."""
+        """Poll the version of a silent sensor from now on: waiting for it here would hold up the others."""
         self._silent.add(patch.key)
         return False
 
     async def attend(self, link: Link) -> None:
-        """Hear who they are that were silent, and the errors that sensors answer with."""
+        """Follow the versions of silent sensors, and the errors that sensors answer."""
         error, of_function = "", IDENTIFIER.mask & ~_SENSOR_MASK
         who = answer(0, _READ, _VERSION)._replace(mask=of_function)
         with link.follow(who, Match(0, 0, bytes((0, _ERROR)))) as heard:
@@ -198,12 +203,12 @@ class ConverterBoard(Board):
                 sensor = reply.identifier & _SENSOR_MASK
                 if reply.payload[1] != _ERROR:
                     self._heard_who(link, sensor, version_in(reply.payload))
-                elif (told := Head.of(reply.payload).in_words(sensor)) != error:
-                    error = told
-                    log.warning("%s: %s", link.bus_name, told)
+                elif (text := Head.of(reply.payload).in_words(sensor)) != error:
+                    error = text
+                    log.warning("%s: %s", link.bus_name, text)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
-        """Have sensors take the present forces as zero, one after the other.
+        """Make sensors take the present forces as zero, one after the other.
 
         Raises:
             BusError: one refuses, or does not answer.
@@ -224,8 +229,8 @@ class ConverterBoard(Board):
             self._silent.discard(sensor)
         else:
             log.warning("%s: sensor %d is another one now: %s", link.bus_name, sensor, version)
-            del self._patches[sensor]  # said once
-            self.tell(patch, Notice.CHANGED)
+            del self._patches[sensor]  # logged once
+            self.report(patch, Notice.CHANGED)
 
     def _points_of(self, sensor: int, version: str) -> int:
         known = (points for code, points in POINTS_OF_PART.items() if code in version)
@@ -237,13 +242,8 @@ class ConverterBoard(Board):
             )
         return points
 
-    def _ask_data(self, sensor: int, points: int) -> Poll:
-        question = read(sensor, _DATA, _BEFORE_TAXELS + TAXEL * points)
-        return Poll(sensor, question, self.period_s, answer(sensor, _READ, _DATA))
-
-    def _ask_who(self, sensor: int) -> Poll:
-        question = read(sensor, _VERSION, VERSION_BYTES)
-        return Poll(sensor, question, self.period_s, answer(sensor, _READ, _VERSION))
+    def _poll(self, sensor: int, address: int, size: int) -> Poll:
+        return Poll(sensor, read(sensor, address, size), self.period_s, answer(sensor, _READ, address))
 
 
 def _frame(sensor: int, points: int) -> Frame:

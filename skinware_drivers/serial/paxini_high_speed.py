@@ -1,18 +1,18 @@
-"""Paxini's high-speed board PXSR-STDOTO4B: up to 28 modules of a hand, all of them in every frame that it sends.
+"""Paxini's high-speed board PXSR-STDOTO4B: up to 28 modules of a hand, all of them in every frame.
 
 All numbers are little-endian; LRC is minus the sum of all bytes before it.
 
 * Request: ``55 AA | 00 | function | register u16 | count u16 | data | LRC``. Functions: 03 reads 1 to 512 bytes, 10
   writes 1 to 10, 17 calibrates. Reply: ``AA 55`` and the same; a function with bit 7 has the number of an error in the
-  other bits. The data of a reply to a write are a status, 0 if all is well.
-* Stream: ``AA 56 | 00 | bytes u16 | error u8 | data | LRC``; the bytes count error and data. Data: of each connected
-  slot, in order, the resultant (three u16, of which the low byte counts) and its taxels; of a module on the palm, nine
-  at most. How long a frame is follows from the slots and their numbers of taxels; both have to be asked for first.
+  other bits. The data of a reply to a write is a status, 0 if all is well.
+* Stream: ``AA 56 | 00 | bytes u16 | error u8 | data | LRC``; the bytes count error and data. Data: for each connected
+  slot, in order, the resultant (three u16, whose low byte counts) and its taxels; nine taxels at most for a module on
+  the palm. The length of a frame follows from the slots and their numbers of taxels, which must be read first.
 * Registers: 0000 version, 15 characters; 0010 to 0013 connected slots, one bit each, the lowest first; 0017 stream on
   and off; 0030 and 0066 numbers of taxels, u16, of the slots of the fingers and of the palm.
 
-A program that ends without switching the stream off leaves the board sending. So it is switched off before anything is
-asked, what has come is dropped, and what is not answered is asked again.
+A program that ends without switching the stream off leaves the board sending. So the driver switches the stream off
+before its first question, drops the bytes received, and repeats questions that are not answered.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from skinware_drivers.hand import Hand
 from skinware_drivers.layout import Flag, Frame, Identifier, Layout
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
@@ -53,7 +53,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 VERSION_BYTES = 15
 STRANGE = 0x57
-"""Identifier of what is streamed and not as long as it should be; those of slots are their numbers."""
+"""Identifier of streamed frames of another length; the identifiers of slots are their numbers."""
 
 _REPLY, _STREAM = 0x55, 0x56
 _READ, _WRITE, _CALIBRATE, _IS_ERROR = 0x03, 0x10, 0x17, 0x80
@@ -64,7 +64,7 @@ _MOST_ON_PALM = 9
 _LENGTH_AND_ERROR, _RESULTANT, _RESULTANT_STEP = 3, 6, 2
 _LONGEST = 7 + _SLOTS * (_RESULTANT + TAXEL * MOST_POINTS)
 _ENOUGH = 64
-"""Bytes of it that are handed on."""
+"""Bytes of a strange frame that are kept."""
 _TIMEOUT_S, _TRIES, _SWITCHES = 0.2, 3, 2
 _TIMEOUT_OF_CALIBRATION_S = 10.0
 _USUAL_HZ = 91.0
@@ -91,7 +91,7 @@ _WHOLE = Packet(
 
 
 def framing_of(slots: Sequence[Slot]) -> Framing:
-    """Replies, and streamed frames split into one for each of these slots: its data behind length and error."""
+    """Return a framing of replies, and of streamed frames split by slot: its data behind length and error."""
     sizes = [_RESULTANT + TAXEL * slot.points for slot in slots]
     *starts, end = accumulate(sizes, initial=_LENGTH_AND_ERROR)
     parts = [(slot.number, start, start + size) for slot, start, size in zip(slots, starts, sizes, strict=True)]
@@ -107,14 +107,14 @@ def framing_of(slots: Sequence[Slot]) -> Framing:
 
 
 UNKNOWN_SLOTS: Framing = framing_of(())
-"""All streamed frames are strange, as long as nobody knows what is in them."""
+"""All streamed frames are strange as long as the slots are unknown."""
 
 
 class HighSpeedBoard(Board):
     """One board: a patch with a module for each connected slot.
 
     Args:
-        hand: whose modules they are, for their places.
+        hand: the hand with the modules, for their places.
         how: see :class:`Board`.
     """
 
@@ -127,16 +127,16 @@ class HighSpeedBoard(Board):
         self._streams = False
 
     async def is_streaming(self, link: Link, duration_s: float) -> bool:
-        """Whether frames come that only this board sends; nothing is asked."""
+        """Listen, and return whether frames come that only this board sends."""
         self._streams = False
         self.use(UNKNOWN_SLOTS)
         return any(heard.identifier == STRANGE for heard in await link.listen(duration_s))
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules; it may still be sending for somebody before us.
+        """Ask the board for its modules; it may still be sending for an earlier program.
 
         Raises:
-            BusError: it does not answer, nothing is connected to it, or it says what cannot be.
+            BusError: it does not answer, no module is connected to it, or its answer is impossible.
         """
         self.framing = UNKNOWN_SLOTS
         self.use(self.framing)
@@ -152,6 +152,7 @@ class HighSpeedBoard(Board):
         return patches
 
     def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
+        """Return the patch of a board with these slots."""
         self._slots = list(slots)
         self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
         self.layout = Layout([_frame(slot) for slot in slots])
@@ -160,26 +161,26 @@ class HighSpeedBoard(Board):
         return [self._patch]
 
     async def start(self, link: Link) -> None:
-        """Have it send by itself. That it does, its data show; not every version of it acknowledges it."""
+        """Switch the stream on; not every version of the board acknowledges it."""
         self._streams = True
         if not await self._switch(link, on=True):
             log.debug("%s: the board does not acknowledge that it streams", link.bus_name)
 
     async def stop(self, link: Link) -> None:
-        """Make it silent, and wait until it says so."""
+        """Switch the stream off, and wait for the acknowledgement."""
         self._streams = False
         if not await self._switch(link, on=False):
             log.debug("%s: the board does not acknowledge that it is silent", link.bus_name)
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and has the modules that it had: then it was reset, and does not send any more."""
+        """Return whether a board with the same modules answers: then it was reset, and no longer sends."""
         if await self._ask_slots(link, tries=1) == self._slots:
             return True
-        self.tell(patch, Notice.CHANGED)
+        self.report(patch, Notice.CHANGED)
         return False
 
     async def attend(self, link: Link) -> None:
-        """Notice that what it streams is of another length: modules were connected or came off."""
+        """Notice streamed frames of another length: modules were connected or came off."""
         times_ns: list[int] = []
         with link.follow(Match(STRANGE)) as heard:
             while True:
@@ -189,10 +190,10 @@ class HighSpeedBoard(Board):
                 if enough and self._patch is not None:
                     log.warning("%s: the board streams other modules than before; asking which", link.bus_name)
                     times_ns, self._streams = [], False
-                    self.tell(self._patch, Notice.CHANGED)
+                    self.report(self._patch, Notice.CHANGED)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Calibrate the board, which sends nothing meanwhile.
+        """Calibrate the board, which does not send meanwhile.
 
         Raises:
             BusError: it refuses, or does not answer within 10 s.
@@ -229,11 +230,12 @@ class HighSpeedBoard(Board):
         return slots
 
     async def _switch(self, link: Link, *, on: bool) -> bool:
-        """Switch the stream on or off; whether that was acknowledged, by a reply or an empty streamed frame."""
+        """Switch the stream on or off; return whether a reply or an empty streamed frame acknowledged it."""
         sent = request(_WRITE, _SWITCH, 1, bytes([on]))
 
         def take(frame: Reply) -> bytes | None:
-            status = frame.payload[2:] if _is_empty(frame) else _data_of(frame, _WRITE, _SWITCH, 1)
+            is_empty = frame.identifier == STRANGE and len(frame.payload) == _LENGTH_AND_ERROR  # but for an error byte
+            status = frame.payload[2:] if is_empty else _data_of(frame, _WRITE, _SWITCH, 1)
             _check_status("stream", status or b"")
             return status
 
@@ -251,10 +253,10 @@ class HighSpeedBoard(Board):
     async def _exchange(
         self, link: Link, sent: bytes, take: Callable[[Reply], bytes | None], timeout_s: float, tries: int
     ) -> bytes | None:
-        """What ``take`` makes of the first frame that is an answer to it; None if none comes, however often it is sent.
+        """Send a request until ``take`` accepts a frame as its answer; return the result, None if no answer comes.
 
-        What is half received is dropped before it is sent again: it may be a beginning that is none, and the answer be
-        taken for more of it.
+        Half a frame is dropped before the request is repeated: it may be a false beginning that would swallow the
+        answer.
         """
         with link.follow(Match(_REPLY), Match(STRANGE)) as heard:
             for _ in range(tries):
@@ -276,16 +278,11 @@ def _frame(slot: Slot) -> Frame:
     return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED])
 
 
-def _is_empty(frame: Reply) -> bool:
-    """Whether it is a streamed frame that has an error byte and nothing else."""
-    return frame.identifier == STRANGE and len(frame.payload) == _LENGTH_AND_ERROR
-
-
 def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | None:
-    """What the reply to such a request says; None if it is none.
+    """Return the data of the reply to such a request; None if the frame is no such reply.
 
     Raises:
-        Refused: it is an error.
+        Refused: the reply is an error.
     """
     if frame.identifier != _REPLY:
         return None

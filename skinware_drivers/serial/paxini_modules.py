@@ -1,4 +1,4 @@
-"""Describe the modules of Paxini's PX-6AX GEN3, and what its boards have in common."""
+"""The modules of Paxini's PX-6AX GEN3, and the base class of its boards."""
 
 from __future__ import annotations
 
@@ -24,25 +24,20 @@ MOST_POINTS = 255
 
 _PAXINI = 0x5058
 """Number of the vendor in the ids of its own types."""
-
-
-def _shear(sensor_type: SensorType) -> SensorType:
-    return sensor_type.measured(scale=0.1, minimum=-12.8, maximum=12.7)
-
-
-def _normal(sensor_type: SensorType) -> SensorType:
-    return sensor_type.measured(scale=0.1, minimum=0.0, maximum=25.5)
-
-
-_TAXEL_TYPES = (_shear(FORCE_X), _shear(FORCE_Y), _normal(FORCE_Z))
-_RESULTANT_TYPES = (
-    _shear(SensorType("resultant_x", _PAXINI << 12 | 1, "N")),
-    _shear(SensorType("resultant_y", _PAXINI << 12 | 2, "N")),
-    _normal(SensorType("resultant_z", _PAXINI << 12 | 3, "N")),
+_RANGES_N = ((-12.8, 12.7), (-12.8, 12.7), (0.0, 25.5))
+"""Ranges of the axes x, y (within the skin) and z (along the normal); a byte each, in 0.1 N."""
+_TAXEL_TYPES, _RESULTANT_TYPES = (
+    tuple(
+        axis.measured(scale=0.1, minimum=low, maximum=high) for axis, (low, high) in zip(axes, _RANGES_N, strict=True)
+    )
+    for axes in (
+        (FORCE_X, FORCE_Y, FORCE_Z),
+        [SensorType(f"resultant_{axis}", _PAXINI << 12 | n, "N") for n, axis in enumerate("xyz", 1)],
+    )
 )
 TYPES: Sequence[SensorType] = (*_TAXEL_TYPES, *_RESULTANT_TYPES)
 SATURATED: Sequence[Sentinel] = (Sentinel(Status.OUT_OF_RANGE, -128), Sentinel(Status.OUT_OF_RANGE, 255))
-"""The ends of ranges, but for 127 within the skin, which along the normal is in the middle."""
+"""The ends of the ranges, except 127 within the skin, which is an ordinary value along the normal."""
 
 POINTS_OF_PART: Mapping[str, int] = {
     "PXSR-STDCP03A": 239,
@@ -58,7 +53,7 @@ POINTS_OF_PART: Mapping[str, int] = {
     "PXSR-STDIP03B": 25,
     "PXSR-STDMC03A": 9,
 }
-"""Taxels of a module by its part code."""
+"""Number of taxels of a module by its part code."""
 _MODELS: Mapping[int, str] = {
     9: "M2020",
     25: "S1610",
@@ -73,7 +68,7 @@ _MODELS: Mapping[int, str] = {
     135: "L3530",
     239: "L5325",
 }
-"""Models by their number of taxels: no two have the same."""
+"""Models by their number of taxels, which differs for all models."""
 
 _UID_OF_MODULE = 16
 _PLACES = ("near", "middle", "tip", "nail")
@@ -82,17 +77,17 @@ _PALMS = 8
 
 
 def model_of(points: int) -> str:
-    """Name of the model that has so many taxels; of one that is not known, their number."""
+    """Return the name of the model with this number of taxels; for an unknown model, the number."""
     return _MODELS.get(points, f"{points} taxels")
 
 
 def module(number: int, points: int, *, key: int = 0, name: str = "") -> Module:
-    """A module with its taxels, each of three axes, and its resultant.
+    """Return a module with its taxels, each of three axes, and its resultant.
 
     Args:
         number: of the module on its bus; the uids of its taxels are ``number << 16`` and the next ones.
-        points: how many taxels it has.
-        key: by which frames name it.
+        points: number of taxels.
+        key: number by which frames name it.
         name: for people.
     """
     first_uid = number << _UID_OF_MODULE
@@ -102,13 +97,13 @@ def module(number: int, points: int, *, key: int = 0, name: str = "") -> Module:
 
 
 def values(points: int, taxels_at: int, resultant_at: int, step: int) -> list[Values]:
-    """Where the values of a module are in a payload.
+    """Return the places of a module's values in a payload.
 
     Args:
-        points: how many taxels it has.
-        taxels_at: first byte of them.
+        points: number of taxels.
+        taxels_at: first byte of the taxels.
         resultant_at: first byte of the resultant.
-        step: bytes from one of its axes to the next, of which the first counts.
+        step: bytes from one axis of the resultant to the next; the first of them counts.
     """
     n = TAXEL * points
     found = [
@@ -127,7 +122,7 @@ class Slot:
 
     Attributes:
         number: of the slot: 0 to 19 on fingers, 20 to 27 on the palm.
-        points: taxels of the module that the board tells of.
+        points: taxels of the module in the board's frames.
     """
 
     number: int
@@ -135,7 +130,7 @@ class Slot:
 
     @property
     def part(self) -> str:
-        """Of the hand: a finger, or ``palm``."""
+        """The part of the hand: a finger, or ``palm``."""
         return FINGERS[self.number // len(_PLACES)] if self.is_on_finger else "palm"
 
     @property
@@ -155,14 +150,18 @@ class Slot:
 
 
 def nominal_places(slots: Sequence[Slot], hand: Hand) -> Geometry | None:
-    """Where the modules of a hand are, about, with the taxels of each in a compact block; None: no taxels.
+    """Return nominal places of the modules of a hand, the taxels of each in a compact block; None: no taxels.
 
-    No public map tells how the taxels of all models lie: a block shows which module a taxel is of, not where on it.
+    No map of the taxels of all models is public: a block shows on which module a taxel is, not where on it.
     """
     found = []
     for part in (*FINGERS, "palm"):
-        here = sorted((slot for slot in slots if slot.part == part and slot.points), key=_from_the_end)
-        blocks = [_block(slot.points) for slot in here]
+        here = [slot for slot in slots if slot.part == part and slot.points]
+        here.sort(key=lambda slot: _FROM_THE_END.index(slot.place) if slot.is_on_finger else slot.number)
+        blocks = []
+        for slot in here:
+            columns = math.isqrt(slot.points - 1) + 1
+            blocks.append(Grid(-(-slot.points // columns), columns))
         for slot, block, centre in zip(here, blocks, hand.down(part, blocks), strict=True):
             first_uid = slot.number << _UID_OF_MODULE
             uid = range(first_uid, first_uid + slot.points)
@@ -170,61 +169,54 @@ def nominal_places(slots: Sequence[Slot], hand: Hand) -> Geometry | None:
     return Geometry.joined(found) if found else None
 
 
-def _from_the_end(slot: Slot) -> int:
-    return _FROM_THE_END.index(slot.place) if slot.is_on_finger else slot.number
-
-
-def _block(points: int) -> Grid:
-    columns = math.isqrt(points - 1) + 1
-    return Grid(-(-points // columns), columns)
-
-
 class Board(ABC):
     """One board on a line; the methods are those of a driver, see :class:`skinware_drivers.adapter.Adapter`.
 
     Attributes:
-        framing: what it sends, as far as it is known yet.
-        layout: what its frames mean; known once it was described.
-        geometry: where its modules are, about; None: nobody knows.
+        framing: of its frames, as far as it is known.
+        layout: of its frames, once it was described.
+        geometry: nominal places of its modules; None: unknown.
         period_s: time between two updates.
 
     Args:
-        period_s: time between two updates, as far as it is known yet.
-        use: called with a framing: from now on it is that; what was received and is no whole frame is dropped.
-        tell: called with what a patch says of itself.
+        period_s: time between two updates, as far as it is known.
+        use: called with a framing for the line; bytes that are no whole frame yet are dropped.
+        report: called with the notices of patches.
     """
 
     framing: Framing
     layout: Layout
     geometry: Geometry | None = None
 
-    def __init__(self, period_s: float, use: Callable[[Framing], None], tell: Callable[[Patch, Notice], None]) -> None:
+    def __init__(
+        self, period_s: float, use: Callable[[Framing], None], report: Callable[[Patch, Notice], None]
+    ) -> None:
         self.period_s = period_s
         self.use = use
-        self.tell = tell
+        self.report = report
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """What it has to be asked; nothing if it sends by itself."""
+        """Questions to the board; none if it sends by itself."""
         return ()
 
     @abstractmethod
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask it what it has."""
+        """Ask the board for its modules."""
 
-    async def start(self, link: Link) -> None:  # noqa: B027  (one that is asked has nothing to do)
-        """Have it send by itself, if it can."""
+    async def start(self, link: Link) -> None:  # noqa: B027  (a board that only answers has nothing to do)
+        """Start the stream, if the board has one."""
 
     async def stop(self, link: Link) -> None:  # noqa: B027
-        """Make it silent."""
+        """Stop the stream."""
 
     @abstractmethod
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether a silent patch answers, and is what it was."""
+        """Return whether a silent patch answers and is the same."""
 
     @abstractmethod
     async def attend(self, link: Link) -> None:
-        """Hear what is no data."""
+        """Follow frames that are no data."""
 
     @abstractmethod
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

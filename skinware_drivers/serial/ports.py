@@ -1,4 +1,4 @@
-"""Bytes in and out: a tty, a socket, one of pyserial's other URLs, or the end of a pseudo terminal for emulators."""
+"""Ports for bytes: a tty, a socket, one of pyserial's other URLs, or the end of a pseudo terminal for emulators."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _MOST_THREADED = 1 << 16
 """Bytes that a port with threads holds in each direction."""
 _THREAD_TURN_S = 0.1
 _THREAD_END_S, _CLOSE_S = 0.25, 0.8
-"""How long a thread may go on with what it does; how long a port may take to be closed, as for python-can's."""
+"""Time that a thread may take to end, and a port to be closed (the same as for python-can's interfaces)."""
 
 
 class Port(ABC):
     """An open serial line; no call blocks.
 
     Attributes:
-        note: what a person should know about it.
-        longest_wait: bytes that may wait until it takes them. 0: what is written at once stays one piece.
+        note: advice about it.
+        longest_wait: bytes that may wait until it takes them. 0: bytes that are written together stay together.
     """
 
     note = ""
@@ -37,27 +37,27 @@ class Port(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """A descriptor that is readable when there is something to read."""
+        """Return a descriptor that is readable when ``read`` has something to do."""
 
     @abstractmethod
     def read(self, size: int) -> bytes:
-        """Up to ``size`` bytes; none if there are none.
+        """Return up to ``size`` bytes; none if none have come.
 
         Raises:
-            BusNotAvailable: it is gone.
+            BusNotAvailable: the port is gone.
         """
 
     @abstractmethod
     def write(self, data: bytes) -> int:
-        """Write what can be written now; gives how many bytes that were.
+        """Write the bytes that can be written now; return their number.
 
         Raises:
-            OSError: it is gone.
+            OSError: the port is gone.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of it. Idempotent."""
+        """Close the port. Idempotent."""
 
 
 class DescriptorPort(Port):
@@ -65,8 +65,8 @@ class DescriptorPort(Port):
 
     Args:
         name: for messages.
-        serial: pyserial's object, which stays the owner.
-        hang_up: False: DTR and RTS stay as they are when it is closed.
+        serial: pyserial's object, which owns the descriptor.
+        hang_up: False: DTR and RTS keep their levels when it is closed.
     """
 
     def __init__(self, name: str, serial: Any, *, hang_up: bool = True) -> None:
@@ -76,7 +76,13 @@ class DescriptorPort(Port):
         os.set_blocking(self._fd, False)
         self._is_tty = os.isatty(self._fd)
         if self._is_tty:
-            _set_up(self._fd, hang_up)
+            with contextlib.suppress(termios.error):
+                settings = termios.tcgetattr(self._fd)
+                if not hang_up:
+                    settings[2] &= ~termios.HUPCL
+                # a read of no bytes then fails, instead of returning none, which means that the device is gone
+                settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
+                termios.tcsetattr(self._fd, termios.TCSANOW, settings)
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
 
@@ -84,7 +90,7 @@ class DescriptorPort(Port):
         return self._fd
 
     def read(self, size: int) -> bytes:
-        """Up to ``size`` bytes; none if there are none.
+        """Return up to ``size`` bytes; none if none have come.
 
         Raises:
             BusNotAvailable: unplugged, or the other end has closed.
@@ -100,12 +106,11 @@ class DescriptorPort(Port):
         return data
 
     def gone(self, number: int) -> BusNotAvailable:
-        """What an error of the system means; 0: it is readable, but nothing comes."""
+        """Return the error for an error number of the system; 0: the port is readable, but nothing comes."""
         why = os.strerror(number) if number else "readable, but nothing comes"
         return BusNotAvailable(f"{self._name} went away, perhaps unplugged ({why})")
 
     def write(self, data: bytes) -> int:
-        """Write what fits into the kernel's buffer."""
         return _write_some(self._fd, data)
 
     def close(self) -> None:
@@ -118,7 +123,7 @@ class DescriptorPort(Port):
 
 
 class ThreadedPort(Port):
-    """A port that has no descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it.
+    """A port without a descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it.
 
     Args:
         name: for messages.
@@ -145,10 +150,10 @@ class ThreadedPort(Port):
         return self._event
 
     def read(self, size: int) -> bytes:
-        """Up to ``size`` bytes, as the thread has them.
+        """Return up to ``size`` bytes that the thread has read.
 
         Raises:
-            BusNotAvailable: the thread could not go on.
+            BusNotAvailable: the thread has failed.
         """
         with self._changed:
             with contextlib.suppress(BlockingIOError):
@@ -165,7 +170,7 @@ class ThreadedPort(Port):
         return taken[:size]
 
     def write(self, data: bytes) -> int:
-        """Hand bytes to the thread, as many as it still takes."""
+        """Give bytes to the thread, as many as fit into its queue."""
         with self._changed:
             if self._failure:
                 raise OSError(self._failure)
@@ -176,7 +181,7 @@ class ThreadedPort(Port):
         return len(taken)
 
     def close(self) -> None:
-        """End the threads. A port that hangs in it is left to itself after 0.8 s, which is logged."""
+        """End the threads. A port that hangs is left to itself after 0.8 s, and a warning is logged."""
         if self._closing:
             return
         with self._changed:
@@ -192,7 +197,7 @@ class ThreadedPort(Port):
         for thread in self._threads:
             thread.join(_THREAD_END_S)
         try:
-            self._serial.close()  # which ends a write that nobody takes
+            self._serial.close()  # it also ends a write that hangs
         except Exception as error:  # noqa: BLE001  (see _work)
             log.debug("%s: %s", self._name, error)
         for thread in self._threads:
@@ -203,7 +208,7 @@ class ThreadedPort(Port):
         try:
             while not self._closing:
                 work()
-        except Exception as error:  # noqa: BLE001  (pyserial's handlers raise what their libraries raise)
+        except Exception as error:  # noqa: BLE001  (the exceptions of pyserial's handlers are not documented)
             with self._changed:
                 self._failure = str(error) or type(error).__name__
                 os.eventfd_write(self._event, 1)
@@ -229,7 +234,7 @@ class ThreadedPort(Port):
 
 
 class PtyPort(Port):
-    """The device's end of a pseudo terminal: what programs open as a serial port.
+    """The device's end of a pseudo terminal, which programs open as a serial port.
 
     Args:
         link: a symbolic link to the port; replaced if it is one.
@@ -274,7 +279,6 @@ class PtyPort(Port):
             raise BusNotAvailable(f"{self.path} went away ({error.strerror})") from None
 
     def write(self, data: bytes) -> int:
-        """What fits into the kernel's buffer; nobody may be reading."""
         return _write_some(self._fd, data)
 
     def close(self) -> None:
@@ -292,13 +296,3 @@ def _write_some(fd: int, data: bytes) -> int:
         return os.write(fd, data)
     except BlockingIOError:
         return 0
-
-
-def _set_up(fd: int, hang_up: bool) -> None:
-    with contextlib.suppress(termios.error):
-        settings = termios.tcgetattr(fd)
-        if not hang_up:
-            settings[2] &= ~termios.HUPCL
-        # a read of nothing fails rather than return nothing, which then means that the device is gone
-        settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
-        termios.tcsetattr(fd, termios.TCSANOW, settings)

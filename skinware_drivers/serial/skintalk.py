@@ -2,10 +2,10 @@
 
 Wire format: ``skintalk.c`` and ``serialcfg.sh`` of skinvis (github.com/t173/skinvis). 2,000,000 baud. The byte '1'
 starts all patches, '0' stops them; neither is answered. A record has five bytes: 55, patch << 4 | cell, and the value
-as a big-endian signed number of 24 bits. Patches are numbered from 1 on, cells from 0 on.
+as a big-endian signed number of 24 bits. Patches are numbered from 1, cells from 0.
 
-There is no checksum and no counter. As in skintalk, a record counts only if the next one's 55 comes right behind it; so
-the last record before a pause waits for the next one. With two bytes that can be checked, noise can look like a record.
+A record has no checksum and no counter. As in skintalk, it counts only if the next one's 55 comes right behind it, so
+the last record before a pause waits for the next one. Only two bytes can be checked: noise can look like a record.
 """
 
 from __future__ import annotations
@@ -34,16 +34,7 @@ _Bytes = npt.NDArray[np.uint8]
 class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    patches: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the patches, 0-15")] = (
-        1,
-        2,
-        3,
-        4,
-        5,
-        6,
-        7,
-        8,
-    )
+    patches: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
     cells: Annotated[int, msgspec.Meta(description="cells of each patch", ge=1, le=16)] = 16
     negative: Annotated[
         Literal["twos_complement", "off_by_one"],
@@ -58,9 +49,10 @@ class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SkintalkDriver(SerialAdapter[SkintalkOptions]):
-    """All patches of a serial line. Each cell has records of its own and so is a module: it is stale for itself.
+    """All patches of a serial line; uid = patch << 4 | cell.
 
-    uid = patch << 4 | cell. Records of patches or cells that the options do not name are counted as unknown.
+    Each cell has records of its own, so it is a module and becomes stale alone. Records of patches or cells that the
+    options do not name are counted as unknown.
     """
 
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
@@ -93,7 +85,7 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
 def _off_by_one(
     payload: _Bytes, length: _Bytes
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]:
-    """Values as they are if a negative one is taken for minus its inverted bits: FF FF FF is 0."""
+    """Return values in which a negative one is minus its inverted bits: FF FF FF is 0."""
     row = np.arange(len(length))
     high, middle, low = payload[:, :3].astype(np.int32).T
     value = (high << 16 | middle << 8 | low) - ((high >> 7) << 24)

@@ -15,11 +15,11 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framed, Framer, Framing, fill_rows
 
 Splitting = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-"""(identifier, body) of a frame -> those of the frames that it becomes."""
+"""(identifier, body) of a frame -> (identifier, body) of each frame that it becomes."""
 
 
 class Part(NamedTuple):
-    """Bytes of a body that become a frame.
+    """A part of a body that becomes a frame.
 
     Attributes:
         identifier: of that frame.
@@ -34,11 +34,11 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Split(Framing):
-    """Frames of another framing, each split into several; they have the time and the end of the whole.
+    """Frames of another framing, each split into several, which have the time and the end of the whole.
 
     Attributes:
         whole: how frames lie in the stream, and how commands are sent.
-        splitting: what becomes of one; must not raise, whatever it is given.
+        splitting: returns the parts of a frame; must not raise, whatever it is given.
     """
 
     whole: Framing
@@ -49,11 +49,10 @@ class Split(Framing):
         object.__setattr__(self, "maximum_body", self.whole.maximum_body)
 
     def framer(self) -> Framer:
-        """Something to feed a stream to."""
         return _Splitter(self.whole.framer(), self.splitting)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A command, as a whole frame.
+        """Return a command, as a whole frame.
 
         Raises:
             ValueError: there is no such frame.
@@ -62,7 +61,7 @@ class Split(Framing):
 
 
 def by_length(known: Mapping[tuple[int, int], Sequence[Part]]) -> Splitting:
-    """Split frames of some identifiers and lengths of body; others stay as they are."""
+    """Return a splitting of frames of known identifiers and lengths of body; others stay whole."""
 
     def split(identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
         parts = known.get((identifier, len(body)))
@@ -94,7 +93,7 @@ class _Splitter(Framer):
         self._whole.asked()
 
     def feed(self, chunk: bytes) -> list[Framed]:
-        """Find whole frames, and split them; the counters are of whole ones."""
+        """Find whole frames, and split them; the counters count whole frames."""
         self._whole.counters = self.counters
         split = self._splitting
         return [
@@ -112,10 +111,10 @@ CHUNK = 1 << 16
 
 
 class Stream(ABC):
-    """What a line brings from when it is opened, or its framing is another, until it is closed or gets another.
+    """The bytes of a line from when it is opened, or gets another framing, until it is closed or gets the next.
 
     Attributes:
-        counters: of the bus; go on from one stream to the next.
+        counters: of the bus; they go on from one stream to the next.
     """
 
     def __init__(self, counters: BusCounters) -> None:
@@ -124,7 +123,7 @@ class Stream(ABC):
     @property
     @abstractmethod
     def is_behind(self) -> bool:
-        """Whether there may be more frames in what has come; until there are not, nothing more is added."""
+        """Whether the bytes so far may have more frames; until they have none, no bytes are added."""
 
     @property
     @abstractmethod
@@ -133,31 +132,31 @@ class Stream(ABC):
 
     @property
     def is_lost(self) -> bool:
-        """Whether nothing more is found in it: only another one helps."""
+        """Whether no more frames can be found, so that the bus must be opened again."""
         return False
 
-    def asked(self) -> None:  # noqa: B027  (most frames are found whatever the host has said)
-        """The host is about to ask something."""
+    def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
+        """Note that the host sends a question."""
 
     @abstractmethod
     def add(self, chunk: bytes, time_ns: int) -> None:
-        """What was read at this time, CLOCK_MONOTONIC ns: at most ``CHUNK`` bytes."""
+        """Add at most ``CHUNK`` bytes that were read at this time, CLOCK_MONOTONIC ns."""
 
     @abstractmethod
     def fill(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append frames to a batch, as many as there are and as fit; returns how many that were."""
+        """Append frames to a batch, as many as fit; return their number."""
 
     @abstractmethod
     def take_damaged(self) -> bytes:
-        """Once: the chunk that came last, if nothing was found in it but what is no frame."""
+        """Return the last chunk, once, if it had damaged frames and no good one."""
 
 
 class PythonStream(Stream):
-    """A stream whose frames are found by a framer.
+    """A stream whose frames a framer finds.
 
     Args:
-        framing: what is on the line.
-        payload_size: of bodies, at most; frames with longer ones are counted as refused.
+        framing: of the line.
+        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
         counters: of the bus.
     """
 
@@ -199,7 +198,12 @@ class PythonStream(Stream):
         self.counters.refused += len(framed) - len(fitting)
         if fitting:
             self._backlog.append((fitting, self._times(fitting, known, time_ns)))
-        self._forget_reads()
+        # keep the times of the bytes that are still held back
+        undecided = framer.position - framer.pending
+        if not framer.pending:
+            self._reads.clear()
+        while self._reads and self._reads[0][0] <= undecided:
+            self._reads.pop(0)
 
     def fill(self, batch: FrameBatch, ordinal: int) -> int:
         taken = 0
@@ -223,17 +227,9 @@ class PythonStream(Stream):
         return damaged
 
     def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
-        """(n,) int64 ns: when the last byte of each frame was read."""
+        """Return (n,) int64 ns: when the last byte of each frame was read."""
         if framed[0].end > known:
             return np.full(len(framed), time_ns)
-        ends, times = zip(*self._reads, strict=True)  # some were held back behind a false beginning
+        ends, times = zip(*self._reads, strict=True)  # frames were held back behind a false beginning
         found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
         return found
-
-    def _forget_reads(self) -> None:
-        """Keep the times of the bytes that are still held back."""
-        undecided = self._framer.position - self._framer.pending
-        if not self._framer.pending:
-            self._reads.clear()
-        while self._reads and self._reads[0][0] <= undecided:
-            self._reads.pop(0)

@@ -1,11 +1,11 @@
 """The tactile glove of Bielefeld University (TactileGlove, iObject), as its first firmware speaks on a serial line.
 
-Wire format: what the maker's host reads (tactile-filters, ``linux/libio/SerialInput.cpp``). 115200 baud. One packet of
-five bytes for each taxel: ``3C + taxel``, 01, high byte, low byte, 00. The value has twelve bits, the lower four bits
-of the high byte first; what the upper four say is not known. The maker's host shows 4095 - value: pressure lowers it.
+Wire format: the maker's host (tactile-filters, ``linux/libio/SerialInput.cpp``). 115200 baud. One packet of five bytes
+for each taxel: ``3C + taxel``, 01, high byte, low byte, 00. The value has twelve bits, the lower four bits of the high
+byte first; the meaning of the upper four is unknown. The maker's host shows 4095 - value: pressure lowers the value.
 
-There is no checksum, no counter and no command. A packet counts if it has its first, second and last byte, and if
-what follows it is one, too: a packet that lost bytes could otherwise pass with the beginning of the next.
+A packet has no checksum and no counter, and the glove takes no command. A packet counts if its first, second and last
+byte are right, and a packet follows: one that lost bytes could otherwise pass with the beginning of the next.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MOST = 64
 class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    taxels: Annotated[int, msgspec.Meta(description="taxels that there are, numbers 0 on", ge=1, le=_MOST)] = _MOST
+    taxels: Annotated[int, msgspec.Meta(description="number of taxels, counted from 0", ge=1, le=_MOST)] = _MOST
     period_ms: Annotated[int, msgspec.Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
-    """One glove on a serial line. Each taxel has packets of its own and so is a module: it is stale for itself.
+    """One glove on a serial line; uid = taxel. Each taxel has packets of its own: it is a module, and stale alone.
 
     Values are those of the wire (0 is the greatest pressure); ``physical`` is 4095 - value, as the maker shows it.
     """

@@ -1,4 +1,4 @@
-"""What Weiss Robotics' sensors and controllers have in common: their packets, their answers, and what they are asked.
+"""The protocol of Weiss Robotics' sensors and controllers: their packets, their answers, and the check after a reset.
 
 Frames: ``AA AA AA | command | length u16 LE | payload | CRC u16 LE``, with a CRC that is in no catalogue. A response
 has the number of its command and begins with a status, u16 LE.
@@ -7,15 +7,13 @@ has the number of its command and begins with a status, u16 LE.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers
+from skinware_drivers.serial.adapter import Answers, SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet
@@ -25,11 +23,11 @@ _AROUND = 8
 
 
 def weiss_packet(most_payload: int, **more: Any) -> Packet:
-    """The frames of a device.
+    """Return the framing of a device.
 
     Args:
         most_payload: bytes of the longest payload.
-        more: what else is said of a :class:`Packet`.
+        more: further arguments of :class:`Packet`.
     """
     return Packet(
         sync=(0xAA, 0xAA, 0xAA),
@@ -41,23 +39,13 @@ def weiss_packet(most_payload: int, **more: Any) -> Packet:
     )
 
 
-def weiss_answers(device: str, reasons: Mapping[int, str]) -> Answers:
-    """How a device answers.
-
-    Args:
-        device: what it is called.
-        reasons: what its statuses mean.
-    """
-    return Answers(device, reasons, dtype="<u2")
-
-
 class WeissAdapter(SerialAdapter[OptionsT]):
-    """One device, which says itself which cells it has; :meth:`describe` keeps that in ``_cells``.
+    """One device, which reports its cells; :meth:`describe` keeps the report in ``_cells``.
 
     Attributes:
-        packet: its frames.
-        answers: how it answers.
-        timeout_s, tries: how long an answer is waited for, and how often it is asked.
+        packet: its framing.
+        answers: its answers; their status is u16 LE.
+        timeout_s, tries: time to wait for an answer, and number of questions.
     """
 
     packet: ClassVar[Packet]
@@ -71,11 +59,11 @@ class WeissAdapter(SerialAdapter[OptionsT]):
 
     @property
     def payload_size(self) -> int:
-        """Of the most cells: how many there are is known only when it was asked."""
+        """Bytes of the most cells; their number is known only after the device was asked."""
         return -(-self.packet.maximum_body // 8) * 8
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
+        """Return whether the same device answers: then it was reset, and no longer sends by itself."""
         if await self._ask_cells(link, tries=1) == self._cells:
             return True
         self.tell(patch, Notice.CHANGED)
@@ -84,17 +72,17 @@ class WeissAdapter(SerialAdapter[OptionsT]):
     @classmethod
     @abstractmethod
     async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> Any:
-        """Which cells it has."""
+        """Ask for its cells."""
 
     @classmethod
     async def _ask(
         cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int | None = None
     ) -> bytes:
-        """What it answers behind its status.
+        """Send a command and return the answer behind its status.
 
         Raises:
-            Refused: it does not do it.
-            BusError: it does not answer, or too little.
+            Refused: the status is not 0.
+            BusError: no answer, or too short.
         """
         reply = await link.request(
             command, arguments, Match(command), timeout_s=cls.timeout_s, tries=cls.tries if tries is None else tries

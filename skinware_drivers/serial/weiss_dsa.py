@@ -9,8 +9,8 @@ with the CRC of the WTS; a frame without payload has none. An answer begins with
 * ``03 | flags | frames per second u16`` -> error. Flags: 80 acquire, 01 run lengths. Any rate above 0 is the highest.
 * Data: command 0, time in ms u32, flags, cells u16 of 12 bits: matrix by matrix, row by row.
 
-What is not known, and what is done about it: two programs disagree on where run-length coded data begin, so they are
-asked for only if ``rle_offset`` says it. Counts are raw: the library's factor to N/mm2 is that of one measurement.
+Not known: two programs disagree on where run-length coded data begin, so the driver requests them only if
+``rle_offset`` gives the byte. Counts are raw: the library's factor to N/mm2 is that of one measurement.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch, ZeroWatch
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Answers, Refused
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
+from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA, _CONTROLLER, _SENSOR, _ACQUIRE, _MATRIX = 0x00, 0x01, 0x02, 0x03, 0x0B
 _ON, _RLE = 0x80, 0x01
-_PART, _TORN = 0x100, 0x200  # what the frame of a matrix is called, plus its number; and of data that fit none
+_PART, _TORN = 0x100, 0x200  # identifiers of the frame of a matrix, plus its number, and of data that fit none
 _HEADER, _TIME = 5, 4
 _MOST_MATRICES, _MOST_CELLS = 16, 4096
 _FULL = 0xFFF
@@ -64,11 +64,9 @@ class WeissDsaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     rle_offset: Annotated[
         Literal[5, 11] | None,
-        Meta(description="have data run-length coded, and take them from this byte of the payload on: not certain"),
+        Meta(description="request run-length coded data, which begin at this byte of the payload: not certain"),
     ] = None
-    period_ms: Annotated[
-        int, Meta(ge=10, le=1000, description="time between two frames that is to be expected, ms")
-    ] = 100
+    period_ms: Annotated[int, Meta(ge=10, le=1000, description="expected time between two frames, ms")] = 100
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -86,16 +84,16 @@ class _Matrix(NamedTuple):
 
     @property
     def grid(self) -> Grid:
-        """Its cells; with the pitch that it tells, if that can be."""
-        told = math.sqrt(self.width_mm * self.height_mm) / 1e3 if self.width_mm * self.height_mm > 0 else 0.0
-        return Grid(self.rows, self.columns, told if 0.0005 <= told <= 0.05 else PITCH_M)
+        """Its cells, with the pitch that it reports, if that is plausible."""
+        pitch_m = math.sqrt(self.width_mm * self.height_mm) / 1e3 if self.width_mm * self.height_mm > 0 else 0.0
+        return Grid(self.rows, self.columns, pitch_m if 0.0005 <= pitch_m <= 0.05 else PITCH_M)
 
 
 class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
     """One controller; uid = matrix << 12 | cell, row by row."""
 
     packet = _WHOLE
-    answers = weiss_answers("controller", {})
+    answers = Answers("controller", {}, dtype="<u2")
     timeout_s, tries = 1.0, 4  # it is silent for some 8 s after power-up
     framing: Framing = _WHOLE
     commands: Encoding | None = _WHOLE
@@ -110,10 +108,10 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         self._cells: tuple[_Matrix, ...] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the controller for its matrices; it may still be sending for somebody before us.
+        """Ask the controller for its matrices; it may still be sending for an earlier program.
 
         Raises:
-            BusError: it does not answer, says what cannot be, or must not be asked.
+            BusError: it does not answer, its answer is impossible, or it must not be asked.
         """
         if link.listen_only:
             raise BusError("a DSA controller reports its matrices only on request: listening is not enough")
@@ -142,7 +140,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """How many matrices it has; nothing that it is asked stops one that sends."""
+        """Ask for its number of matrices; no question stops a controller that sends."""
         matrices = await cls._ask_cells(link, tries=1)
         return f"Weiss DSA controller with {len(matrices)} matrices"
 
@@ -158,17 +156,17 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
 
     @operation(looks=True)
     async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002
+        """Return serial number, hardware and software version of the controller."""
         answer = await self._ask(link, _CONTROLLER, size=7)
         serial_number, hardware, software = struct.unpack_from("<IBH", answer)
         return {"serial_number": serial_number, "hardware": hardware, "software": software}
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Matrices that tell nothing but 0."""
         return ZeroWatch(tables)
 
     def split(self) -> Split:
-        """How the frames of this controller lie in the stream."""
+        """Return the framing of this controller: a frame for each matrix."""
         return Split(_WHOLE, self._split)
 
     def _split(self, identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
@@ -202,6 +200,6 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
 
 
 def _expanded(coded: bytes) -> bytes:
-    """Run lengths: how often in the upper four bits of each u16, what in the lower twelve."""
+    """Expand run lengths: the count in the upper four bits of each u16, the value in the lower twelve."""
     units = np.frombuffer(coded[: len(coded) // 2 * 2], "<u2")
     return np.repeat(units & _FULL, units >> 12).astype("<u2").tobytes()

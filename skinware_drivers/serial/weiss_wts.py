@@ -1,15 +1,13 @@
-"""Weiss Robotics' WTS tactile sensors, which say themselves how many cells they have.
+"""Weiss Robotics' WTS tactile sensors, which report how many cells they have.
 
 Wire format: the programs wts_driver (github.com/ksatyaki/wts_driver) and wts_ft; where they contradict each other (byte
-order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | payload |
-CRC u16 LE`` over everything before it, with a CRC that is in no catalogue. A response has the number of its command and
-begins with a status, u16 LE. Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
+order of the cells), the former. Frames: see :mod:`.weiss`; the CRC is over everything before it. Data come as command 0
+without a status: time in ms u32 LE, flags u8, cells u16 LE.
 
-What is not known, and what is done about it: the payload of tare; it is sent empty, and the option
-``tare_payload`` changes it. ksatyaki/wts_driver 82c46ac (2016-09-01) declares tare and untare as one command with a
-truth value, and implements neither. System information is not taken apart, the operation ``system`` shows its bytes.
-Data that are run-length coded are documented for another device only, by two programs that disagree on where they
-begin.
+Not known: the payload of tare, which is sent empty unless the option ``tare_payload`` gives one; ksatyaki/wts_driver
+82c46ac (2016-09-01) declares tare and untare as one command with a truth value, and implements neither. The meaning of
+system information: the operation ``system`` returns its bytes. Run-length coded data are documented for another device
+only, by two programs that disagree on where they begin.
 """
 
 from __future__ import annotations
@@ -31,9 +29,9 @@ from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier,
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.adapter import Answers, Refused
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
+from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -41,31 +39,28 @@ _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 
 _HEADER = 5
 _MOST_CELLS = 1024
 _RLE = 1
-_ANSWERS = weiss_answers(
-    "sensor",
-    {
-        7: "a timeout",
-        11: "the command's checksum was wrong on its side",
-        14: "it does not know this command",
-        16: "access is denied",
-        27: "overrun: its line is too slow for its data",
-    },
-)
+_REASONS = {
+    7: "a timeout",
+    11: "the command's checksum was wrong on its side",
+    14: "it does not know this command",
+    16: "access is denied",
+    27: "overrun: its line is too slow for its data",
+}
 
 
 class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver.
 
     Raises:
-        ConfigurationError: an option is out of its limits, or run lengths are wanted and nobody says where they begin.
+        ConfigurationError: an option is out of its limits, or ``rle`` is set without ``rle_offset``.
     """
 
     period_ms: Annotated[int, Meta(ge=1, le=0xFFFF, description="time between two frames, ms")] = 10
-    rle: Annotated[bool, Meta(description="have data run-length coded; needs rle_offset")] = False
+    rle: Annotated[bool, Meta(description="request run-length coded data; needs rle_offset")] = False
     rle_offset: Annotated[
         Literal[5, 11] | None, Meta(description="byte of the payload at which run-length coded data begin: not known")
     ] = None
-    tare_payload: Annotated[str, Meta(description="bytes that the command tare carries, in hexadecimal")] = ""
+    tare_payload: Annotated[str, Meta(description="payload of the command tare, in hexadecimal")] = ""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -84,17 +79,17 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
     """One WTS on a serial line."""
 
     packet = weiss_packet(_HEADER + 2 * _MOST_CELLS)
-    answers = _ANSWERS
+    answers = Answers("sensor", _REASONS, dtype="<u2")
     timeout_s, tries = 0.5, 3
     framing: Framing = packet
     layout: Layout
     dtype: npt.DTypeLike = np.uint16
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the sensor for its matrix; it may still be sending for somebody before us.
+        """Ask the sensor for its matrix; it may still be sending for an earlier program.
 
         Raises:
-            BusError: it does not answer, says what cannot be, or must not be asked.
+            BusError: it does not answer, its answer is impossible, or it must not be asked.
         """
         if link.listen_only:
             raise BusError("a sensor reports its number of cells only on request: listening is not enough")
@@ -118,7 +113,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         await self._ask(link, _START, struct.pack("<BH", _RLE if self.options.rle else 0, self.options.period_ms))
 
     async def stop(self, link: Link) -> None:
-        """Make it silent; one that was silent already may say so."""
+        """Stop the data; a sensor that is silent already may refuse."""
         try:
             await self._ask(link, _STOP)
         except Refused as error:
@@ -126,16 +121,18 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
+        """Take the present values as zero."""
         await self._ask(link, _TARE, bytes.fromhex(self.options.tare_payload))
 
     @operation(looks=True)
     async def temperature(self, link: Link, patches: Sequence[Patch]) -> float:  # noqa: ARG002
+        """Return the temperature of the sensor, degrees Celsius."""
         answer = await self._ask(link, _TEMPERATURE, size=2)
         return int.from_bytes(answer[:2], "little", signed=True) / 10
 
     @operation(looks=True)
     async def system(self, link: Link, patches: Sequence[Patch]) -> str:  # noqa: ARG002
-        """What the sensor says of its hardware and firmware: bytes in hexadecimal, their meaning is not public."""
+        """Return the system information of the sensor: bytes in hexadecimal, whose meaning is not public."""
         return (await self._ask(link, _SYSTEM)).hex(" ")
 
     def _layout(self, count: int) -> Layout:
@@ -151,7 +148,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
 
     @classmethod
     async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> tuple[int, ...]:
-        """Columns, rows, width and height of a cell in 1/100 mm, greatest value."""
+        """Ask for columns, rows, width and height of a cell in 1/100 mm, and the greatest value."""
         return struct.unpack_from("<5H", await cls._ask(link, _MATRIX, size=10, tries=tries))
 
 
@@ -161,7 +158,7 @@ Numbers = npt.NDArray[np.int64]
 def _runs(
     payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8], offset: int, count: int
 ) -> tuple[Numbers, Numbers, npt.NDArray[np.uint16]]:
-    """Units of 16 bits: how often in the upper four, what in the lower twelve."""
+    """Expand units of 16 bits: the count in the upper four, the value in the lower twelve."""
     n_units = (payload.shape[1] - offset) // 2
     units = np.ascontiguousarray(payload[:, offset : offset + 2 * n_units]).view("<u2").astype(np.int64)
     times = np.where(np.arange(n_units) < ((length.astype(np.int64) - offset) // 2)[:, None], units >> 12, 0)

@@ -29,8 +29,7 @@ from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Senti
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers
+from skinware_drivers.serial.adapter import Answers, SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -43,7 +42,7 @@ _DATA, _ANSWER = 0x55, 0x57
 _ROWS, _COLUMNS = 24, 32
 _N = _ROWS * _COLUMNS
 _BODY = 3082
-_TIMEOUT_S, _TRIES = 1.0, 3  # the line stalls for half a second now and then, its maker's program says
+_TIMEOUT_S, _TRIES = 1.0, 3  # the line stalls for half a second now and then, by the maker's program
 _USUAL_HZ = 120.0
 _ANSWERS = Answers(
     "board", {0x10: "bad length", 0x11: "bad checksum", 0x12: "unknown command", 0x13: "bad arguments"}, offset=4
@@ -57,7 +56,7 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ConfigurationError: an option is out of its limits.
     """
 
-    rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: as the board has it")] = 0
+    rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: leave the board's own")] = 0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -105,7 +104,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         self._on = True
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board who it is; who only listens need not know."""
+        """Ask the board which hand it is for; a listener does without."""
         name = "glove"
         if not link.listen_only:
             info, hand = await self._ask(link, _INFO, size=32), await self._ask(link, _HAND, size=1)
@@ -119,7 +118,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Which hand it is for; nothing that it is asked disturbs a board that sends."""
+        """Ask which hand it is for; no question disturbs a board that sends."""
         [patch] = await cls(WujiGloveOptions()).describe(link)
         return f"Wuji {patch.name}"
 
@@ -134,7 +133,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         await self._ask(link, _STREAM, b"\0")
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Whether it answers, unless it is silent because it was told to be."""
+        """Return whether the board answers; False if it was switched off."""
         if not self._on:
             return False
         await self._ask(link, _INFO, size=32, tries=1)
@@ -142,7 +141,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     @operation()
     async def rate(self, link: Link, patches: Sequence[Patch], hz: int) -> float:  # noqa: ARG002
-        """Set the frames per second; returns what it became."""
+        """Set the frames per second; return the rate that the board has now."""
         if not 1 <= hz <= 1000:
             raise ValueError(f"{hz} Hz: give 1 to 1000")
         await self._set_rate(link, hz)
@@ -151,12 +150,13 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     @operation()
     async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:  # noqa: ARG002
+        """Make the board send (on=true) or be silent (on=false)."""
         await self._ask(link, _STREAM, bytes([on]))
         self._on = on
 
     @operation(looks=True)
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, float]:  # noqa: ARG002
-        """What the board counts: uptime_s, frames, checksum_errors, dropouts, usb_resets."""
+        """Return the board's counters: uptime_s, frames, checksum_errors, dropouts, usb_resets."""
         uptime_ms, *counts = struct.unpack_from("<IIIIH", await self._ask(link, _DIAGNOSTICS, size=18))
         names = ("frames", "checksum_errors", "dropouts", "usb_resets")
         return {"uptime_s": uptime_ms / 1000, **dict(zip(names, counts, strict=True))}

@@ -1,1 +1,1 @@
-"""Streams over a network: serial devices behind TCP and UDP, as buses on which every serial driver runs unchanged."""
+"""Buses over a network, on which every serial driver runs unchanged."""

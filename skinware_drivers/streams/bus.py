@@ -1,4 +1,4 @@
-"""Read a stream over a network as a bus: its address, and what TCP, UDP and servers have in common."""
+"""Addresses of network buses, and the bases that TCP, UDP and servers share."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 
 Resolved = tuple[socket.AddressFamily, tuple[str, int]]
-"""Family, and the address as sockets of that family know it (the first two parts)."""
+"""Family, and the first two parts of the address for sockets of that family."""
 
 
 class Address(NamedTuple):
-    """Where something is.
+    """A host and a port.
 
     Attributes:
-        host: name or number; empty: whichever.
+        host: name or number; empty: any.
         port: 0 to 65535.
     """
 
@@ -34,31 +34,31 @@ class Address(NamedTuple):
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
     def resolve(self, kind: socket.SocketKind) -> Resolved:
-        """Look its name up, which may take a while; the first address that there is.
+        """Look the name up, which may take a while; return the first address.
 
         Raises:
             BusNotAvailable: the name is not known now.
         """
+        flags = 0 if self.host else socket.AI_PASSIVE
         try:
-            family, *_, numbers = socket.getaddrinfo(self.host or None, self.port, type=kind, flags=_flags(self.host))[
-                0
-            ]
+            found = socket.getaddrinfo(self.host or None, self.port, type=kind, flags=flags)
         except socket.gaierror as error:
             raise unknown_name(self, error) from None
+        family, *_, numbers = found[0]
         return family, (str(numbers[0]), int(numbers[1]))
 
 
 def parse_address(scheme: str, channel: str, *, default_port: int | None = None, needs_host: bool = True) -> Address:
-    """Take ``HOST:PORT`` or ``[HOST]:PORT`` apart; an IPv6 address stands in brackets.
+    """Parse ``HOST:PORT`` or ``[HOST]:PORT``; an IPv6 address stands in brackets.
 
     Args:
         scheme: for messages, such as ``tcp``.
         channel: of the bus' name.
-        default_port: where none is given; None: one must be.
-        needs_host: whether the host must be given, too.
+        default_port: used if none is given; None: one must be given.
+        needs_host: a host must be given, too.
 
     Raises:
-        ConfigurationError: it is no such address.
+        ConfigurationError: this is no such address.
     """
     try:
         parts = urlsplit(f"//{channel}")
@@ -79,7 +79,7 @@ def parse_address(scheme: str, channel: str, *, default_port: int | None = None,
 
 
 def unknown_name(address: Address, error: socket.gaierror) -> BusNotAvailable:
-    """Nobody knows this host now; that can change."""
+    """Return the error for a host whose name is not known now, which can change."""
     return BusNotAvailable(f"the name {address.host!r} of a host is not known ({error.strerror or error})")
 
 
@@ -88,7 +88,7 @@ def reason_of(error: OSError) -> str:
 
 
 def _mistake(channel: str) -> str:
-    """Those that are usual, in words; empty: another one."""
+    """Name a usual mistake; empty: it is another one."""
     port = channel.rpartition(":")[2]
     if "&" in channel or "=" in channel:
         return "options begin with a question mark"
@@ -97,16 +97,12 @@ def _mistake(channel: str) -> str:
     if "]" in channel and port.endswith("]"):
         return ""
     if not port.isdecimal() and "/" not in port:
-        return f"{port!r} is no number of a port"
+        return f"{port!r} is no port number"
     return "ports have numbers up to 65535" if port.isdecimal() and int(port) > 65535 else ""
 
 
-def _flags(host: str) -> int:
-    return 0 if host else socket.AI_PASSIVE
-
-
 class NetworkBus(SerialBus):
-    """A serial bus that is reached over a network.
+    """A serial bus over a network.
 
     Args:
         channel: ``HOST:PORT``.
@@ -130,18 +126,18 @@ class NetworkBus(SerialBus):
 
     @property
     def baudrate(self) -> int:
-        """0: a network has none."""
+        """0: a network has no baud rate."""
         return 0
 
 
 class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a bus that is a connection to a program that sends by itself."""
+    """Options of a connection to a program that sends by itself."""
 
     patience_s: Annotated[
         int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
     ] = 5
     silence_s: Annotated[
-        float, Meta(ge=0, le=3600, description="seconds without a message until it is connected anew; 0: never")
+        float, Meta(ge=0, le=3600, description="seconds without a message until it is connected again; 0: never")
     ] = 5.0
 
 
@@ -149,10 +145,10 @@ class ServerBus(SerialBus):
     """A program that sends by itself, perhaps to others as well, and is only read.
 
     Args:
-        channel: what the bus' name has after the interface.
+        channel: of the bus' name.
         options: see :class:`ServerOptions`.
         payload_size: longest body that fits into a batch.
-        listen_only: makes no difference: nothing is ever sent.
+        listen_only: makes no difference, because nothing is sent.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.
@@ -167,33 +163,33 @@ class ServerBus(SerialBus):
 
     @property
     def baudrate(self) -> int:
-        """0: a network has none."""
+        """0: a network has no baud rate."""
         return 0
 
     @property
     def reads_natively(self) -> bool:
-        """No: the protocol is spoken in Python."""
+        """False: the protocol is in Python."""
         return False
 
     def open(self) -> None:
         """Connect.
 
         Raises:
-            BusNotAvailable: nobody answers there, or somebody else does.
+            BusNotAvailable: no program answers there, or another one does.
         """
         super().open()
         self._heard_ns = now_ns()
 
     def check(self) -> None:
-        """Whether the other end still says something.
+        """Check that the other end still sends.
 
         Raises:
-            BusNotAvailable: it has not for too long.
+            BusNotAvailable: it has been silent for too long.
         """
         super().check()
         silence_s = self._options.silence_s
         if self._port is not None and silence_s and now_ns() - self._heard_ns > silence_s * NS_PER_S:
-            raise BusNotAvailable(f"{self.name}: connected, but no message for {silence_s:g} s; connecting anew")
+            raise BusNotAvailable(f"{self.name}: connected, but no message for {silence_s:g} s; connecting again")
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Refuse: it is only read.

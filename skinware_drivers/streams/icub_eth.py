@@ -35,19 +35,19 @@ _ITEM, _LONGEST_CAN = 10, 8
 
 
 def rops(port: int) -> Split:
-    """The framing; what it finds are the CAN frames of the skin on a CAN port, 1 or 2."""
+    """Return the framing that finds the CAN frames of the skin on a CAN port, 1 or 2."""
     return Split(_FRAMES, lambda _, operations: _can_frames(operations, _SKIN | (port - 1) << 8))
 
 
 def _can_frames(operations: bytes, wanted: int) -> Iterator[tuple[int, bytes]]:
-    """The CAN frames in those operations of a frame that tell a variable: (identifier, payload)."""
+    """Yield (identifier, payload) of the CAN frames in the operations of a frame that carry a variable."""
     place = 0
     while len(operations) - place >= _HEAD.size:
         control, code, size, variable = _HEAD.unpack_from(operations, place)
         begin = place + _HEAD.size
         place = begin + -(-size // 4) * 4 + (4 if control & _SIGNATURE else 0) + (8 if control & _TIME else 0)
         if control & _VERSION or place > len(operations):
-            return  # where the next one begins is not known
+            return  # the beginning of the next one is not known
         if code in (_SAY, _SIGNAL) and variable == wanted:
             yield from _items(operations[begin : begin + size])
 
@@ -72,7 +72,7 @@ _FRAMES = Packet(
 
 
 class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver; those of ``roboskin`` that matter to who listens.
+    """Options of the driver: the CAN port, and those of ``roboskin`` that matter while only listening.
 
     Raises:
         ConfigurationError: an option is out of its limits.
@@ -91,10 +91,10 @@ class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         self.of_roboskin()
 
     def of_roboskin(self) -> RoboskinOptions:
-        """As the driver of the boards on CAN knows them.
+        """Return them as options of the driver of the boards on CAN.
 
         Raises:
-            ConfigurationError: they are none.
+            ConfigurationError: an option is out of its limits.
         """
         given = msgspec.structs.asdict(self)
         del given["port"]
@@ -121,7 +121,7 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
         return self.payload_bytes
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn from the data which boards and modules there are.
+        """Learn the boards and modules from the data.
 
         Raises:
             BusError: there are no skin data.
@@ -135,7 +135,7 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
         return self._boards.patches_heard(await link.listen(self.options.learn_s), known)
 
     async def revive(self, link: Link, patch: Patch) -> None:
-        """Wait: nobody but the robot's program sets a board up."""
+        """Wait: only the robot's program sets a board up."""
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:

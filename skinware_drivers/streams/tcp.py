@@ -1,8 +1,7 @@
-"""A stream of bytes over TCP as a bus; what is in it is found by the framings of serial lines.
+"""A stream of bytes over TCP as a bus, with the framings of serial lines.
 
-A connection that the other end closes is lost as a serial port is when it is unplugged, and is opened again with the
-same pauses. One whose other end has gone without a word (its plug was pulled, its cable cut) is noticed because the
-kernel asks it now and then whether it is still there.
+A connection that the other end closes counts as lost, like an unplugged serial port, and is opened again with the same
+pauses. The kernel asks the other end now and then whether it is still there, which shows a pulled plug.
 """
 
 from __future__ import annotations
@@ -49,19 +48,23 @@ class TcpPort(DescriptorPort):
         keep_alive(connection, patience_s)
 
     def gone(self, number: int) -> BusNotAvailable:
-        """What an error of the system means; 0: the other end has closed the connection."""
+        """Return the meaning of an error of the system; 0: the other end has closed the connection."""
         why = os.strerror(number) if number else "closed by the other end"
         return BusNotAvailable(f"{self._name}: the connection is lost ({why})")
 
 
 class ListeningPort(Port):
-    """The device's end: waits to be called, by one at a time. Others are hung up on while the first is there.
+    """The device's end: accepts one caller at a time, and closes the connections of others.
 
-    What is written while nobody is connected is for nobody, as on a line that nobody listens to.
+    Bytes that are written without a caller are dropped, as on a serial line without a reader.
 
     Args:
-        address: at which it listens; port 0: any that is free, which ``note`` tells.
+        address: at which to listen; port 0: any that is free, which ``note`` shows.
         patience_s: seconds without a sign of the caller until it is given up.
+
+    Attributes:
+        caller: the connection; None: there is none.
+        address: at which it listens.
 
     Raises:
         BusNotAvailable: it cannot listen there.
@@ -77,23 +80,19 @@ class ListeningPort(Port):
         self._listener.setblocking(False)
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
-        self._caller: socket.socket | None = None
+        self.caller: socket.socket | None = None
         self.address = Address(*self._listener.getsockname()[:2])
         self.note: str = f"listens on {self.address}"
-
-    @property
-    def caller(self) -> socket.socket | None:
-        return self._caller
 
     def fileno(self) -> int:
         return self._epoll.fileno()
 
     def read(self, size: int) -> bytes:
         self._answer_callers()
-        if self._caller is None:
+        if self.caller is None:
             return b""
         try:
-            data = self._caller.recv(size)
+            data = self.caller.recv(size)
         except BlockingIOError:
             return b""
         except OSError:
@@ -103,18 +102,18 @@ class ListeningPort(Port):
         return data
 
     def write(self, data: bytes) -> int:
-        """What fits into the kernel's buffer."""
-        if self._caller is None:
+        """Write as much as fits into the kernel's buffer."""
+        if self.caller is None:
             return len(data)
         try:
-            written = self._caller.send(data)
+            written = self.caller.send(data)
         except BlockingIOError:
             written = 0
         except OSError:
             self._hang_up()
             return len(data)
         more = select.EPOLLOUT if written < len(data) else 0
-        self._epoll.modify(self._caller, select.EPOLLIN | more)  # which makes the epoll's own descriptor readable
+        self._epoll.modify(self.caller, select.EPOLLIN | more)  # makes the epoll's own descriptor readable
         return written
 
     def close(self) -> None:
@@ -128,27 +127,25 @@ class ListeningPort(Port):
                 caller, _ = self._listener.accept()
             except (BlockingIOError, ConnectionError):
                 return
-            if self._caller is not None and _has_gone(self._caller):
+            if self.caller is not None and _has_gone(self.caller):
                 self._hang_up()
-            if self._caller is not None:
+            if self.caller is not None:
                 caller.close()
                 continue
             caller.setblocking(False)
             keep_alive(caller, self._patience_s)
             self._epoll.register(caller, select.EPOLLIN)
-            self._caller = caller
+            self.caller = caller
 
     def _hang_up(self) -> None:
-        if self._caller is not None:
+        if self.caller is not None:
             with contextlib.suppress(OSError):
-                self._epoll.unregister(self._caller)
-            self._caller.close()
-            self._caller = None
+                self._epoll.unregister(self.caller)
+            self.caller.close()
+            self.caller = None
 
 
 class _TcpEnd(NetworkBus):
-    """An end of a connection."""
-
     scheme: ClassVar[str] = "tcp"
 
     def __init__(
@@ -161,7 +158,7 @@ class _TcpEnd(NetworkBus):
 class TcpServerBus(_TcpEnd):
     """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
 
-    ``note`` tells where it listens.
+    ``note`` shows where it listens.
 
     Raises:
         ConfigurationError: no such address, or an option is unknown or has a bad value.
@@ -192,10 +189,10 @@ class TcpBus(_TcpEnd):
 
 
 def connect(address: Address) -> socket.socket:
-    """Call a device; blocks for seconds if it does not answer.
+    """Connect to a device; blocks for seconds if it does not answer.
 
     Raises:
-        BusNotAvailable: its name is not known, it does not answer, or nobody listens at that port.
+        BusNotAvailable: its name is not known, it does not answer, or nothing listens at that port.
     """
     where = f"tcp://{address}"
     try:
@@ -208,14 +205,14 @@ def connect(address: Address) -> socket.socket:
         raise BusNotAvailable(f"{where}: no answer within {_CONNECTING_S:g} s") from None
     except OSError as error:
         raise BusNotAvailable(f"{where}: {error.strerror or error}") from None
-    if connection.getsockname() == connection.getpeername():  # a local port nobody listens at, and we happened to get
+    if connection.getsockname() == connection.getpeername():  # the free local port that the kernel gave us
         connection.close()
         raise BusNotAvailable(f"{where}: nothing listens at this port")
     return connection
 
 
 def keep_alive(connection: socket.socket, patience_s: int) -> None:
-    """Send what is written at once, and have the kernel give up another end of which there is no sign for so long."""
+    """Send what is written at once, and let the kernel give up another end after a time without a sign of it."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, patience_s // 2))

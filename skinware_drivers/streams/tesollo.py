@@ -3,16 +3,16 @@
 Wire format: the maker's program dg_tcp_comm (github.com/tesollodelto/dg_tcp_comm, BSD-3), commits of 2026. TCP port
 502, but no Modbus. Everything is big-endian: ``length u16 of all | command u8 | ...``. There is no checksum.
 
-* ``00 03 08`` -> ``00 09 08 | model u16 | firmware 2 bytes | kind of sensors u8 | fingers that have one u8``; firmware
-  before that: ``00 07 08 | model u16 | firmware``.
+* ``00 03 08`` -> ``00 09 08 | model u16 | firmware 2 bytes | kind of sensors u8 | fingers that have one u8``; older
+  firmware: ``00 07 08 | model u16 | firmware``.
 * ``length 01 | what ...`` with what = 1 joints, 2 currents, 3 temperatures, 4 velocities, 5 fingertips, 6 GPIO ->
   ``length 01 | 8 bytes for each motor | each finger's sensor | GPIO``. The program always asks for 1 to 4, or 1 to 5.
-* ``00 03 0B``: the force sensors take what they feel as zero; the program waits for no answer.
+* ``00 03 0B``: the force sensors take their present values as zero; the program waits for no answer.
 * Force sensors of three axes send (x, y, z, nc, nc, nc), of four axes (x, y, z, nc, nc, tz): commit 116a684
   (2026-03-26).
 
-Where it contradicts itself: one commit (8c85809) expects bytes of all fingers, another (0ea90ef) only of those that
-have a sensor. The length tells which, so both are read.
+The program contradicts itself: one commit (8c85809) expects bytes of all fingers, another (0ea90ef) only of those that
+have a sensor. The length shows which, so both are read.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _ASK, _VERSION, _OFFSET = 0x01, 0x08, 0x0B
 _FINGERTIPS = 5
 _EVERYTHING = bytes((1, 2, 3, 4, _FINGERTIPS))
-_FINGER = 0x100  # what the frame of a finger is called, plus its number from 0
+_FINGER = 0x100  # identifier of the frame of finger 0
 _HEADER, _MOTOR = 3, 8
 _VERSIONS = frozenset({(_VERSION, 7), (_VERSION, 9)})
 _TIMEOUT_S, _TRIES = 1.0, 3
@@ -82,7 +82,7 @@ _MODELS = {
 
 
 class _Tip(NamedTuple):
-    """A fingertip: cells in a grid, or (without one) axes of a force sensor."""
+    """A fingertip: cells in a grid or, without a grid, axes of a force sensor."""
 
     name: str
     dtype: str
@@ -103,7 +103,7 @@ _TIPS = {
 }
 _FORCES = ["force_x", "force_y", "force_z"]
 _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
-"""What sensors of fewer than six axes measure; what they send of the others is not connected."""
+"""Axes of sensors that have fewer than six; their other values are not connected."""
 
 
 class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -117,11 +117,11 @@ class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
     ask: Annotated[
         Literal["everything", "fingertips"],
-        Meta(description="everything, as the maker's program does; or fingertips alone: not documented, but shorter"),
+        Meta(description="everything, as the maker's program asks; or fingertips alone: shorter, not documented"),
     ] = "everything"
     sensors: Annotated[
         Literal[0, 1, 2, 3, 4, 5],
-        Meta(description="kind of sensors, of hands whose firmware does not tell; 0: the hand tells"),
+        Meta(description="kind of sensors, for hands whose firmware does not report it; 0: ask the hand"),
     ] = 0
     cells: Annotated[
         Literal["by_row", "by_column"], Meta(description="order in which a grid's cells are sent: not documented")
@@ -132,7 +132,7 @@ class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Hand(NamedTuple):
-    """What the hand says it is."""
+    """The hand, as it reports itself."""
 
     model: int
     firmware: bytes
@@ -157,7 +157,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
     @property
     def payload_size(self) -> int:
-        """Of the longest answer: which hand it is, is known only when it was asked."""
+        """Bytes of the longest answer of any hand: the model is known only after it was asked."""
         return -(-_MOST_BODY // 8) * 8
 
     @property
@@ -166,7 +166,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return [Poll(_ASK, what, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand which model it is, and which sensors it has.
+        """Ask the hand for its model and its sensors.
 
         Raises:
             BusError: it does not answer, has no sensors, is not known, or must not be asked.
@@ -198,7 +198,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Its model; the question disturbs nothing. Devices on serial lines are not asked: no hand is there."""
+        """Ask for the model, which disturbs nothing; serial lines are not asked, because no hand has one."""
         if "tcp://" not in link.bus_name:
             return None
         hand = await cls(TesolloOptions(sensors=1))._ask_version(link)  # noqa: SLF001
@@ -212,12 +212,12 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Fingertips that tell nothing but 0."""
+        """Watch for fingertips that send only 0."""
         return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Have the force sensors take what they feel as zero; tactile sensors have no such command."""
+        """Let the force sensors take their present values as zero; tactile sensors have no such command."""
         if self._hand is None or _TIPS[self._hand.sensors].grid is not None:
             raise BusError("only hands with force sensors can be tared")
         await link.send(_OFFSET, b"")
@@ -231,13 +231,13 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         fingers = tuple(finger for finger in range(_MODELS[model].fingers) if fitted >> finger & 1)
         name = f"the hand ({_MODELS[model].name})"
         if len(body) < 6 and not sensors:
-            raise BusError(f"{name} has a firmware that does not tell which sensors it has: say sensors")
+            raise BusError(f"{name} has a firmware that does not report its sensors: say sensors")
         if sensors not in _TIPS or not fingers:
             raise BusError(f"{name} says it has no sensors in its fingertips")
         return _Hand(model, body[2:4], sensors, fingers)
 
     def _channels(self, sensors: int) -> tuple[Sequence[SensorType], list[str | None]]:
-        """The types of a fingertip, and which of them each of its values is; None: what it does not measure."""
+        """Return the types of a fingertip, and the type name of each value; None: it is not measured."""
         tip = _TIPS[sensors]
         if tip.grid is not None:
             most = np.iinfo(np.dtype(tip.dtype)).max
@@ -253,7 +253,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return [columns * row + column for column in range(columns) for row in range(rows)]
 
     def _framing(self, hand: _Hand) -> Framing:
-        """The answers of this hand: with bytes of all its fingers, or only of those that have a sensor."""
+        """Return the framing of this hand's answers, with bytes of all fingers or only of those with a sensor."""
         model, tip = _MODELS[hand.model], _TIPS[hand.sensors]
         start = _MOTOR * model.motors if self.options.ask == "everything" else 0
         answers = {}
@@ -283,7 +283,7 @@ def _name_of(model: _Model, finger: int) -> str:
 
 
 def _geometry(model: _Model, tip: _Tip, fitted: Sequence[int], type_names: Sequence[str]) -> Geometry:
-    """Nominal places: the fingers of a hand that has fewer are the first ones of a human's."""
+    """Return nominal places: the fingers of a hand with fewer than five are the first ones of a human hand."""
     grid = tip.grid or Grid(1, 1)
     places = []
     for finger in fitted:

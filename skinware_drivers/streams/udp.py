@@ -1,7 +1,7 @@
-"""Datagrams as a bus: what is in each is found by the framings of serial lines, or is a frame as it is.
+"""Datagrams as a bus: each is a frame, or holds frames that a framing of serial lines finds.
 
-Who sends is known from the address, and only one is heard. The network may lose datagrams, and may bring them in
-another order: where a protocol numbers its frames, its layout says so, and what is lost is counted.
+Only one other end is heard, which its address identifies. The network may lose and reorder datagrams; where a protocol
+numbers its frames and the layout says so, missing ones are counted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skinware_drivers.streams.bus import Address, NetworkBus
 
 _RECEIVE_BUFFER = 1 << 20
 _MOST_DATAGRAMS = 512
-"""Datagrams of a take, before other buses have their turn."""
+"""Datagrams of a take, before other buses get their turn."""
 _SILENT_NS = 2 * NS_PER_S
 _ANY_HOST = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
@@ -33,7 +33,7 @@ class UdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     local: Annotated[
         Annotated[int, Meta(ge=1, le=65535)] | None,
-        Meta(description="port of this computer, for devices that send to a certain one; default: any that is free"),
+        Meta(description="port of this computer, for devices that send to a fixed one; default: any that is free"),
     ] = None
 
 
@@ -41,12 +41,12 @@ class UdpPort(Port):
     """A socket for datagrams, and the one other end that is heard.
 
     Args:
-        address: with a host: of the other end; without: the port of this computer, to which one will speak.
+        address: with a host: of the other end; without: the port of this computer.
         local: port of this computer, if the other end is given.
 
     Attributes:
-        foreign: datagrams of others, which were dropped.
-        peer: the other end; None: nobody has spoken yet.
+        foreign: datagrams of other senders, which were dropped.
+        peer: the other end; None: none has sent yet.
 
     Raises:
         BusNotAvailable: the name of the host is not known, or the port is taken.
@@ -78,7 +78,7 @@ class UdpPort(Port):
         return self._socket.fileno()
 
     def read(self, size: int) -> bytes:
-        """The next datagram of the other end; none if there is none. Empty ones do not count.
+        """Return the next datagram of the other end, or nothing; empty ones do not count.
 
         Raises:
             BusNotAvailable: the socket cannot be used any more.
@@ -96,21 +96,21 @@ class UdpPort(Port):
                 return data
 
     def write(self, data: bytes) -> int:
-        """Send one datagram; while nobody has spoken yet, it is for nobody."""
+        """Send one datagram; drop it while no other end is known."""
         if self.peer is None:
             return len(data)
         try:
             return self._socket.sendto(data, self.peer)
         except BlockingIOError:
             return 0
-        except ConnectionRefusedError:  # of a datagram before
+        except ConnectionRefusedError:  # the answer to an earlier datagram
             return self._socket.sendto(data, self.peer)
 
     def close(self) -> None:
         self._socket.close()
 
     def _is_heard(self, sender: tuple[str, int]) -> bool:
-        """Where the other end is not given it is who speaks first; another one only after a silence of two seconds."""
+        """Return whether a sender is the other end: as given, or the first to send, until it is silent for 2 s."""
         time_ns = now_ns()
         if self._may_change and sender != self.peer and time_ns - self._heard_ns > _SILENT_NS:
             self.peer = sender
@@ -122,11 +122,11 @@ class UdpPort(Port):
 class UdpBus(NetworkBus):
     """Datagrams to and from one other end. Its name is ``udp://HOST:PORT`` or ``udp://:PORT``, with ``?key=value``.
 
-    With a host: what is sent goes there, and only what comes from there (that host and port) is received. Without one,
-    PORT is that of this computer, and the other end is who speaks first. Datagrams of others are counted as refused.
+    With a host, datagrams go to that host and port, and only its datagrams are received. Without one, PORT is that of
+    this computer, and the first sender is the other end. Datagrams of other senders are counted as refused.
 
-    A framing finds frames in what datagrams contain one after the other, as converters of serial lines send it. With
-    ``Unframed`` each datagram is a frame.
+    A framing finds frames in the joined content of the datagrams, as converters of serial lines send it. With
+    ``Unframed``, each datagram is a frame.
 
     Args:
         channel: ``HOST:PORT`` or ``:PORT``.
@@ -151,7 +151,7 @@ class UdpBus(NetworkBus):
 
     @property
     def reads_natively(self) -> bool:
-        """No: who has sent a datagram is looked at in Python."""
+        """False: the sender of a datagram is examined in Python."""
         return False
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
@@ -173,7 +173,7 @@ class UdpBus(NetworkBus):
         return self._udp
 
     def _read(self, port: Port) -> None:
-        """One datagram: never two as one."""
+        """Read one datagram, never two as one."""
         if datagram := port.read(CHUNK):
             self._hear(datagram, now_ns())
         if self._udp is not None:

@@ -1,4 +1,4 @@
-"""A websocket server as a bus that is only read: each of its messages is a line of a stream."""
+"""Read a websocket server as a bus: each of its messages is a line of a stream."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from skinware_drivers.serial.ports import Port
 from skinware_drivers.streams.bus import ServerBus, parse_address
 
 if TYPE_CHECKING:
-    from skinware_drivers.streams.websocket_port import WebSocketPort
+    from skinware_drivers.streams.websocket_ends import WebSocketPort
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _HTTP = 80
 _MOST_MESSAGES = 256
-"""Messages of a take, before other buses have their turn."""
+"""Messages of a take, before other buses get their turn."""
 
 
 def split_url(channel: str) -> str:
-    """Host and port of a URL.
+    """Return host and port of a URL.
 
     Raises:
-        ConfigurationError: it is none of a websocket without encryption.
+        ConfigurationError: this is no URL of a websocket without encryption.
     """
     parts = urlsplit(channel)
     if parts.scheme != "ws":
@@ -42,9 +42,8 @@ def _need_package(name: str) -> None:
 
 
 def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    """A server; see :class:`skinware_drivers.streams.websocket_serving.WebSocketServerBus`."""
     _need_package(f"bus websocket:{channel}")
-    from skinware_drivers.streams.websocket_serving import WebSocketServerBus
+    from skinware_drivers.streams.websocket_ends import WebSocketServerBus
 
     return WebSocketServerBus(channel, options, **more)
 
@@ -52,15 +51,15 @@ def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any
 class WebSocketBus(ServerBus):
     """A connection to a websocket server. Its name is ``websocket:ws://HOST:PORT/PATH?key=value``.
 
-    A framing finds frames in its messages, each of which ends with an end of line (those within it become spaces).
-    Messages of 64 KiB and more, and what is left of one when the connection breaks, are counted as refused. A server
-    that closes the connection, or sends no message for ``silence_s``, is connected to again, after growing pauses.
+    A framing finds frames in its messages. Each gets an end of line, and those within it become spaces. Messages of
+    64 KiB and more, and one that breaks off with the connection, are counted as refused. After a server has closed the
+    connection, or sent no message for ``silence_s``, it is connected to again after growing pauses.
 
     Args:
         channel: the URL.
         options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
         payload_size: longest body that fits into a batch.
-        listen_only: makes no difference: nothing is ever sent.
+        listen_only: makes no difference, because nothing is sent.
 
     Raises:
         ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.
@@ -85,7 +84,7 @@ class WebSocketBus(ServerBus):
         """Connect; a message that came with the server's greeting is read at once.
 
         Raises:
-            BusNotAvailable: nobody answers there, or no websocket server.
+            BusNotAvailable: no websocket server answers there.
         """
         super().open()
         self._stay_readable(self._web is not None and self._web.waiting > 0)
@@ -94,7 +93,7 @@ class WebSocketBus(ServerBus):
         """Append the frames of the messages that have arrived, at most ``batch.free``.
 
         Raises:
-            BusNotAvailable: the connection is closed; the message says by whom, and with which code.
+            BusNotAvailable: the connection is closed; the message says by which end, and with which code.
         """
         taken, more = 0, True
         for _ in range(_MOST_MESSAGES):
@@ -114,7 +113,7 @@ class WebSocketBus(ServerBus):
         return taken
 
     def _open_port(self) -> Port:
-        from skinware_drivers.streams.websocket_port import WebSocketPort
+        from skinware_drivers.streams.websocket_ends import WebSocketPort
 
         self._web = WebSocketPort(self.channel, self._address, self._options.patience_s)
         return self._web
@@ -129,5 +128,5 @@ class WebSocketBus(ServerBus):
         self.counters.refused += self._web.unusable
         self._web.unusable = 0
         if not self._unusable:
-            log.warning("%s: messages that are too long, or broke off, are left out (logged once)", self.name)
+            log.warning("%s: messages that are too long or broke off are left out (logged once)", self.name)
         self._unusable += 1

@@ -1,9 +1,9 @@
-"""Messages of XELA's server: JSON, one message a line; taken apart into one frame for each sensor.
+"""XELA's server: JSON messages, one a line, that become one frame for each sensor.
 
-A frame has the number of its sensor as identifier, and as body the time in ms u32, then x, y and z of each taxel,
-float32, all little-endian. Where the server tells forces they are these; where it does not, the raw counts, and the
-identifier has the bit ``RAW``. Whenever a sensor is new, or is not what it was, and now and then, a frame with the
-identifier 0 tells all that were seen so far, as JSON: ``{number: [model, taxels, whether forces are told]}``.
+The identifier of a frame is the number of its sensor. The body is the time in ms (u32), then x, y and z of each taxel
+(float32), all little-endian: forces if the server sends them, else raw counts, with the bit ``RAW`` in the identifier.
+When a sensor is new or has changed, and now and then, a frame with the identifier 0 lists all sensors seen so far, as
+JSON: ``{number: [model, taxels, whether it sends forces]}``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Notice, Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
@@ -42,17 +42,17 @@ RAW = 0x400
 _AXES = 3
 _MOST_TEXT = 64
 _LONGEST = 1 << 17
-_TELL_EVERY = 256
+_LIST_EVERY = 256
 _U16 = 0xFFFF
 _U32 = 0xFFFF_FFFF
 
 Seen = dict[str, tuple[str, int, bool]]
-"""By number of the sensor: model, taxels, whether it tells forces."""
+"""By number of the sensor: model, taxels, whether it sends forces."""
 
 
 @dataclass(frozen=True)
 class XelaMessages(Framing):
-    """The framing; only to be received."""
+    """The framing, for receiving only."""
 
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
@@ -60,7 +60,7 @@ class XelaMessages(Framing):
         return _Messages()
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Refuse: the server is told nothing.
+        """Refuse: nothing is sent to the server.
 
         Raises:
             ValueError: always.
@@ -72,7 +72,7 @@ class _Messages(Framer):
     def __init__(self) -> None:
         super().__init__()
         self._seen: Seen = {}
-        self._untold = 0  # messages since it was last told what was seen
+        self._unlisted = 0  # messages since the last list of sensors
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         *lines, rest = stream.split(b"\n")
@@ -88,7 +88,7 @@ class _Messages(Framer):
         return found, done
 
     def _count(self, line: bytes, is_good: bool | None) -> None:
-        """Every byte of a line, once: of a message with values, of one without, or of none."""
+        """Count a line: as a message with values (True), without (None), or as no message (False)."""
         counters = self.counters
         if is_good:
             counters.frame_bytes += len(line) + 1
@@ -99,7 +99,7 @@ class _Messages(Framer):
             counters.skipped_bytes += len(line) + 1
 
     def _take_apart(self, line: bytes, end: int, found: list[Framed]) -> bool | None:
-        """Find the frames of a message; None: it is in order and has no sensor, as the first one of a connection."""
+        """Append the frames of a message to ``found``; return None for one without sensors, False for a bad one."""
         try:
             message = msgspec.json.decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -121,16 +121,16 @@ class _Messages(Framer):
             frames.append(Framed(identifier, body, end))
             if self._seen.get(number) != seen:
                 is_news, self._seen[number] = True, seen
-        self._untold += 1
-        if frames and (is_news or self._untold >= _TELL_EVERY) and len(self._seen) <= MOST_SENSORS:
-            self._untold = 0
+        self._unlisted += 1
+        if frames and (is_news or self._unlisted >= _LIST_EVERY) and len(self._seen) <= MOST_SENSORS:
+            self._unlisted = 0
             found.append(Framed(0, msgspec.json.encode(self._seen), end))
         found += frames
         return is_good or bool(frames)
 
 
 def _sensor(key: str, sensor: Any, time: Any) -> tuple[int, tuple[str, int, bool], bytes] | None:
-    """Identifier, what the sensor is, and body; None if it makes no sense."""
+    """Return identifier, description and body of a sensor; None if they make no sense."""
     if not isinstance(sensor, dict) or not 1 <= (number := int(key[:9])) <= 255 or key != str(number):
         return None
     model, taxels, time = sensor.get("model"), sensor.get("taxels"), sensor.get("time", time)
@@ -150,7 +150,7 @@ def _sensor(key: str, sensor: Any, time: Any) -> tuple[int, tuple[str, int, bool
 
 
 def _counts(sensor: dict[str, Any]) -> list[int] | None:
-    """Raw counts: hexadecimal numbers with commas between them, or (newer servers also) a list."""
+    """Return the raw counts, from hexadecimal numbers with commas or (newer servers also) a list."""
     data = sensor.get("data")
     try:
         values = [int(text, 16) for text in data.split(",")] if isinstance(data, str) else sensor.get("integer")
@@ -187,7 +187,7 @@ class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     ] = 0.3
     grids: Annotated[
         tuple[str, ...],
-        Meta(description="rows and columns of sensors whose model does not tell them, as 2=5x6 for sensor 2"),
+        Meta(description="rows and columns of sensors whose model name lacks them, as 2=5x6 for sensor 2"),
     ] = ()
 
     def __post_init__(self) -> None:
@@ -197,10 +197,10 @@ class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
                 raise ConfigurationError(f"option grids: {text!r}: write NUMBER=ROWSxCOLUMNS, as 2=5x6")
 
     def grid(self, number: int, model: str, count: int) -> Grid | None:
-        """How the taxels of a sensor are arranged; None: nobody has said, or what was said does not fit."""
-        said = {int(match[1]): match for text in self.grids if (match := _GRID_TEXT.fullmatch(text))}
-        match = said.get(number)
-        rows, columns = (int(match[2]), int(match[3])) if match else _of_model(model)
+        """Return the grid of a sensor's taxels, by the options or its model; None: unknown, or it does not fit."""
+        given = {int(match[1]): match.groups()[1:] for text in self.grids if (match := _GRID_TEXT.fullmatch(text))}
+        match = _GRID_OF.fullmatch(model)
+        rows, columns = map(int, given.get(number, match.groups() if match else (0, 0)))
         return Grid(rows, columns, _PITCH_M) if rows * columns == count else None
 
 
@@ -223,22 +223,22 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         return -(-self.framing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn from the first messages which sensors there are.
+        """Learn the sensors from the first messages.
 
         Raises:
             BusError: there are no messages with sensors.
         """
-        with link.follow(_STRUCTURE) as told:
-            self.change_framing(XelaMessages())  # which tells them anew
+        with link.follow(_STRUCTURE) as lists:
+            self.change_framing(XelaMessages())  # lists them again
             try:
                 async with asyncio.timeout(_FIRST_S):
-                    seen = _read(await told.get())
+                    seen = _read(await lists.get())
             except TimeoutError:
                 raise BusError(f"{link.bus_name}: no message with a sensor within {_FIRST_S:g} s") from None
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self.options.learn_s):
                     while True:
-                        seen = _read(await told.get())
+                        seen = _read(await lists.get())
         for number, (model, count, has_forces) in seen.items():
             what = "forces" if has_forces else "counts; for newtons: calibration = on in xServ.ini, if it has the model"
             log.info("%s: sensor %s: %s, %d taxels, %s", link.bus_name, number, model, count, what)
@@ -247,22 +247,22 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Which sensors the server has; nobody else is waited for."""
+        """Return the sensors of the server; other buses are not waited for."""
         if "websocket:" not in link.bus_name:
             return None
         patches = await cls(XelaServerOptions()).describe(link)
         return f"XELA's server with {', '.join(patch.name for patch in patches)}"
 
     async def attend(self, link: Link) -> None:
-        with link.follow(_STRUCTURE) as told:
+        with link.follow(_STRUCTURE) as lists:
             while True:
-                seen = _read(await told.get())
+                seen = _read(await lists.get())
                 if any(self._known.get(number) != sensor for number, sensor in seen.items()):
                     self.tell(self._describe(self._known)[0], Notice.CHANGED)
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """Sensors that tell nothing but 0."""
+        """Watch for sensors that send only 0."""
         return ZeroWatch(tables)
 
     def _describe(self, seen: Seen) -> list[Patch]:
@@ -294,11 +294,5 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         return patches
 
 
-def _read(told: object) -> Seen:
-    payload: bytes = told.payload  # type: ignore[attr-defined]
-    return msgspec.json.decode(payload, type=Seen)
-
-
-def _of_model(model: str) -> tuple[int, int]:
-    match = _GRID_OF.fullmatch(model)
-    return (int(match[1]), int(match[2])) if match else (0, 0)
+def _read(frame: Reply) -> Seen:
+    return msgspec.json.decode(frame.payload, type=Seen)

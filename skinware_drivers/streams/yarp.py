@@ -1,11 +1,11 @@
-"""The skin ports of a robot that runs YARP, as iCub: one vector of values a message, over YARP's carrier ``fast_tcp``.
+"""The skin ports of a robot that runs YARP, such as iCub: one vector of values a message, in the carrier ``fast_tcp``.
 
-Which values there are, and where, the port does not say: the robot's files do (``skin-import icub --yarp``). What is in
-a message: ``yarp_messages``. How the port is found, and read: ``yarp_bus``.
+The port does not say which sensors its values belong to; the robot's files do (``skin-import icub --yarp``). The module
+``yarp_messages`` parses messages, ``yarp_bus`` finds and reads the port.
 
-Values, by robotology/icub-main: the port of a part (``/icub/skin/left_hand``) has what its boards send, 0 to 255, where
-less is more pressure, and unused triangles have a place too. The ports of skinManager (``/icub/skin/left_hand_comp``)
-have what is left of it beyond the baseline: 0 at rest, up to 255.
+By robotology/icub-main, the port of a part (``/icub/skin/left_hand``) has the values of its boards, 0 to 255, where
+less is more pressure and unused triangles have a place too. The ports of skinManager (``/icub/skin/left_hand_comp``)
+have the rest of it beyond the baseline: 0 at rest, up to 255.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from skinware_drivers.streams.yarp_messages import LENGTH, MOST_VALUES, PLAIN, T
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_S = 5.0
-_TOLD_LENGTH = Match(LENGTH << 8)
+_LENGTHS = Match(LENGTH << 8)
 _KIND = 0x700
 _OF_A_BOARD = TRIANGLES * CHANNELS
 _MOST_PATCHES = 16
@@ -55,10 +55,10 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         board: its address, for people.
-        first: place of the first value of its triangle 0, also if that is not there; less than 0: before the vector.
-        triangles: which.
+        first: place of the first value of its triangle 0, even if that is missing; below 0: before the vector.
+        triangles: their numbers.
         kind: ``triangle``, ``fingertip`` or ``palm``.
-        thermal: channels that feel no touch, if others than the kind's own.
+        thermal: channels that feel no touch, unless they are those of the kind.
     """
 
     board: int
@@ -83,15 +83,15 @@ class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     values: Annotated[
         Literal["compensated", "raw"],
-        Meta(description="what the port sends: compensated, 0 is no touch; raw, as the boards, less is more pressure"),
+        Meta(description="compensated: 0 is no touch; raw: the values of the boards, where less is more pressure"),
     ] = "compensated"
     length: Annotated[
-        int, Meta(ge=0, le=MOST_VALUES, description="values of a message; 0: as many as the port is found to send")
+        int, Meta(ge=0, le=MOST_VALUES, description="values of a message; 0: as many as the port sends")
     ] = 0
     period_ms: Annotated[float, Meta(ge=1, le=10_000, description="nominal time between two messages, ms")] = 20
     triangles: Annotated[
         tuple[Triangles, ...],
-        Meta(description="which values are which triangles (configuration file only, as skin-import writes it)"),
+        Meta(description="places of the triangles in a message (configuration file only, as skin-import writes it)"),
     ] = ()
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class YarpDriver(SerialAdapter[YarpOptions]):
-    """One port. A patch is a board, or sixteen times twelve values where nobody says so; uid = place in the vector."""
+    """One port. A patch is a board, or 16 x 12 values where the options name no boards; uid = place in the vector."""
 
     framing: Framing = YarpMessages()
     dtype: npt.DTypeLike = np.float32
@@ -142,10 +142,10 @@ class YarpDriver(SerialAdapter[YarpOptions]):
         self._described: Sequence[Patch] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """As the options say, or by the number of values that the port sends.
+        """Return the boards of the options, or patches for as many values as the port sends.
 
         Raises:
-            BusError: it has to be heard, and there is no message.
+            BusError: the number of values is not known, and no message comes.
         """
         if self.options.triangles:
             self._described, parts = self._of_boards()
@@ -157,9 +157,9 @@ class YarpDriver(SerialAdapter[YarpOptions]):
 
     async def attend(self, link: Link) -> None:
         """Notice when the port sends another number of values."""
-        with link.follow(_TOLD_LENGTH) as told:
+        with link.follow(_LENGTHS) as lengths:
             while True:
-                length = int.from_bytes((await told.get()).payload, "little")
+                length = int.from_bytes((await lengths.get()).payload, "little")
                 if length == self._length:
                     continue
                 if self.options.length:
@@ -176,30 +176,30 @@ class YarpDriver(SerialAdapter[YarpOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """How many values it sends; nobody else is waited for."""
+        """Return the number of values that it sends; other buses are not waited for."""
         if "yarp:" not in link.bus_name:
             return None
         return f"YARP port with {', '.join(patch.name for patch in await cls(YarpOptions()).describe(link))}"
 
     async def _heard_length(self, link: Link) -> int:
-        with link.follow(_TOLD_LENGTH) as told:
-            self.change_framing(YarpMessages())  # which tells it anew
+        with link.follow(_LENGTHS) as lengths:
+            self.change_framing(YarpMessages())  # reports it again
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_FIRST_S):
                     while True:
-                        length = int.from_bytes((await told.get()).payload, "little")
+                        length = int.from_bytes((await lengths.get()).payload, "little")
                         if length == (self.options.length or length):
                             return length
         raise BusError(f"{link.bus_name}: no messages with {self.options.length or 'any'} values within {_FIRST_S:g} s")
 
     def _of_places(self, length: int) -> tuple[list[Patch], list[tuple[int, int]]]:
-        """Boards of sixteen triangles, all of which feel touch; what is less than a triangle has fewer channels."""
+        """Return boards of sixteen triangles that all feel touch; the last triangle may have fewer channels."""
         patches, parts = [], []
         for patch, start in enumerate(range(0, length, _OF_A_BOARD)):
             modules = []
             for number, first in enumerate(range(start, min(length, start + _OF_A_BOARD), CHANNELS)):
-                there = [Sensor("pressure", place) for place in range(first, min(length, first + CHANNELS))]
-                modules.append(Module([*there, *[None] * (CHANNELS - len(there))], key=number))
+                sensors = [Sensor("pressure", place) for place in range(first, min(length, first + CHANNELS))]
+                modules.append(Module([*sensors, *[None] * (CHANNELS - len(sensors))], key=number))
                 parts.append((patch << 4 | number, first))
             last = min(length, start + _OF_A_BOARD) - 1
             patches.append(Patch(f"values {start}-{last}", modules, key=patch))
@@ -219,7 +219,7 @@ class YarpDriver(SerialAdapter[YarpOptions]):
         return patches, parts
 
     def _sensor(self, channel: int, first: int, run: Triangles) -> Sensor | None:
-        """Compensation makes nothing of what feels no touch."""
+        """Return a sensor; None for a channel without touch in compensated values."""
         if channel not in run.non_tactile():
             return Sensor("pressure", first + channel)
         return Sensor("temperature", first + channel) if self.options.values == "raw" else None

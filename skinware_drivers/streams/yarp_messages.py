@@ -1,21 +1,20 @@
-"""The messages of a YARP port in its carrier ``fast_tcp``: lists of numbers, taken apart by twelve.
+"""Split the messages of a YARP port in its carrier ``fast_tcp``, lists of numbers, into frames of twelve values.
 
 Source: robotology/yarp, tags v3.8.1 and v4.0.0 (``PortCommand``, ``VectorOf``, ``BottleImpl``), and exchanges with
 ports of both. All numbers are little-endian.
 
 A message begins with ``YA``, 10 i32, ``RP``; the number of its blocks u8, 1 u8 and eight FF; the length of each block
 i32; and 0 i32. The blocks follow: a command, then the data. A command is the length of its text i32, ``~``, and three
-bytes of which the first is the command if there is no text; the command ``D`` or ``d`` says that data follow, and its
-text can have an envelope: the number of the message and its time in seconds since 1970. The data are a list: its tag
-i32, the number of values i32, the values. A tag is 256 and the type of all values (1: int32; 10: float64 up to YARP 3,
-float32 since YARP 4; 20: float64 since YARP 4), or 256 alone for a list in which each value has its own type before it.
-The length of the block says which of both 10 means.
+bytes, the first of which is the command if there is no text. The command ``D`` or ``d`` announces data. Its text can
+have an envelope: the number of the message and its time in seconds since 1970. The data are a list: its tag i32, the
+number of values i32, the values. A tag is 256 plus the type of all values (1: int32; 10: float64 up to YARP 3, float32
+since YARP 4; 20: float64 since YARP 4), or 256 alone for a list in which each value follows its own type. The length of
+the block shows which meaning of 10 applies.
 
-The values of a message become frames of twelve, as triangles of a skin have them; the last one is filled up with 0.
-A frame's identifier is ``kind << 8 | number``, where ``number`` is what the driver calls these twelve. Its body is the
-sender's time in ms u32 and twelve float32, little-endian; of the kind ``PLAIN`` there was no time, and it is 0. A frame
-of the kind ``LENGTH`` (number 0) gives how many values messages have, u32: now and then, and when three in a row had
-another number than the driver expects.
+The values become frames of twelve, the number of a triangle; the last one is filled up with 0. The identifier of a
+frame is ``kind << 8 | number``, with the driver's number for these twelve. Its body is the sender's time in ms u32 and
+twelve float32; the kind ``PLAIN`` has no time, which is 0. A frame of the kind ``LENGTH`` (number 0) has the number of
+values in a message, u32; it comes now and then, and when three messages in a row had an unexpected number.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ LENGTH, PLAIN, TIMED = 0, 1, 2
 """Kinds of frames."""
 VALUES_OF_A_FRAME = 12
 MOST_VALUES = 3072
-"""Of a message: sixteen boards of sixteen triangles."""
+"""Values of a message: sixteen boards of sixteen triangles."""
 BEGIN = struct.pack("<2si2s", b"YA", 10, b"RP")
 """The first bytes of every message."""
 LONGEST = 1 << 16
@@ -52,10 +51,10 @@ _U32 = 0xFFFF_FFFF
 
 @dataclass(frozen=True)
 class YarpMessages(Framing):
-    """The framing; only to be received.
+    """The framing, for receiving only.
 
     Args:
-        length: values of a message; others are refused. 0: not known yet, so that there are frames ``LENGTH`` only.
+        length: values of a message; others are refused. 0: not known yet; there are only frames ``LENGTH`` then.
         parts: (number, first value) of each twelve values that matter.
     """
 
@@ -128,7 +127,7 @@ class _Messages(Framer):
         self.counters.skipped_bytes += size
 
     def _take(self, message: bytes, end: int, found: list[Framed]) -> None:
-        """Count a whole message: as used, or as none of a skin."""
+        """Count a whole message as used or refused, and append its frames to ``found``."""
         envelope, values = _content(message[_FIXED + 4 * (message[len(BEGIN)] + 1) :])
         if values is None or not self._fits(values, end, found):
             self.counters.refused += 1
@@ -138,7 +137,7 @@ class _Messages(Framer):
         self._cut_up(values, envelope, end, found)
 
     def _fits(self, values: npt.NDArray[np.float32], end: int, found: list[Framed]) -> bool:
-        """Whether a message has as many values as it should have; reports now and then how many it has."""
+        """Return whether a message has the expected number of values; report the number now and then."""
         self._times = self._times + 1 if len(values) == self._last else 1
         self._last = len(values)
         if self._times % _REPORT_EVERY == (0 if len(values) == self._length else _SURE):
@@ -157,7 +156,7 @@ class _Messages(Framer):
 
 
 def _content(blocks: bytes) -> tuple[bytes, npt.NDArray[np.float32] | None]:
-    """The text of the command, and the values of a message; None if it is no list of numbers."""
+    """Return the text of the command and the values of a message; None if it is no list of numbers."""
     if len(blocks) < _COMMAND.size:
         return b"", None
     size, command = _COMMAND.unpack_from(blocks)
@@ -169,7 +168,7 @@ def _content(blocks: bytes) -> tuple[bytes, npt.NDArray[np.float32] | None]:
 
 
 def _values(data: bytes) -> npt.NDArray[np.float32] | None:
-    """The numbers of a list as float32; None if it is none, or of more than a skin has."""
+    """Return the numbers of a list as float32; None if it is no such list, or longer than a skin."""
     if len(data) < _LIST.size:
         return None
     tag, count = _LIST.unpack_from(data)
@@ -191,8 +190,8 @@ def _values(data: bytes) -> npt.NDArray[np.float32] | None:
 
 
 def _mixed(numbers: bytes, count: int) -> npt.NDArray[np.float32] | None:
-    """A list whose values have their own types, as of a Bottle with both kinds of numbers."""
-    for float_of_3 in ("<d", "<f"):  # the length says which it is
+    """Return the numbers of a list whose values have their own types, such as a Bottle of both kinds of numbers."""
+    for float_of_3 in ("<d", "<f"):  # the length shows which
         forms = {_INT32: "<i", _FLOAT_OF_3: float_of_3, _FLOAT64_OF_4: "<d"}
         found: list[float] = []
         at = 0
@@ -209,7 +208,7 @@ def _mixed(numbers: bytes, count: int) -> npt.NDArray[np.float32] | None:
 
 
 def _time_ms(envelope: bytes) -> int | None:
-    """When a message was sent, as far as 32 bits hold it; None if it has no time, or 0."""
+    """Return the time of a message in ms, modulo 2 ** 32; None if it has no time, or 0."""
     match = _ENVELOPE.fullmatch(envelope)
     if match is None:
         return None

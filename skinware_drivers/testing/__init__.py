@@ -1,1 +1,1 @@
-"""Tests for drivers: a conformance suite, fixtures (see ``plugin``), and the lab. The only part that imports pytest."""
+"""Test drivers: a conformance suite, fixtures (see ``plugin``), and the CAN lab. Only this package imports pytest."""

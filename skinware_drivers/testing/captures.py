@@ -1,4 +1,4 @@
-"""Tests of a driver by captures of real devices: a folder of files, and a test for each.
+"""Test a driver with captures of real devices: a folder of files, and a test for each.
 
 ::
 
@@ -6,9 +6,9 @@
         driver = MyDriver
         folder = Path(__file__).parent / "captures"
 
-A capture is what ``skin-driver --capture FILE`` leaves. The test fails if the driver does not make of it what is
-expected: what is in the file beside it (``hand.npz`` of ``hand.mcap``, by ``skin-prove --captured hand.mcap --save``),
-or else what was decoded when it was captured.
+``skin-driver --capture FILE`` writes a capture. The test fails if the driver decodes it to other values than expected:
+those in the file beside it (``hand.npz`` for ``hand.mcap``, from ``skin-prove --captured hand.mcap --save``), or else
+those that were decoded during the capture.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class CaptureTests:
 
     Attributes:
         driver: the class of the driver.
-        folder: where the captures are, also in folders in it.
-        driver_options: beside those that the driver had when it was captured.
+        folder: of the captures, with its subfolders.
+        driver_options: options in place of those that the driver had during the capture.
     """
 
     driver: ClassVar[type[AnyAdapter]]
@@ -38,13 +38,16 @@ class CaptureTests:
     driver_options: ClassVar[Mapping[str, Any]] = {}
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """Called by pytest."""
+        """Make a test of each capture (a hook of pytest)."""
         if "capture" in metafunc.fixturenames:
             files = sorted(self.folder.rglob("*.mcap"))
             metafunc.parametrize("capture", files, ids=[str(file.relative_to(self.folder)) for file in files])
 
     def test_the_driver_makes_of_it_what_is_expected(self, capture: Path) -> None:
-        """Every value, of every update."""
+        """Every value of every update is the expected one."""
         compared, _ = check_capture(capture, self.driver, self.driver_options)
-        require(compared.then, f"{capture}: nothing was decoded then; look at what is now, and save it (skin-prove)")
+        require(
+            compared.then,
+            f"{capture}: nothing was decoded then; check what is decoded now, and save it (skin-prove)",
+        )
         require(compared.difference is None, f"{capture}: {compared.difference}")

@@ -1,7 +1,4 @@
-"""A coroutine in a time of its own, watched: what blocks instead of waiting, or waits for ever, is found and named.
-
-The time is that of :mod:`skinware_drivers.virtual.hand_clock`.
-"""
+"""Run a coroutine in the time of a :class:`skinware_drivers.virtual.hand_clock.HandClock`, and find what blocks it."""
 
 from __future__ import annotations
 
@@ -22,21 +19,21 @@ from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, NeverEnds, 
 T = TypeVar("T")
 
 _EXPAND_LOG = logging.getLogger("skinware.driver.expand")
-"""Where exceptions are told that the package caught from a driver's code."""
+"""Receives the exceptions of a driver's code that the package caught."""
 _LOOKS_A_SECOND = 50
 _ASLEEP_LOOKS = 40
-"""So often in a row the loop's thread must be found asleep in the same turn to be called blocked."""
+"""Number of looks in a row at which the loop's thread sleeps in the same turn, from which it is called blocked."""
 _LONGEST_TURN_S = 10.0
-"""Of processor time."""
-_SAID = (pytest.fail.Exception, NeverEnds)
-"""What says by itself what is wrong."""
+"""Longest turn of the loop in processor time."""
+_EXPLAINED = (pytest.fail.Exception, NeverEnds)
+"""Exceptions whose message is the explanation."""
 
 
 def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run a coroutine in an event loop of a clock's time, in a thread of its own, and find what blocks it.
+    """Run a coroutine in an event loop of the clock's time, in its own thread, and find what blocks it.
 
     Raises:
-        Failed: it raised something, blocks, never ends, or leaves a task behind; the message says what.
+        Failed: the coroutine raised an exception, blocks, never ends, or leaves a task; the message says which.
     """
     outcome: list[T] = []
     failures: list[BaseException] = []
@@ -44,11 +41,11 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
 
     def note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        if isinstance(error, _SAID):
+        if isinstance(error, _EXPLAINED):
             failures.append(error)
         elif not failures:
             trace = _short_trace(error) if error is not None else str(context["message"])
-            unseen.append(f"the driver raised an exception in the event loop, where nobody catches it:\n{trace}")
+            unseen.append(f"the driver raised an exception in the event loop, where nothing catches it:\n{trace}")
 
     async def scenario() -> T:
         loop = asyncio.get_running_loop()
@@ -68,33 +65,26 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
             failures.append(error)
 
     thread = threading.Thread(target=work, name="driver under test", daemon=True)  # one that hangs must not hang pytest
-    told = _Told(unseen)
-    _EXPAND_LOG.addHandler(told)
+
+    def keep(record: logging.LogRecord) -> bool:
+        unseen.append(record.getMessage())
+        return True
+
+    _EXPAND_LOG.addFilter(keep)
     try:
         thread.start()
         _watch(thread, clock)
     finally:
-        _EXPAND_LOG.removeHandler(told)
+        _EXPAND_LOG.removeFilter(keep)
     if unseen:
         defect(unseen[0])
     if failures:
-        # told anew: the trace of the first would keep everything alive that the test has to look after
+        # only its text: a traceback would keep alive everything that the test must release
         error = failures.pop()
-        what = str(error) if isinstance(error, _SAID) else f"it raised\n{_short_trace(error)}"
+        what = str(error) if isinstance(error, _EXPLAINED) else f"it raised\n{_short_trace(error)}"
         del error
         defect(what)
     return outcome[0]
-
-
-class _Told(logging.Handler):
-    """Writes down the messages of a log."""
-
-    def __init__(self, messages: list[str]) -> None:
-        super().__init__()
-        self._messages = messages
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._messages.append(record.getMessage())
 
 
 def _watch(thread: threading.Thread, clock: HandClock) -> None:
@@ -116,7 +106,7 @@ def _watch(thread: threading.Thread, clock: HandClock) -> None:
 
 
 def _look_at(thread: threading.Thread) -> tuple[bool, float]:
-    """Whether the kernel says that it waits for something, rather than for a processor; and what it used of one, s."""
+    """Return whether a thread sleeps in the kernel, and the processor time that it has used, s."""
     try:
         with open(f"/proc/self/task/{thread.native_id}/stat") as file:
             state, *numbers = file.read().rpartition(")")[2].split()

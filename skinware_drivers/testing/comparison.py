@@ -1,4 +1,4 @@
-"""What a driver showed, against what its devices felt."""
+"""Compare the updates that a driver showed with the bursts that its devices sent, and explain the differences."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, sensor_name
 
 Values = npt.NDArray[np.int64]
 _LATE_NS = 6_000_000
-"""By so much the truth's times can be late: buses hand out together what came within 4 ms."""
+"""The most by which times of bursts can be late: buses deliver together the frames of 4 ms."""
 _LAGS = 3
 _ENOUGH = 0.9
 _MOST_NAMED = 3
@@ -24,12 +24,12 @@ _FEWEST_UPDATES = 3
 
 @dataclass(frozen=True)
 class Update:
-    """A module that a frame shows anew.
+    """New values of a module in a snapshot.
 
     Attributes:
-        frame: number of the frame in the record.
-        module: the module.
-        burst: number of the burst of its device that it shows; None: of none.
+        frame: number of the snapshot in the record.
+        module: number of the module.
+        burst: number of the burst of its device that it shows; None: it shows none.
     """
 
     frame: int
@@ -38,7 +38,7 @@ class Update:
 
 
 class Comparison:
-    """Every update that a driver showed, and the burst that it is.
+    """The updates that a driver showed, each with its burst.
 
     Args:
         rig: a driver that ran.
@@ -76,14 +76,14 @@ class Comparison:
 
     @property
     def wrong(self) -> list[Update]:
-        """Updates with values that no burst had, or had too long ago."""
+        """Return the updates with values that no burst had, or only an old one."""
         return [update for update in self.updates if update.burst is None]
 
     def bursts_shown(self, module: int) -> list[int]:
         return [u.burst for u in self.updates if u.module == module and u.burst is not None]
 
     def require_right(self, because: str = "") -> None:
-        """Every update is a burst of its device, newer than the one before; a defect says what else it may be."""
+        """Fail unless every update shows a burst of its device, newer than the one before; explain what it shows."""
         wrong = self.wrong
         if not wrong:
             return
@@ -106,7 +106,7 @@ class Comparison:
         )
 
     def require_no_shift(self) -> None:
-        """No module shows what another one felt; a defect names all that do at once."""
+        """Fail if modules show the bursts of other modules; name all of them at once."""
         whose = {module: other for module in range(len(self._sensors)) if (other := self._whose(module)) is not None}
         for step in sorted({other - module for module, other in whose.items()}, key=abs):
             modules = [module for module, other in whose.items() if other - module == step]
@@ -143,11 +143,11 @@ class Comparison:
         return f"modules {modules[0]} to {modules[-1]} ({names})"
 
     def require_complete(self, spare: Callable[[int], bool] = lambda _time_ns: False, because: str = "") -> None:
-        """Every burst was shown, from the first one shown on, but for those around a moment that is to be spared.
+        """Fail unless every burst was shown, from the first shown one on.
 
         Args:
-            spare: tells whether a burst of that time need not be shown.
-            because: what went wrong on the wire, for the message.
+            spare: returns whether a burst at this time need not be shown.
+            because: the fault on the wire, for the message.
         """
         end_ns = self.rig.record.times_ns[-1] - 2 * self.rig.period_ns - _LATE_NS
         for module in range(self.structure.n_modules):
@@ -168,7 +168,7 @@ class Comparison:
                 )
 
     def spoilt(self) -> Callable[[int], bool]:
-        """Whether something happened on the wire to a burst of that time, or may have."""
+        """Return a test of a time: whether a burst at this time was perhaps damaged on the wire."""
         damaged_ns = np.array(sorted(damage.time_ns for damage in self.rig.wire.damages))
         reach_ns = self.rig.period_ns + _LATE_NS
         # on a serial line a frame can lose its end, and the next one its beginning
@@ -179,8 +179,6 @@ class Comparison:
             return bool(first < len(damaged_ns) and damaged_ns[first] <= time_ns + reach_ns)
 
         return is_spoilt
-
-    # -- finding ------------------------------------------------------------------------------------------------
 
     def _of_module(self, module: int) -> list[Update]:
         frames, times_ns = self.rig.record.frames, self.rig.record.times_ns
@@ -209,7 +207,7 @@ class Comparison:
     # -- explaining ---------------------------------------------------------------------------------------------
 
     def _wrong_sensors(self, update: Update) -> Values:
-        """The sensors of an update that differ from the burst of its time (of the last few, the likeliest)."""
+        """Return the sensors of an update that differ from the most similar of the last few bursts."""
         sensors, device = self._sensors[update.module], self._device[update.module]
         shown = _as_numbers(self.rig.record.frames[update.frame].values[sensors])
         until = self._newest_burst(device, update.frame)
@@ -270,7 +268,7 @@ def _as_numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def transforms(bits: int) -> list[tuple[str, str, Callable[[Values], Values]]]:
-    """What drivers do to values by mistake: in words, what to look at, and how."""
+    """Return mistakes of drivers: in words, the advice, and the change of the values."""
     full, whole = (1 << bits) - 1, 8 * -(-bits // 8)
     order = "look at the byte order of the dtype (`<` or `>`)"
     sign = "look at the sign of the dtype (`u` or `i`, `signed`)"

@@ -1,4 +1,4 @@
-"""How the suite says what is wrong: in words, without a trace through its own code."""
+"""Fail a test in words, without a traceback through the suite."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import pytest
 
 
 def defect(what: str) -> NoReturn:
-    """Fail the test with a message that names the defect and what to look at."""
+    """Fail the test with a message that names the defect and the place to look at."""
     pytest.fail(what, pytrace=False)
 
 
 def require(condition: object, what: str) -> None:
-    """Fail the test unless something holds."""
+    """Fail the test unless a condition holds."""
     if not condition:
         defect(what)

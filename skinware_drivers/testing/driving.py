@@ -1,39 +1,45 @@
-"""A driver that runs in a thread, in real time, for tests that read it as a user would."""
+"""Run a driver, and emulated devices, in threads and in real time, for tests that read the driver as a user would."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.flow import FlowLoop
-from skinware_drivers.running.runner import PublishMode, Runner
-from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
+from skinware_drivers.running.runner import Runner
+from skinware_drivers.serial.bus import PtyBus
+from skinware_drivers.streams.tcp import TcpServerBus
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.waiting import SLOWER
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
 _LONGEST_S = 15.0 * SLOWER
-"""For a driver to begin, and to end: a wrong one is to be told soon."""
+"""Time for a driver to begin, and to end: a wrong driver should fail soon."""
+_EMULATION_S = 30.0
+_LONGEST_WRITE = 4096
 
 
 class Driving:
-    """A running driver; ``do`` runs something in its event loop, where the emulated hardware may be touched.
+    """A driver in a thread.
 
     Attributes:
-        ready: set once it publishes.
-        failure: what it ended with, if it failed.
-        runner: the runner, once there is one.
+        ready: set when it publishes.
+        failure: the exception that ended it, if it failed.
+        runner: the runner, once the thread has made it.
     """
 
     def __init__(
@@ -75,22 +81,21 @@ class Driving:
         try:
             with asyncio.Runner(loop_factory=FlowLoop) as loop:
                 loop.run(run())
-        except BaseException as error:  # noqa: BLE001  (shown to the test, which fails on it)
+        except BaseException as error:  # noqa: BLE001  (raised in the test)
             self.failure = error
             self.ready.set()
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def wait(self) -> None:
-        """Wait until it publishes; what it failed with is raised here."""
+        """Wait until it publishes; raise the exception that ended it."""
         require(self.ready.wait(_LONGEST_S), f"the driver published nothing within {_LONGEST_S:g} s")
         if self.failure is not None:
             raise self.failure
 
     def stop(self) -> None:
-        """End it in good order; what it failed with is raised here."""
+        """Stop it as ``skin-driver`` does; raise the exception that ended it."""
         if self.runner is not None and self._loop is not None and self._thread.is_alive():
             with contextlib.suppress(RuntimeError):  # it has failed and closed its loop, and its thread is about to end
                 self._loop.call_soon_threadsafe(self.runner.stop)
@@ -100,7 +105,7 @@ class Driving:
             raise self.failure
 
     def do(self, action: Callable[[], object]) -> None:
-        """Run in the driver's loop and wait for it."""
+        """Run something in the driver's event loop, where emulated hardware may be changed, and wait for it."""
         done = threading.Event()
 
         def act() -> None:
@@ -113,7 +118,7 @@ class Driving:
         require(done.wait(_LONGEST_S), "the driver's loop is stuck")
 
     def status(self) -> dict[str, Any]:
-        """Figures of every bus and patch, as ``skin-driver --json`` tells them."""
+        """Return the figures of every bus and patch, as in ``skin-driver --json``."""
         return {} if self.runner is None else self.runner.status()
 
 
@@ -128,16 +133,16 @@ def driving_lines(
     wait_for_buses: bool = False,
     bus_names: Sequence[str] = (),
 ) -> Iterator[Driving]:
-    """A driver on any buses, as long as the ``with`` lasts.
+    """Run a driver on any buses while the block runs.
 
     Args:
         lines: an adapter and an unopened bus for every bus.
         name: of the driver in the namespace.
         listen_only: send nothing.
-        wait: until it publishes.
+        wait: begin the block when the driver publishes.
         publish: see :class:`skinware_drivers.running.runner.Runner`.
-        wait_for_buses: likewise.
-        bus_names: of each bus; default: bus0, bus1 ...
+        wait_for_buses: see :class:`skinware_drivers.running.runner.Runner`.
+        bus_names: names of the buses; default: bus0, bus1 ...
     """
     running = Driving(lines, name, listen_only, publish, wait_for_buses, bus_names)
     running.start()
@@ -149,21 +154,109 @@ def driving_lines(
         running.stop()
 
 
-class EmulatedSkin:
+class _Control:
+    """Wait for the start of an emulation in another thread, and end it."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self.ready = threading.Event()
+        self.failure: BaseException | None = None
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def fileno(self) -> int:
+        return self._event
+
+    def event(self, name: str, **facts: Any) -> None:
+        del facts
+        if name == "ready":
+            self.ready.set()
+
+    def stop(self) -> None:
+        self.stopped = True
+        os.eventfd_write(self._event, 1)
+
+    def close(self) -> None:
+        os.close(self._event)
+
+
+@contextmanager
+def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
+    """Run emulated devices while the block runs, and yield the path of their serial port.
+
+    Args:
+        emulator: class or registered name of an emulator of serial devices.
+        options: of the emulator.
+    """
+    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
+    bus = PtyBus("", payload_size=_LONGEST_WRITE)
+    with emulated_on(bus, factory, **options):
+        yield bus.note.removeprefix("serial port ")
+
+
+@contextmanager
+def emulated_over_tcp(emulator: Any, **options: Any) -> Iterator[str]:
+    """Run emulated devices while the block runs, and yield ``HOST:PORT``, to which a driver can connect.
+
+    Args:
+        emulator: class or registered name of an emulator of serial or Modbus devices.
+        options: of the emulator.
+    """
+    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
+    bus = TcpServerBus("127.0.0.1:0", payload_size=_LONGEST_WRITE)
+    with emulated_on(bus, factory, **options):
+        yield bus.note.removeprefix("listens on ")
+
+
+@contextmanager
+def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
+    """Run emulated devices on a bus while the block runs.
+
+    Args:
+        bus: not opened yet.
+        emulator: class of an emulator.
+        options: of the emulator.
+    """
+    given = msgspec.convert(options, emulator.Options, strict=False)
+    hardware, control = emulator(given), _Control()
+
+    def run() -> None:
+        try:
+            Emulation(bus, hardware, control).run(control, bus_name=bus.name, driver=str(emulator), options=given)
+        except BaseException as error:  # noqa: BLE001  (raised in the test)
+            control.failure = error
+            control.ready.set()
+
+    thread = threading.Thread(target=run, name="emulated devices", daemon=True)
+    thread.start()
+    try:
+        require(control.ready.wait(_EMULATION_S), "the emulated devices did not start")
+        if control.failure is not None:
+            raise control.failure
+        yield
+    finally:
+        control.stop()
+        thread.join(_EMULATION_S)
+        control.close()
+    require(not thread.is_alive(), "the emulated devices did not stop")
+    if control.failure is not None:
+        raise control.failure
+
+
+class EmulatedSkin(NamedTuple):
     """A driver that runs on emulated devices in this process.
 
     Attributes:
         driver: the running driver.
-        reader: reads it.
-        hardware: the devices; touch them only within ``driver.do``. None: they are on a serial line, or a bus of yours.
-        bus: the bus; it can ``vanish`` and ``come_back``, also only within ``driver.do``.
+        reader: of the driver.
+        bus: the bus. Call its ``vanish`` and ``come_back`` only within ``driver.do``.
+        hardware: the devices, to be changed only within ``driver.do``; None: they are on a serial line, or on a bus of
+            yours.
     """
 
-    def __init__(self, driver: Driving, reader: DriverReader, bus: Bus, hardware: EmulatedHardware | None) -> None:
-        self.driver = driver
-        self.reader = reader
-        self.bus = bus
-        self.hardware = hardware
+    driver: Driving
+    reader: DriverReader
+    bus: Bus
+    hardware: EmulatedHardware | None
 
 
 @contextmanager
@@ -176,16 +269,16 @@ def emulated_skin(
     bus: str = "",
     **emulator_options: Any,
 ) -> Iterator[EmulatedSkin]:
-    """Run a driver on emulated devices, or on a bus of your own.
+    """Run a driver on emulated devices, or on a bus of your own, while the block runs.
 
     Args:
-        driver: its registered name, or its class.
-        emulator: a class; by default the one registered under the driver's name, unless there is a ``bus``. Those of
-            serial drivers get a pseudo terminal.
+        driver: registered name or class of the driver.
+        emulator: class of the devices; by default the one registered under the driver's name, unless there is a
+            ``bus``. Serial devices get a pseudo terminal.
         name: of the driver in the namespace.
         driver_options: options of the driver.
-        bus: a bus' name (``vcan0``, a pseudo terminal). Without ``emulator``, the devices are there already; with it,
-            they are brought there.
+        bus: name of a bus (``vcan0``, a pseudo terminal). With ``emulator``, the devices are emulated on it; without,
+            it has devices already.
         emulator_options: options of the devices.
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver

@@ -1,4 +1,4 @@
-"""Test that damage costs no more than it must and is never shown as data, and that silence shows and ends."""
+"""Test that damage costs only its own bursts and is never shown as data, and that silence shows and ends."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class FaultTests(Suite):
     def test_foreign_frames_disturb_nothing(self) -> None:
         """Other devices on the bus (on a serial line: noise between frames) are counted and change nothing."""
         if self.driver.medium == "virtual":
-            return  # nobody else is there
+            return  # there are no other devices
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
@@ -106,8 +106,8 @@ class FaultTests(Suite):
         play(scenario)
 
     async def _own_identifiers(self, rig: Running) -> Collection[int]:
-        told: Collection[int] = getattr(rig.devices, "identifiers", ())
-        return told or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
+        declared: Collection[int] = getattr(rig.devices, "identifiers", ())
+        return declared or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
 
     async def _damage(self, rig: Running, fault: Fault) -> None:
         """Run, damage some frames, and let the last burst come through."""
@@ -147,7 +147,7 @@ class SilenceTests(Suite):
         play(scenario)
 
     def test_a_silent_kind_of_frame_is_not_shown_as_fresh(self) -> None:
-        """One kind of frame falls silent while all others go on: what only it carried keeps the time that it has."""
+        """One kind of frame falls silent while all others continue: sensors that only it carries become stale."""
 
         async def scenario(clock: HandClock) -> tuple[Heard, Running]:
             async with self.running(clock) as rig:
@@ -168,22 +168,21 @@ class SilenceTests(Suite):
             renewed = groups[decoder.state.group_time_ns[groups] > np.maximum(before[groups], silent_ns)]
             require(
                 not len(renewed),
-                f"frames {frame.name!r} fell silent, but what only they carry goes on as fresh: other frames fill the"
+                f"frames {frame.name!r} fell silent, but sensors that only they carry stay fresh: other frames fill the"
                 " same module. If an Expand is among them, say with `to` which channels it has",
             )
 
     def test_a_lost_bus_comes_back(self) -> None:
-        """The interface is unplugged and plugged in again: the driver goes on by itself."""
+        """The interface is unplugged and plugged in again: the driver continues by itself."""
 
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock) as rig:
                 await rig.until_fresh()
                 rig.bus.vanish()
-                gone = await rig.until(
+                await rig.until(
                     lambda frame: frame.bus_state[0] in (BusState.GONE, BusState.DOWN),
-                    "the interface went away, but the state of the bus does not tell",
+                    "the interface went away, but the state of the bus does not show it",
                 )
-                del gone
                 await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s))
                 require(
                     (rig.record.frames[-1].status & _STALE).all(),
@@ -233,7 +232,7 @@ class SilenceTests(Suite):
         Comparison(rig).require_right(f"{after}, and afterwards")
 
     def test_a_dead_device_holds_up_no_other(self) -> None:
-        """One device dies: the others go on at their rate."""
+        """One device dies: the others continue at their rate."""
 
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock, boot_s=1e6) as rig:
@@ -261,8 +260,8 @@ class SilenceTests(Suite):
 def _show(
     decoder: Decoder, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], silent: int | None
 ) -> npt.NDArray[np.bool_]:
-    """Show frames without those of one kind; (n_sensors,) bool, which sensors they have values of."""
-    batch = FrameBatch(len(wire) + decoder.headroom, wire.dtype["payload"].shape[0], decoder.headroom)
+    """Show frames without those of one kind, and return (n_sensors,) bool: the sensors that they have values of."""
+    batch = FrameBatch(len(wire) + decoder.compiled.headroom, wire.dtype["payload"].shape[0], decoder.compiled.headroom)
     decoder.put_back(batch)
     rows = slice(batch.stop, batch.stop + len(wire))
     batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0

@@ -1,13 +1,13 @@
-"""The CAN lab: a guest kernel that has CAN, over this machine's own files, for a machine whose kernel has none.
+"""The CAN lab: a virtual machine with CAN over this machine's own files, for a kernel without CAN.
 
-    python -m skinware_drivers.testing.lab check                  what is missing here; exit status 1 if anything is
-    python -m skinware_drivers.testing.lab packages               Debian's packages that it needs
-    python -m skinware_drivers.testing.lab run [-T S] -- COMMAND  boot, run COMMAND in this folder, exit as it did
+    python -m skinware_drivers.testing.lab check                  list what is missing; exit status 1 if anything is
+    python -m skinware_drivers.testing.lab packages               list the Debian packages that it needs
+    python -m skinware_drivers.testing.lab run [-T S] -- COMMAND  run COMMAND in this folder, and exit with its status
     python -m skinware_drivers.testing.lab --kernel rt ...        the same with a PREEMPT_RT kernel
 
-The guest sees this machine's files; what it writes is gone with it. It has vcan, and two emulated CAN
-controllers on one wire: can0 and can1. SKINWARE_CAN_LAB=1 tells a program that it runs inside, and
-SKINWARE_CAN_LAB_KERNEL on which kernel. The processor is emulated: what runs there works, but says nothing of timing.
+The guest reads this machine's files; its own files end with it. It has vcan, and two emulated CAN controllers on one
+wire: can0 and can1. SKINWARE_CAN_LAB is 1 inside, and SKINWARE_CAN_LAB_KERNEL names the kernel. The processor is
+emulated, so that times mean nothing.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ FILES = (
     "-fsdev local,id=lab-files,path=/,security_model=none,readonly=on,multidevs=remap"
     " -device virtio-9p-pci,fsdev=lab-files,mount_tag=lab-files"
 )
-"""This machine's files once more: virtme-ng's way to them caches nothing, and Python starts in three times the time."""
+"""This machine's files with a cache: virtme-ng mounts them without one, which makes Python start three times slower."""
 BOOT_S = 300.0
-"""How long a boot may take, s: ten times what it does."""
+"""Time for a boot, ten times the usual."""
 UP = b"CAN lab: up\n"
-"""What the guest says when it is."""
+"""Printed by the guest after its boot."""
 PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
 COMMANDS = ("ip", "modprobe", "file")
-"""Commands that are needed here or in the guest, beside those that every machine has; virtme-ng asks ``file``."""
+"""Commands that are needed here or in the guest, beside those of every machine; virtme-ng uses ``file``."""
 IMAGES = {"plain": "linux-image-amd64", "rt": "linux-image-rt-amd64"}
-"""Kernels that can be chosen, and Debian's packages of them."""
+"""Kernels to choose from, and their Debian packages."""
 
 
 def find_kernel(flavour: str) -> Path | None:
-    """The newest installed kernel of a flavour that has all modules of the lab."""
+    """Return the newest installed kernel of a flavour that has all modules of the lab."""
     kernels = [
         Path("/boot") / f"vmlinuz-{folder.name}" for folder in Path("/lib/modules").glob("*") if _has_modules(folder)
     ]
@@ -64,21 +64,21 @@ def _numbers(text: str) -> list[str]:
 
 
 def find_vng() -> str | None:
-    """The command of virtme-ng, beside this Python or on the path."""
+    """Return the command of virtme-ng, beside this Python or on the path."""
     return shutil.which("vng", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
 
 
 def find_busybox() -> str | None:
-    """A statically linked busybox, where virtme-ng looks for one: it begins the guest's boot."""
+    """Return a statically linked busybox, which virtme-ng boots the guest with, if there is one."""
     for name in ("busybox-static", "busybox.static", "busybox"):
         if busybox := _which(name):
-            told = subprocess.run(["file", "-L", busybox], capture_output=True, text=True).stdout
-            return busybox if "statically linked" in told or "static-pie linked" in told else None
+            kind = subprocess.run(["file", "-L", busybox], capture_output=True, text=True).stdout
+            return busybox if "statically linked" in kind or "static-pie linked" in kind else None
     return None
 
 
 def missing(flavour: str) -> list[str]:
-    """What this machine lacks, a line each; empty if the lab can run."""
+    """Return what this machine lacks, a line each; empty if the lab can run."""
     lacks = []
     if _which("qemu-system-x86_64") is None:
         lacks.append("qemu-system-x86_64")
@@ -102,7 +102,7 @@ def _path() -> str:
 
 
 def guest_script(flavour: str, command: list[str], folder: Path) -> str:
-    """What the guest runs."""
+    """Return the script that the guest runs."""
     return f"""
         set -e
         echo CAN lab: up
@@ -121,17 +121,16 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
 
 
 def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int:
-    """Boot the guest and run a command in it; the guest is gone when this returns.
+    """Boot the guest, run a command in it, and stop the guest.
 
     Args:
         flavour: of the kernel, a key of ``IMAGES``.
-        command: what to run.
-        timeout_s: when to stop the guest at the latest.
+        command: the command with its arguments.
+        timeout_s: time after which the guest is stopped.
         folder: where the command runs.
 
     Returns:
-        The command's exit status; 1 if the lab cannot run here, 124 after the timeout, or if the guest
-        does not come up.
+        The command's exit status; 1 if the lab cannot run here; 124 after the timeout, or if the guest does not boot.
     """
     lacks = missing(flavour)
     kernel, vng = find_kernel(flavour), find_vng()
@@ -149,14 +148,14 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
 
 
 def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) -> int:
-    """Boot the guest, and wait for its end; returns the command's exit status, or 124."""
+    """Boot the guest, wait for its end, and return the command's exit status, or 124."""
     is_up = threading.Event()
     with subprocess.Popen(
         arguments,
         start_new_session=True,
         env=environment,
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,  # given a file, QEMU opens it anew and overwrites what is in it
+        stdout=subprocess.PIPE,  # QEMU would open a file again and overwrite it
         stderr=subprocess.STDOUT,
     ) as process:
         relay = threading.Thread(target=copy_output, args=(process, is_up), daemon=True)
@@ -177,7 +176,7 @@ def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) ->
 
 
 def copy_output(process: subprocess.Popen[bytes], is_up: threading.Event) -> None:
-    """What the guest prints, at once, from when it is up; what comes before is shown if it never is."""
+    """Copy the guest's output from the end of its boot on; if the boot fails, print the output before."""
     before = b""
     while process.stdout is not None and (data := os.read(process.stdout.fileno(), 65536)):
         if not is_up.is_set():
@@ -193,7 +192,7 @@ def copy_output(process: subprocess.Popen[bytes], is_up: threading.Event) -> Non
 
 
 def report(flavour: str, lacks: list[str]) -> int:
-    """Say what is missing and how to get it."""
+    """Print what is missing and how to install it; return the exit status."""
     if not lacks:
         sys.stdout.write(f"the CAN lab can run: {find_kernel(flavour)}\n")
         return 0
@@ -205,12 +204,12 @@ def report(flavour: str, lacks: list[str]) -> int:
 
 
 def packages(flavour: str) -> str:
-    """Debian's packages that the lab needs, for the command line of apt-get."""
+    """Return the Debian packages that the lab needs, for the command line of apt-get."""
     return PACKAGES.format(image=IMAGES[flavour])
 
 
 def main(folder: Path) -> int:
-    """Entry point; commands run in ``folder``."""
+    """Run the command line; commands run in ``folder``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kernel", choices=IMAGES, default="plain", help="which kernel to boot (default: plain)")
     actions = parser.add_subparsers(dest="action", required=True)

@@ -1,4 +1,4 @@
-"""What a test leaves behind: descriptors, threads, processes, files in shared memory."""
+"""Find what a test leaves behind: descriptors, threads, processes, files in shared memory."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 
 
 class Belongings:
-    """What this process has at one moment."""
+    """The threads, descriptors and processes of this process at one moment."""
 
     def __init__(self) -> None:
-        gc.freeze()  # so that garbage is sought only among what comes after it: after every test, that takes its time
+        gc.freeze()  # makes the collection after each test fast: older objects are not searched
         self._threads = set(threading.enumerate())
         self._descriptors = _descriptors()
 
     def left_since(self) -> list[str]:
-        """What has come since then and is still there, in words; empty if nothing is."""
+        """Return in words what was made since then and still exists."""
         gc.collect()
         gc.unfreeze()
         left = [f"thread {thread.name!r}" for thread in set(threading.enumerate()) - self._threads]
@@ -28,7 +28,7 @@ class Belongings:
 
 
 def files_left(namespace: Path) -> list[str]:
-    """Files of services and readers that nobody took away from a namespace."""
+    """Return in words the files of services and readers that are left in a namespace."""
     return [f"file {path}" for path in namespace.rglob("*") if path.suffix != ".lock" and path != namespace / "readers"]
 
 

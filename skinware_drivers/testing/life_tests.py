@@ -1,4 +1,4 @@
-"""What a driver says of itself, and how it begins, ends, listens and keeps house."""
+"""Test a driver's description, and how it starts, stops, listens and releases resources."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_GROWN = 1.5
 
 
 def _check_matrices(structure: Structure, geometry: Geometry) -> None:
-    """Taxels of matrices lie as their rows and columns say: each step along one is a step forwards."""
+    """Fail unless taxels of matrices lie in the order of their rows and columns."""
     for sensor_type in structure.types:
         places = geometry.of(structure, sensor_type.name).position_m
         for name, taxels in structure.matrices(sensor_type.name).items():
@@ -60,15 +60,15 @@ class LifeTests(Suite):
                 second = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
                 require(
                     first.structure == second.structure,
-                    "`describe` says something else when it is asked again, of the same devices: readers would have to"
-                    " follow a new structure each time",
+                    "`describe` returns another structure for the same devices when it is called again: readers would"
+                    " have to follow a new structure each time",
                 )
                 other = self.case.adapter()
                 third = self._tables(other, await other.describe(rig.link))
                 require(
                     first.structure == third.structure,
-                    "another object of the driver describes the same devices in another way: what is kept in the class"
-                    " that belongs to the object?",
+                    "another object of the driver describes the same devices in another way: does the class keep"
+                    " something that belongs to the object?",
                 )
 
         play(scenario)
@@ -88,7 +88,7 @@ class LifeTests(Suite):
         return tables
 
     def test_handshakes_in_any_order(self) -> None:
-        """Stop without start, twice, start again, close twice, use after close: only bus errors may come of it."""
+        """Stop without start, twice, start again, close twice, use after close: only bus errors may be raised."""
 
         async def scenario(clock: HandClock) -> None:
             async with self.handshakes(clock) as rig:
@@ -99,7 +99,7 @@ class LifeTests(Suite):
                         return await getattr(adapter, name)(link, *arguments)
                     except BusError as error:
                         return defect(f"`{name}` failed ({story}) though the devices are there: {error}")
-                    except Exception as error:  # noqa: BLE001  (told to the author)
+                    except Exception as error:  # noqa: BLE001  (reported to the author)
                         return defect(
                             f"`{name}` raised {type(error).__name__}: {error} ({story}); only BusError may be"
                         )
@@ -126,7 +126,7 @@ class LifeTests(Suite):
                         await getattr(adapter, name)(link)
                     except BusError:
                         continue
-                    except Exception as error:  # noqa: BLE001  (told to the author)
+                    except Exception as error:  # noqa: BLE001  (reported to the author)
                         defect(f"`{name}` raised {type(error).__name__} on a closed bus: {error}; only BusError may be")
                 rig.open()
                 story = "after the bus was closed and opened again"
@@ -151,7 +151,7 @@ class LifeTests(Suite):
         self._require_nothing_left(before, "after it was stopped in the middle of its start")
 
     def test_devices_that_come_late_are_found(self) -> None:
-        """Nobody is there when the driver starts; devices that get their power later are set up and shown."""
+        """No device has power when the driver starts; devices that are switched on later are set up and shown."""
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
@@ -175,21 +175,21 @@ class LifeTests(Suite):
             sent = len(self._let_pass(rig, 1.0))
             require(
                 not sent,
-                f"the devices go on sending after the driver was stopped ({sent} frames in a second): `stop` does not"
-                " make them silent",
+                f"the devices continue to send after the driver was stopped ({sent} frames in a second): `stop` does"
+                " not make them silent",
             )
 
         play(scenario)
 
     def _frames_alone(self, clock: HandClock) -> int:
-        """How much devices send in a second, to which nobody has said anything."""
+        """Return the number of frames that devices send in a second without being started."""
         devices = self.emulator(self.case.options(), log=None, source=self.handshakes(clock).truth)
         devices.skip(clock.now_ns)
         return len(devices.emit(clock.now_ns + 1_000_000_000))
 
     @staticmethod
     def _let_pass(rig: Running, duration_s: float) -> list[WireFrame]:
-        """What devices send while nobody listens."""
+        """Return the frames that devices send in this time, while nothing listens."""
         rig.clock.now_ns += round(duration_s * 1e9)
         return rig.devices.emit(rig.clock.now_ns)  # type: ignore[no-any-return]
 
@@ -204,7 +204,7 @@ class LifeTests(Suite):
                 rig.bus.come_back()
                 await rig.sleep(1.0)
 
-        play(scenario)  # what is made once and kept
+        play(scenario)  # makes what is kept from then on
         before = Belongings()
         for _ in range(2):
             play(scenario)
@@ -222,8 +222,8 @@ class LifeTests(Suite):
             async with rig:
                 await rig.until_fresh()
                 await rig.sleep(10 * rig.adapter.period_s)
-                rig.truth.remember = rig.wire.remember = False  # what grows is then the driver's
-                await rig.sleep(20 * rig.adapter.period_s)  # what is made once and kept
+                rig.truth.remember = rig.wire.remember = False  # then only the driver can grow
+                await rig.sleep(20 * rig.adapter.period_s)  # makes what is kept from then on
                 before = _pieces()
                 await rig.sleep(_MANY_BURSTS * rig.adapter.period_s)
                 grown = _pieces() - before
@@ -243,7 +243,7 @@ class LifeTests(Suite):
                 tried = rig.bus.counters.send_failures
                 require(
                     not tried and not rig.wire.sent,
-                    f"it was told to listen only, and tried to send {tried} frames: ask `link.listen_only` before"
+                    f"it may only listen, and tried to send {tried} frames: ask `link.listen_only` before"
                     " sending in `describe`, `attend` and `join`",
                 )
 
@@ -257,7 +257,7 @@ def _pieces() -> int:
 
 
 async def _where_it_grows(rig: Running) -> str:
-    """Where most of what comes and stays is made; of small pieces, Python does not always know it rightly."""
+    """Return the line that makes most of the objects that stay; for small objects, Python is not always right."""
     snapshots = []
     tracemalloc.start(1)
     try:

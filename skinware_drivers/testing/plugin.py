@@ -1,6 +1,7 @@
-"""The pytest plug-in: fixtures for tests of drivers and of programs that read skins. pytest finds it by itself.
+"""The pytest plug-in: fixtures for tests of drivers and of programs that read skins.
 
-Nothing of Skinware is imported before a fixture is used: test runs of others that have it installed stay as they are.
+pytest loads it wherever Skinware is installed. It imports nothing of Skinware before a fixture is used, so that tests
+of other projects do not change.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _failed = pytest.StashKey[bool]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--skin-can-lab``."""
+    """Add ``--skin-can-lab``."""
     parser.getgroup("skinware").addoption(
         "--skin-can-lab",
         action="store_true",
@@ -41,12 +42,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the mark known."""
+    """Register the mark ``can``."""
     config.addinivalue_line("markers", "can: needs a kernel with CAN; tests that use `vcan` or `can_pair` have it")
 
 
 def pytest_cmdline_main(config: pytest.Config) -> int | None:
-    """Run in the lab instead of here, if that was asked for."""
+    """Run the tests in the lab if ``--skin-can-lab`` is given and this kernel has no CAN."""
     if not config.getoption("--skin-can-lab") or has_can():
         return None
     import sys
@@ -70,13 +71,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
-    """Remember whether the test itself failed."""
+    """Keep for the fixtures whether the test itself failed."""
     if call.when == "call":
         item.stash[_failed] = call.excinfo is not None
 
 
 def has_can() -> bool:
-    """Whether this kernel has CAN, and we may make interfaces."""
+    """Return whether this kernel has CAN, and this process may make interfaces."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:
@@ -85,15 +86,15 @@ def has_can() -> bool:
 
 
 def ip(*arguments: str) -> None:
-    """The command ``ip``."""
+    """Run the command ``ip``."""
     subprocess.run(["ip", *arguments], check=True, capture_output=True)
 
 
 @pytest.fixture
 def namespace(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Namespace]:
-    """A fresh namespace, also for child processes; afterwards no process, thread, descriptor or file may be left.
+    """Make a new namespace, also for child processes; fail if a process, thread, descriptor or file is left.
 
-    After a test that failed, nobody looks: the report of the failure keeps what the test had.
+    A test that failed is not checked, because pytest's report of the failure keeps its objects.
     """
     from skinware.memory.namespace import Namespace
     from skinware_drivers.testing.leaks import Belongings, files_left
@@ -112,9 +113,9 @@ def namespace(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -
 
 @pytest.fixture
 def emulated_skin(namespace: Namespace) -> Iterator[Callable[..., EmulatedSkin]]:  # noqa: ARG001 - for its effect
-    """Makes drivers that run on emulated devices in this process: ``emulated_skin("xela")``, and a reader for each.
+    """Return a function that starts a driver on emulated devices in this process: ``emulated_skin("xela")``.
 
-    The arguments are those of :func:`skinware_drivers.testing.driving.emulated_skin`. All are stopped at the end.
+    Its arguments are those of :func:`skinware_drivers.testing.driving.emulated_skin`. All are stopped at the end.
     """
     from skinware_drivers.testing import driving
 
@@ -126,11 +127,11 @@ def emulated_skin(namespace: Namespace) -> Iterator[Callable[..., EmulatedSkin]]
 
 @pytest.fixture
 def pty_patch() -> Iterator[Callable[..., str]]:
-    """Makes emulated devices on pseudo terminals: ``pty_patch("my_driver")`` is the path of a serial port.
+    """Return a function that emulates devices on a pseudo terminal: ``pty_patch("my_driver")`` is its path.
 
-    The arguments are an emulator's class or registered name, and its options. All are gone at the end.
+    Its arguments are an emulator's class or registered name, and the emulator's options. All are stopped at the end.
     """
-    from skinware_drivers.testing.carrying import emulated_on_a_pty
+    from skinware_drivers.testing.driving import emulated_on_a_pty
 
     with ExitStack() as running:
         yield lambda emulator, **options: running.enter_context(emulated_on_a_pty(emulator, **options))
@@ -138,11 +139,11 @@ def pty_patch() -> Iterator[Callable[..., str]]:
 
 @pytest.fixture
 def tcp_patch() -> Iterator[Callable[..., str]]:
-    """Makes emulated devices that are called over TCP: ``tcp_patch("my_driver")`` is their ``HOST:PORT``.
+    """Return a function that emulates devices behind TCP: ``tcp_patch("my_driver")`` is their ``HOST:PORT``.
 
-    The arguments are as those of ``pty_patch``. All are gone at the end.
+    Its arguments are those of ``pty_patch``. All are stopped at the end.
     """
-    from skinware_drivers.testing.carrying import emulated_over_tcp
+    from skinware_drivers.testing.driving import emulated_over_tcp
 
     with ExitStack() as running:
         yield lambda emulator, **options: running.enter_context(emulated_over_tcp(emulator, **options))
@@ -150,7 +151,7 @@ def tcp_patch() -> Iterator[Callable[..., str]]:
 
 @pytest.fixture
 def vcan() -> Iterator[Callable[[], str]]:
-    """Makes virtual CAN interfaces of unique names, up; they are deleted at the end. Skips where there is no CAN."""
+    """Return a function that makes a virtual CAN interface, and its name; skip the test on a kernel without CAN."""
     if not has_can():
         pytest.skip(_NO_CAN)
     made: list[str] = []
@@ -161,7 +162,7 @@ def vcan() -> Iterator[Callable[[], str]]:
             ip("link", "add", "dev", name, "type", "vcan")
         except (OSError, subprocess.CalledProcessError) as error:
             if os.environ.get("SKINWARE_CAN_LAB") == "1":
-                raise  # there is nothing better
+                raise  # the lab must have it
             pytest.skip(f"no vcan ({getattr(error, 'stderr', None) or error}): {_NO_CAN}")
         made.append(name)
         ip("link", "set", name, "up")
@@ -174,9 +175,9 @@ def vcan() -> Iterator[Callable[[], str]]:
 
 @pytest.fixture
 def can_pair() -> Iterator[tuple[str, str]]:
-    """Two CAN controllers on one wire, at 1 Mbit/s and up: can0 and can1 of the lab. Skips elsewhere."""
+    """Set up two CAN controllers on one wire at 1 Mbit/s, can0 and can1 of the lab; skip the test elsewhere."""
     if os.environ.get("SKINWARE_CAN_LAB") != "1":
-        pytest.skip("two CAN controllers on one wire are in the CAN lab: `pytest --skin-can-lab`")
+        pytest.skip("two CAN controllers on one wire exist only in the CAN lab: `pytest --skin-can-lab`")
     pair = ("can0", "can1")
     for name in pair:
         ip("link", "set", name, "type", "can", "bitrate", "1000000")

@@ -1,4 +1,4 @@
-"""A driver on emulated devices, in time that the test owns: set up, watched, and compared with what was sent."""
+"""Run a driver on emulated devices in the time of a test, and keep what it publishes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NAME = "driver_under_test"
 _BUS = "bus"
 _SLOTS = 64
 _LONGEST_START_S = 12.0
-_NOT_TAKEN = (
+_UNUSED = (
     *("unknown", "bad_length", "bad_content", "refused", "orphans", "checksum_errors", "bad_form"),
     "polls_unanswered",
 )
@@ -66,20 +66,20 @@ class Case:
         return adapter
 
     def options(self, **more: Any) -> Any:
-        """Options of the devices; of ``more``, those that they have."""
+        """Return the options of the devices, with those of ``more`` that they have."""
         known = self.emulator.Options.__struct_fields__
         given = {**self.emulator_options, **{name: value for name, value in more.items() if name in known}}
         return msgspec.convert(given, self.emulator.Options, strict=False)
 
 
 class Recorder:
-    """Every frame that a driver publishes, in order, as a user's program reads it.
+    """Read every snapshot that a driver publishes, in order, as a user's program does.
 
     Attributes:
-        frames: what was published.
-        times_ns: when.
-        keep: whether to keep them; else only the newest.
-        count: of all that were published.
+        frames: the snapshots.
+        times_ns: times of their publication.
+        keep: keep all snapshots; False: only the newest.
+        count: number of published snapshots.
     """
 
     def __init__(self, clock: HandClock) -> None:
@@ -92,9 +92,9 @@ class Recorder:
 
     def look(self, runner: Runner) -> None:
         if self.reader is None:
-            if runner.writer is None or runner.writer.closed:
+            if runner.builder.writer is None or runner.builder.writer.closed:
                 return
-            self.reader = DriverReader(runner.name)
+            self.reader = DriverReader(runner.identity.name)
         while True:
             last = self.frames[-1].position if self.frames else None
             newest = self.reader.refresh()
@@ -120,14 +120,14 @@ class Recorder:
 
 
 class Rig:
-    """One driver on one bus of devices. Everything happens in the time of ``clock``.
+    """One driver on one bus of emulated devices, in the time of ``clock``.
 
     Attributes:
         clock: the time.
         adapter: the driver.
         devices: the emulated hardware.
-        truth: what it was told to feel.
-        wire: what is between the two.
+        truth: the values that the devices feel.
+        wire: between driver and devices; it can damage frames.
         bus: the bus.
     """
 
@@ -147,7 +147,6 @@ class Rig:
 
     @property
     def period_ns(self) -> int:
-        """Nominal time between two updates."""
         return round(self.adapter.period_s * 1e9)
 
     @property
@@ -156,7 +155,7 @@ class Rig:
 
 
 class Handshakes(Rig):
-    """A rig without a runner: the test calls what it likes of the adapter, and frames reach whoever waits for them."""
+    """A rig without a runner, for a test that calls the adapter's methods itself."""
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -186,11 +185,11 @@ class Handshakes(Rig):
 
 
 class Running(Rig):
-    """A rig whose driver runs as ``skin-driver`` runs it, as long as the ``async with`` lasts.
+    """A rig whose driver runs as in ``skin-driver``, while the ``async with`` block runs.
 
     Attributes:
-        record: what it publishes.
-        answers: frames that its handshakes took, and those that came before it knew what is there.
+        record: the snapshots that it publishes.
+        answers: number of frames that its handshakes took, or that came before it had a structure.
     """
 
     def __init__(self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
@@ -216,7 +215,7 @@ class Running(Rig):
 
         def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
             unwanted = offer(batch, rows)
-            self.answers += len(rows) if runner.generation is None else len(rows) - len(unwanted)
+            self.answers += len(rows) if runner.builder.generation is None else len(rows) - len(unwanted)
             return unwanted
 
         link.offer = offer_and_count  # type: ignore[method-assign]
@@ -225,7 +224,7 @@ class Running(Rig):
         await self.stop()
 
     async def stop(self) -> None:
-        """Stop the driver as ``skin-driver`` does; what it raised is raised here."""
+        """Stop the driver as ``skin-driver`` does; raise the exception that ended it."""
         if self.runner is None or self._task is None:
             return
         runner, task, self._task = self.runner, self._task, None
@@ -242,7 +241,7 @@ class Running(Rig):
             self.record.look(self.runner)
 
     async def sleep(self, duration_s: float) -> None:
-        """Let time pass; fails if the driver ends meanwhile."""
+        """Let time pass; fail if the driver ends meanwhile."""
         await asyncio.sleep(duration_s)
         if self._task is not None and self._task.done():
             error = self._task.exception()
@@ -251,7 +250,7 @@ class Running(Rig):
     async def until(
         self, condition: Callable[[DriverSnapshot], object], why_not: str, within_s: float = _LONGEST_START_S
     ) -> DriverSnapshot:
-        """Let time pass until a published frame fulfils a condition; a defect if none does."""
+        """Let time pass until a snapshot fulfils a condition; fail with ``why_not`` if none does."""
         record, end_ns = self.record, self.clock.now_ns + round(within_s * 1e9)
         seen = record.count
         while True:
@@ -263,7 +262,7 @@ class Running(Rig):
             await self.sleep(min(self.adapter.period_s / 2, 0.05))
 
     async def until_fresh(self, within_s: float = _LONGEST_START_S) -> DriverSnapshot:
-        """Until every sensor was seen and none is stale."""
+        """Let time pass until every sensor is fresh; explain why if that does not happen."""
         frames, begun_ns = self.wire.frames, self.clock.now_ns
         heard_ns: int | None = None
 
@@ -278,16 +277,16 @@ class Running(Rig):
             frame = await self.until(is_decided, "", within_s)
             require(is_fresh(frame), "")
         except BaseException:
-            self._explain_why_not_fresh((self.clock.now_ns - begun_ns) / 1e9)
+            self._explain_not_fresh((self.clock.now_ns - begun_ns) / 1e9)
             raise
         return frame
 
     @property
     def _longest_with_data_ns(self) -> int:
-        """How long data may come before it is shown: a driver asks again for its devices after at most four seconds."""
+        """Return the longest time from the first data to fresh sensors: a driver repeats its questions within 4 s."""
         return max(5 * NS_PER_S, 30 * self.period_ns)
 
-    def _explain_why_not_fresh(self, within_s: float) -> None:
+    def _explain_not_fresh(self, within_s: float) -> None:
         from skinware_drivers.testing.comparison import Comparison  # which looks at rigs
 
         within = f"after {within_s:.1f} s of emulated data"
@@ -306,20 +305,18 @@ class Running(Rig):
         what = "was never seen" if len(never) else "is not fresh"
         count = len(never) if len(never) else len(missing)
         why = "No frame of the layout writes them: is a frame, a module or a channel missing, or two channels `to` one?"
-        why = self._what_was_not_taken() + why
+        why = self._unused_in_words() + why
         defect(f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}.\n{why}")
 
-    def _what_was_not_taken(self) -> str:
-        """Counters, samples, and what they say of the layout, in a line each; empty if all was taken."""
-        counters = {
-            name: count for name, count in self.counters().items() if count and name in (*_NOT_TAKEN, "orphans")
-        }
-        lone = counters.pop("orphans", 0)  # of the rest, it may be the consequence
+    def _unused_in_words(self) -> str:
+        """Return counters of unused frames, samples, and their reasons in the layout; empty if all were used."""
+        counters = {name: count for name, count in self.counters().items() if count and name in (*_UNUSED, "orphans")}
+        lone = counters.pop("orphans", 0)  # perhaps a consequence of the others
         if counters:
             reasons = "".join(
                 f"{reason[0].upper()}{reason[1:]}.\n" for reason in why_unused(self.adapter.layout, self.bus)
             )
-            return f"What was not taken: {counters}{self.samples_in_words()}.\n{reasons}"
+            return f"Frames that were not used: {counters}{self.samples_in_words()}.\n{reasons}"
         if lone:
             return (
                 f"{lone} frames found no partners: do all frames of a cycle come, in the order of its `members`, within"
@@ -328,7 +325,7 @@ class Running(Rig):
         return ""
 
     def counters(self) -> dict[str, int]:
-        """Counters of the bus and those of all patches together, as of now; none before there is a structure."""
+        """Return the counters of the bus and of all patches together; empty before the driver runs."""
         if self.runner is None:
             return {}
         status = self.runner.status()
@@ -340,27 +337,27 @@ class Running(Rig):
         return counters
 
     def samples_in_words(self) -> str:
-        """Some of the frames that were not used: identifier, length, first bytes."""
-        told = [
+        """Return some frames that were not used: identifier, length, first bytes."""
+        samples = [
             f"{sample['why']} {sample_text(sample)}"
             for line in (self.runner.lines if self.runner is not None else ())
             for sample in sample_report(line.bus.samples.rows)
         ]
-        return f"; for example {', '.join(told)}" if told else ""
+        return f"; for example {', '.join(samples)}" if samples else ""
 
     def sent_in_words(self) -> str:
-        """The first and the last frames that the driver sent."""
+        """Return the first and the last frames that the driver sent."""
         sent = [f"{identifier_text(identifier)} [{payload.hex(' ')}]" for identifier, payload in self.wire.sent]
         return ", ".join(sent if len(sent) <= 6 else [*sent[:3], "...", *sent[-3:]]) or "nothing"
 
     def first_patch_of(self, number: int) -> int:
-        """The patch that shows the first value of a device."""
+        """Return the patch that shows the first value of a device."""
         structure = self.record.frames[-1].structure
         return int(structure.sensor_patch[self.numbers.index(number) * self.truth.n_values])
 
 
 def is_fresh(frame: DriverSnapshot) -> bool:
-    """Whether every sensor is good, or at least shown."""
+    """Return whether every sensor is good, or at least shown."""
     return not (frame.status & ~np.uint8(SHOWN_ANYWAY)).any()
 
 

@@ -1,4 +1,4 @@
-"""Share among the tests of the suite: a rig, and what emulated devices feel."""
+"""The base of the suite's tests: rigs of a driver, and the values that emulated devices feel."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Values = npt.NDArray[np.int64]
 
 
 def limits(emulator: Any, n_values: int) -> tuple[Values, Values]:
-    """Least and greatest value that each sensor of a device can send."""
+    """Return the least and the greatest value that each sensor of a device can send."""
     lowest = each_value("lowest", getattr(emulator, "lowest", 0), n_values)
     return lowest, each_value("full_scale", emulator.full_scale, n_values)
 
 
 def lively(emulator: Any) -> Pattern:
-    """Another random value for every sensor, device and burst: whatever is mixed up shows."""
+    """Return a pattern with another random value for every sensor, device and burst, so that any mix-up shows."""
 
     def feel(number: int, cycle: int, n_values: int) -> Values:
         lowest, highest = limits(emulator, n_values)
@@ -35,7 +35,7 @@ def lively(emulator: Any) -> Pattern:
 
 
 def extreme(emulator: Any) -> Pattern:
-    """Values at the ends of the range, and bit patterns, by turns; between them, lively ones."""
+    """Return a pattern of range ends and bit patterns by turns, with lively values between them."""
     between = lively(emulator)
 
     def feel(number: int, cycle: int, n_values: int) -> Values:
@@ -63,13 +63,13 @@ def extreme(emulator: Any) -> Pattern:
 
 
 class Suite:
-    """A driver, its emulator, and rigs of both.
+    """A driver and its emulator.
 
     Attributes:
         driver: the adapter class.
         emulator: emulated hardware for it; see :mod:`.conformance`.
         driver_options: options of the driver, as in a configuration file.
-        emulator_options: options of the emulator, beside what the tests need.
+        emulator_options: options of the emulator, beside those that the tests set.
     """
 
     driver: ClassVar[type[AnyAdapter]]
@@ -78,7 +78,7 @@ class Suite:
     emulator_options: ClassVar[Mapping[str, Any]] = {}
 
     def shown(self, felt: Sequence[int]) -> Sequence[int]:
-        """Of the values that a device felt, what its protocol can tell: to be overridden where that is less."""
+        """Return the values that a device can send for the values that it felt: override it if they are fewer."""
         return felt
 
     @property
@@ -86,7 +86,7 @@ class Suite:
         return Case(self.driver, self.emulator, self.driver_options, self.emulator_options, self.shown)
 
     def running(self, clock: HandClock, **more: Any) -> Running:
-        """The driver on its devices, which feel other values all the time."""
+        """Return the running driver on devices that feel new values in each burst."""
         return Running(self.case, clock, more.pop("pattern", lively)(self.emulator), **more)
 
     def handshakes(self, clock: HandClock, **more: Any) -> Handshakes:
@@ -100,7 +100,7 @@ class Suite:
             require(came == rig.wire.frames, f"{rig.wire.frames} frames came, the bus counted {came}")
         layout = rig.adapter.layout
         if layout.cycle is not None and len(layout.cycle.members) < len(layout.frames):
-            return  # how many frames an update had cannot be told from the counters
+            return  # updates may have had any number of frames
         used = counters["updates"] * layout.cycle_length + rig.answers
         used += sum(counters[name] for name in ("unknown", "bad_length", "bad_content", "orphans"))
         structure = rig.record.frames[-1].structure

@@ -1,4 +1,4 @@
-"""That a driver shows what was felt, all of it, and nothing else."""
+"""Test that a driver shows all values that its devices sent, and no others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ValueTests(Suite):
     """Values of good data."""
 
     def test_every_value_is_right_and_in_order(self) -> None:
-        """Each sensor shows what it felt, every burst is shown once, and nothing is counted as wrong."""
+        """Each sensor shows its values, every burst is shown once, and no counter of faults grows."""
 
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock) as rig:
@@ -36,7 +36,7 @@ class ValueTests(Suite):
                 wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
                 require(
                     not wrong,
-                    f"of good data, something was counted as wrong: {wrong}{rig.samples_in_words()}: does the layout"
+                    f"good data was counted as faulty: {wrong}{rig.samples_in_words()}: does the layout"
                     " know every frame and every length that the devices send?",
                 )
                 self.require_all_counted(rig)
@@ -44,7 +44,7 @@ class ValueTests(Suite):
         play(scenario)
 
     def test_extreme_values(self) -> None:
-        """Least and greatest values, alternating bits, the sign bit alone: also these are shown as they were sent."""
+        """Least and greatest values, alternating bits, and the sign bit alone are shown as they were sent."""
 
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock, pattern=extreme) as rig:
@@ -55,7 +55,7 @@ class ValueTests(Suite):
         play(scenario)
 
     def test_nothing_is_valid_before_the_first_data(self) -> None:
-        """As long as no data came, every sensor is NEVER_SEEN; and what has come makes only itself valid."""
+        """Every sensor is NEVER_SEEN before data comes, and data makes only its own sensors valid."""
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
@@ -83,13 +83,13 @@ class ValueTests(Suite):
                 rig.wire.keep = lambda _identifier, _payload: True
                 await rig.until_fresh()
                 Comparison(rig).require_right(
-                    "with most frames missing on the wire, sensors were filled in that no frame had told of"
+                    "with most frames missing on the wire, sensors without a frame of theirs were filled in"
                 )
 
         play(scenario)
 
     def _data_of(self, rig: Running) -> Any:
-        """Tells data from answers: a device that has sent data before it was asked for any does not exist."""
+        """Return a test of a frame: whether it is data. Answers come before the devices send any data."""
         bursts = rig.truth.bursts
 
         def is_data(_identifier: int, _payload: bytes) -> bool:
@@ -97,7 +97,7 @@ class ValueTests(Suite):
 
         return is_data
 
-    def test_the_rate_is_the_one_it_tells(self) -> None:
+    def test_the_rate_is_the_declared_one(self) -> None:
         """Updates come every ``period_s``: readers, staleness and pairing depend on it."""
 
         async def scenario(clock: HandClock) -> None:
@@ -115,10 +115,9 @@ class ValueTests(Suite):
 
 
 def _mean_interval_s(times_ns: Sequence[int]) -> float:
-    """From burst to burst, s; pauses are left out.
+    """Return the mean time between two bursts, s, without pauses.
 
-    A mean, as each time may be late by what buses wait to hand out several frames together: of 10 ms, the single
-    intervals are 8 or 12.
+    Single intervals say less: a bus delivers the frames of some milliseconds together, so that 10 ms become 8 or 12.
     """
     intervals_ns = np.diff(times_ns)
     return float(np.mean(intervals_ns[intervals_ns < 2 * np.median(intervals_ns)])) / 1e9

@@ -1,4 +1,4 @@
-"""What a driver makes of literal bytes: of a datasheet, of a recording, or written by hand.
+"""Decode literal bytes with a driver: bytes of a datasheet, of a recording, or written by hand.
 
 ::
 
@@ -6,18 +6,17 @@
     assert shown.values[:4].tolist() == [1, 2, 3, 4]
     assert shown.never_seen.sum() == 12
 
-An identifier of 29 bits is written as everywhere: ``EXTENDED_FLAG | 0x18DA00F1``.
+An identifier of 29 bits is written ``EXTENDED_FLAG | 0x18DA00F1``.
 
-The data path in C is given the same, and has to do the same as that of numpy.
-
-A test fails if something of what it decodes is not shown, and says what and why. Where that is what is tested, say
-``strict=False`` and look at ``problems``. Bytes that a program computed, say the driver's emulator, prove only that two
-programs agree.
+A test fails, and says why, if something that it decodes is not shown. To test just that, say ``strict=False`` and look
+at ``problems``. Bytes that a program computed, such as the driver's emulator, only prove that two programs agree.
 """
 
 from __future__ import annotations
 
-import asyncio
+import os
+import secrets
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
@@ -25,22 +24,28 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from skinware.driver_service import DriverWriter
 from skinware.errors import BusError
+from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.counters import BusCounters, FramerCounters
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS
-from skinware_drivers.description import Patch, assemble
-from skinware_drivers.link import Link
+from skinware_drivers.description import Patch, SkinTables, assemble
+from skinware_drivers.finding.without_driver import attended
+from skinware_drivers.layout import Layout
 from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
+from skinware_drivers.polling import Watch
+from skinware_drivers.running.native_path import NativePath
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.direct_path import DirectPath
 from skinware_drivers.testing.wire import make_bus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
@@ -61,7 +66,7 @@ _WHY = dict(
 
 
 class Shown(NamedTuple):
-    """What users would see after some frames."""
+    """The values that users would read after some frames."""
 
     structure: Structure
     values: npt.NDArray[Any]
@@ -71,13 +76,56 @@ class Shown(NamedTuple):
     unknown: int
     """Frames that belong to no module."""
     problems: tuple[str, ...]
-    """What was not shown, and why, a line each."""
+    """Data that was not shown, with the reason, a line each."""
 
     @property
     def never_seen(self) -> npt.NDArray[np.bool_]:
-        """(n_sensors,) bool: sensors of which no value came."""
+        """Return (n_sensors,) bool: sensors without a value."""
         never_seen: npt.NDArray[np.bool_] = (self.status & Status.NEVER_SEEN) != 0
         return never_seen
+
+
+class DirectPath:
+    """A driver's data path without a bus and a loop; it shows every update at once, in a namespace of its own.
+
+    Args:
+        layout: of the only bus.
+        tables: the skin.
+        payload_size: longest payload, bytes.
+
+    Attributes:
+        decoder: its ``state`` holds the values and counters after the frames so far.
+    """
+
+    def __init__(self, layout: Layout, tables: SkinTables, payload_size: int) -> None:
+        self.decoder = Decoder([layout], tables)
+        self._namespace = Namespace(f"direct-{os.getpid()}-{secrets.token_hex(4)}")
+        self._writer = DriverWriter(
+            "direct",
+            self.decoder.tables.structure,
+            bus_counters=ALL_BUS_COUNTERS,
+            patch_counters=ALL_PATCH_COUNTERS,
+            namespace=self._namespace,
+        )
+        publisher = Publisher(self._writer, self.decoder, Watch(tables), 1.0, by_cycle=False)
+        self._batch = FrameBatch(1, payload_size, self.decoder.compiled.headroom)
+        self._path = NativePath(self.decoder, publisher, self._batch)
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of frames that wait for the others of their cycle."""
+        self._path.empty()
+        return len(self._batch)
+
+    def feed(self, time_ns: int, identifier: int, payload: bytes) -> None:
+        """Decode one frame."""
+        self._path.empty()
+        self._batch.append(0, time_ns, identifier, payload)
+        self._path.digest()
+
+    def close(self) -> None:
+        self._writer.close()
+        shutil.rmtree(self._namespace.path, ignore_errors=True)
 
 
 def decode_frames(
@@ -88,10 +136,10 @@ def decode_frames(
     devices: EmulatedHardware | None = None,
     apart_s: float = 0.001,
 ) -> Shown:
-    """What a driver makes of frames that arrive one after the other.
+    """Decode frames that arrive one after the other.
 
     Args:
-        adapter: the driver. Its ``layout`` is used, and its ``patches`` or what its ``describe`` finds.
+        adapter: the driver. Its ``layout`` is used, and its ``patches`` or the patches that its ``describe`` finds.
         frames: identifier and payload (bytes, or hexadecimal digits) of each.
         strict: fail the test if one of them is not shown.
         devices: emulated ones, for a ``describe`` that asks.
@@ -107,12 +155,12 @@ def decode_stream(
     strict: bool = True,
     devices: EmulatedHardware | None = None,
 ) -> Shown:
-    """What a driver makes of bytes on a serial line.
+    """Decode bytes on a serial line.
 
     Args:
-        adapter: the driver. Its ``framing`` and ``layout`` are used (of Modbus, its ``registers`` and byte order), and
-            its ``patches``, or what ``describe`` finds.
-        stream: the bytes, or their hexadecimal digits. Of Modbus: questions and their replies, as on a serial line.
+        adapter: the driver. Its ``framing`` and ``layout`` are used (for Modbus, its ``registers`` and byte order), and
+            its ``patches`` or the patches that its ``describe`` finds.
+        stream: the bytes, or their hexadecimal digits; for Modbus, requests and replies as on a serial line.
         strict: fail the test if some of them are not shown.
         devices: emulated ones, for a ``describe`` that asks.
     """
@@ -122,10 +170,10 @@ def decode_stream(
         text
         for count, text in (
             (counters.checksum_errors, f"{counters.checksum_errors} x the checksum is wrong"),
-            (counters.refused, f"{counters.refused} x what begins like a packet has a form that cannot be"),
+            (counters.refused, f"{counters.refused} x a packet begins, and its form is impossible"),
             (counters.skipped_bytes, f"{counters.skipped_bytes} bytes belong to no good packet"),
             (pending, f"the last {pending} bytes are no whole packet: more would have to follow"),
-            (not frames, "nothing of it is data of this driver"),
+            (not frames, "no part of it is data of this driver"),
         )
         if count
     ]
@@ -133,7 +181,7 @@ def decode_stream(
 
 
 def _framed(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
-    """The frames in the bytes of a serial line, what was counted, and how many bytes are no whole frame yet."""
+    """Return the frames in the bytes of a serial line, the counters, and the number of bytes of an unfinished frame."""
     framer = adapter.framing.framer()
     frames = [(frame.identifier, frame.body) for frame in framer.feed(stream)]
     return frames, framer.counters, framer.pending
@@ -173,7 +221,7 @@ def _decode(
 def _feed(
     path: DirectPath, adapter: AnyAdapter, frames: Sequence[tuple[int, str | bytes]], apart_ns: int
 ) -> Iterator[str]:
-    """Feed frames one by one; yield what is wrong with each."""
+    """Feed frames one by one, and yield the problems of each."""
     counters = path.decoder.state.bus_counters[0]
     for number, (identifier, digits) in enumerate(frames):
         payload = _bytes(digits)
@@ -188,8 +236,8 @@ def _feed(
         yield from (f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(counters - before))
 
 
-class _Nobody:
-    """Devices that are not there."""
+class _NoDevices:
+    """Hardware that never sends."""
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         pass
@@ -213,24 +261,15 @@ def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[
     clock = HandClock()
 
     async def describe() -> Sequence[Patch]:
-        bus = make_bus(adapter, devices or _Nobody(), clock, listen_only=False)
+        bus = make_bus(adapter, devices or _NoDevices(), clock, listen_only=False)
         adapter.fit(bus)
-        link = Link(bus)
-
-        def hear() -> None:
-            batch = FrameBatch(4096, bus.payload_size)
-            bus.receive(batch, 0)
-            link.offer(batch, np.arange(batch.start, batch.stop))
-
-        bus.open()
-        asyncio.get_running_loop().add_reader(bus.fileno(), hear)
-        try:
-            return await adapter.describe(link)
-        except BusError as error:
-            return defect(f"`describe` asks its devices, and none answers: give emulated ones as `devices=` ({error})")
-        finally:
-            asyncio.get_running_loop().remove_reader(bus.fileno())
-            bus.close()
+        async with attended(bus) as link:
+            try:
+                return await adapter.describe(link)
+            except BusError as error:
+                return defect(
+                    f"`describe` asks its devices, and none answers: give emulated ones as `devices=` ({error})"
+                )
 
     patches = run_in_its_time(clock, describe)
     require(patches, "`describe` finds no patch: if it asks its devices, give emulated ones as `devices=`")
@@ -238,5 +277,4 @@ def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[
 
 
 def _bytes(data: str | bytes) -> bytes:
-    """Spaces between hexadecimal digits may be anywhere, or nowhere."""
     return bytes.fromhex("".join(data.split())) if isinstance(data, str) else data

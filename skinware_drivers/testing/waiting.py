@@ -1,4 +1,4 @@
-"""Waiting for what is to come, in real time: never a fixed sleep."""
+"""Wait in real time for a condition, without a fixed sleep."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from skinware.status import Status
 from skinware_drivers.testing.defect import defect, require
 
 SLOWER = float(os.environ.get("SKINWARE_TEST_PATIENCE") or (4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1))
-"""So many times longer than usual may tests in real time wait; in the CAN lab the processor is emulated."""
+"""Factor for the waiting times of tests in real time; the CAN lab has an emulated processor."""
 PATIENCE_S = 12.0 * SLOWER
-"""How long to wait for a frame, unless a test says otherwise."""
+"""Longest time to wait for a snapshot, unless a test gives another."""
 
 
 def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:
-    """Wait for a condition; fails the test if it does not come true in time."""
+    """Wait for a condition; fail the test if it does not come true in time."""
     end = time.monotonic() + deadline_s
     while not condition():
         require(time.monotonic() < end, f"not within {deadline_s:g} s: {condition}")
@@ -34,12 +34,12 @@ def read_until(
     condition: Callable[[DriverSnapshot], bool],
     within_s: float = PATIENCE_S,
 ) -> DriverSnapshot:
-    """The first frame that fulfils a condition; fails the test if none does in time, and tells what was in the last.
+    """Return the first snapshot that fulfils a condition; if none does in time, fail with the state of the last one.
 
     Args:
         reader: of the driver.
-        condition: to be fulfilled.
-        within_s: how long to wait, s.
+        condition: a test of a snapshot.
+        within_s: longest time to wait, s.
     """
     end, last, count = time.monotonic() + within_s, None, 0
     try:
@@ -58,11 +58,11 @@ def read_until(
 
 
 def _in_words(reader: DriverReader, frame: DriverSnapshot) -> str:
-    told = [f"of the last, {np.count_nonzero(frame.status == 0)} of {len(frame.status)} sensors are fresh"]
-    told += [f"{n} {bit.name}" for bit in Status if (n := np.count_nonzero(frame.status & np.uint8(bit)))]
+    parts = [f"in the last, {np.count_nonzero(frame.status == 0)} of {len(frame.status)} sensors are fresh"]
+    parts += [f"{n} {bit.name}" for bit in Status if (n := np.count_nonzero(frame.status & np.uint8(bit)))]
     for bus, counters in enumerate(reader.bus_counters(frame)):
         names = ("errors", "refused", "unknown", "bad_length", "bad_content", "polls_unanswered")
-        told += [f"{name.replace('_', ' ')}: {counters[name]}" for name in names if counters.get(name)]
+        parts += [f"{name.replace('_', ' ')}: {counters[name]}" for name in names if counters.get(name)]
         samples = [sample_text(sample) for sample in sample_report(frame.bus_samples[bus])]
-        told += [f"for example {', '.join(samples)}"] if samples else []
-    return ", ".join(told)
+        parts += [f"for example {', '.join(samples)}"] if samples else []
+    return ", ".join(parts)

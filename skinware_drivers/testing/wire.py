@@ -1,4 +1,4 @@
-"""Connect emulated devices and the driver under test: the truth of what was sent, and faults on the way."""
+"""Connect emulated devices with the driver under test: values that are felt, and faults on the wire."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _LOSES_ONLY = 0.3
 
 
 class Stumbling:
-    """What such a sender makes of its frames; all chance comes from one seed.
+    """A sender that loses runs of frames, stands still and catches up; all chance comes from one seed.
 
     Args:
-        period_ns: from burst to burst.
-        frames: of a burst; it loses up to twice as many in a row.
+        period_ns: time between two bursts.
+        frames: number of frames of a burst; up to twice as many are lost in a row.
 
     Attributes:
-        stumbles: how often it happened.
+        stumbles: number of stumbles so far.
     """
 
     def __init__(self, period_ns: int, frames: int) -> None:
@@ -50,7 +50,7 @@ class Stumbling:
 
     @property
     def due_ns(self) -> int | None:
-        """When it goes on; None: it does not stand still."""
+        """Return the time at which it continues; None: it does not stand still."""
         return self._until_ns if self._held else None
 
     def pass_on(self, frames: list[WireFrame], now_ns: int) -> list[WireFrame]:
@@ -83,20 +83,20 @@ class Stumbling:
 
 
 Fault = Literal["lost", "repeated", "truncated", "garbage", "noise"]
-"""Of a frame: gone, twice, cut short, random bytes instead of its own, random bytes before it (serial lines)."""
+"""What happens to a frame: lost, twice, cut short, replaced by random bytes, or preceded by them (serial lines)."""
 Values = npt.NDArray[np.int64]
 Pattern = Callable[[int, int, int], Values]
-"""(number of the device, number of its burst, number of values) -> what its sensors feel."""
+"""(number of the device, number of its burst, number of values) -> values that its sensors feel."""
 _FOREIGN_NS = 3_000_000
 
 
 @dataclass(frozen=True)
 class Burst:
-    """One sample of all sensors of a device, as the emulator was told to feel it.
+    """One sample of all sensors of a device.
 
     Attributes:
-        time_ns: when the emulator asked for it, at the latest.
-        values: (n,) what was felt, as far as the protocol can tell.
+        time_ns: the latest time at which the emulator took it.
+        values: (n,) as the protocol can send them.
     """
 
     time_ns: int
@@ -104,18 +104,18 @@ class Burst:
 
 
 class Truth:
-    """The source of an emulator's values, which remembers them.
+    """The source of an emulator's values, which keeps them.
 
     Args:
         clock: the time.
-        n_felt: values that each device feels.
-        pattern: what is felt.
-        shown: of what was felt, what the protocol can tell.
+        n_felt: number of values that each device feels.
+        pattern: the values.
+        shown: returns the values that the protocol can send for values that were felt.
 
     Attributes:
-        n_values: values that each device tells.
-        bursts: what was felt so far.
-        remember: whether to write down what is felt.
+        n_values: number of values that each device sends.
+        bursts: the bursts so far, by device.
+        remember: keep the bursts.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Damage:
-    """What was done to one frame on the wire."""
+    """A fault that was made on the wire."""
 
     time_ns: int
     fault: Fault
@@ -148,22 +148,22 @@ class Damage:
 
 @dataclass
 class Interference:
-    """Devices as the driver gets to hear them.
+    """Devices behind a wire with faults.
 
     Attributes:
         hardware: the devices.
-        fault: what happens to some of the frames; None: nothing.
-        every_ns: to one frame after so much time, on average.
-        silent: nothing comes through, in either direction.
-        foreign: identifiers of frames of other devices that come beside the data.
-        keep: which frames come through.
-        stumbling: what holds frames back and loses some in a row; None: nothing.
-        damages: what was done.
-        frames: frames that came through, since the devices have power.
-        foreign_sent: frames of other devices among them.
-        sent: what the driver sent to the devices.
-        remember: whether to write that down.
-        identifiers: of what came through, with how often.
+        fault: of some frames; None: none.
+        every_ns: mean time between two faults.
+        silent: nothing passes in either direction.
+        foreign: identifiers of frames of other devices beside the data.
+        keep: returns whether a frame passes.
+        stumbling: holds frames back and loses some in a row; None: nothing does.
+        damages: the faults so far.
+        frames: number of frames that passed.
+        foreign_sent: number of frames of other devices among them.
+        sent: frames that the driver sent to the devices.
+        remember: keep ``sent``.
+        identifiers: of the frames that passed, with their numbers.
     """
 
     hardware: EmulatedHardware
@@ -215,7 +215,7 @@ class Interference:
         return frames
 
     def skip(self, now_ns: int) -> int:
-        """Let the devices run on with nobody listening."""
+        """Let the devices run without a listener."""
         self._next_foreign_ns = now_ns
         return self.hardware.skip(now_ns)
 
@@ -296,46 +296,30 @@ class _EmulatedPort(Port):
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
-class _Line:
-    """The line of emulated devices."""
+class _OnLine(Bus):
+    """A bus at the end of an emulated line, which can go away and come back."""
 
-    def __init__(self, hardware: EmulatedHardware, clock: HandClock) -> None:
-        self._hardware = hardware
-        self._clock = clock
-        self._present = True
-        self._emulated: _EmulatedPort | None = None
+    opens_slowly: ClassVar[bool] = False  # a thread would not follow the clock's time
+    _hardware: EmulatedHardware
+    _clock: HandClock
+    _end: _EmulatedPort | None = None
+    _present = True
 
-    def open(self) -> Port:
+    def _open_port(self) -> Port:
         if not self._present:
             raise BusNotAvailable("the emulated line is away")
-        self._emulated = _EmulatedPort(self._hardware, self._clock)
-        return self._emulated
+        self._end = _EmulatedPort(self._hardware, self._clock)
+        return self._end
 
     def vanish(self) -> None:
         self._present = False
-        if self._emulated is not None:
-            self._emulated.present = False
-            self._emulated.wake()
-
-    def come_back(self) -> None:
-        self._present = True
-
-
-class _OnLine(Bus):
-    """A bus at the end of a line."""
-
-    opens_slowly: ClassVar[bool] = False  # a thread would know nothing of the clock's time
-    _line: _Line
-
-    def _open_port(self) -> Port:
-        return self._line.open()
-
-    def vanish(self) -> None:
-        self._line.vanish()
+        if self._end is not None:
+            self._end.present = False
+            self._end.wake()
 
     def come_back(self) -> None:
         """End :meth:`vanish`."""
-        self._line.come_back()
+        self._present = True
 
 
 class EmulatedSerialBus(_OnLine, SerialBus):
@@ -343,7 +327,7 @@ class EmulatedSerialBus(_OnLine, SerialBus):
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
-        self._line = _Line(hardware, clock)
+        self._hardware, self._clock = hardware, clock
 
 
 class EmulatedModbusBus(_OnLine, ModbusBus):
@@ -351,10 +335,10 @@ class EmulatedModbusBus(_OnLine, ModbusBus):
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only, make_timer=clock.timer)
-        self._line = _Line(hardware, clock)
+        self._hardware, self._clock = hardware, clock
 
     def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
-        """No time: it has no baud rate."""
+        """Return 0: the line has no baud rate."""
         return 0.0
 
 
@@ -378,7 +362,7 @@ def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, 
 
 
 def foreign_identifiers(own: Collection[int]) -> list[int]:
-    """Identifiers that none of the devices uses, of 11 and of 29 bits."""
+    """Return identifiers of 11 and 29 bits that no device uses."""
     others = [i for i in range(0x7FF) if i not in own]
     extended = [EXTENDED_FLAG | 0x1234_0000 | i for i in (1, 0x710)]
     return random.Random(2).sample(others, min(40, len(others))) + [i for i in extended if i not in own]

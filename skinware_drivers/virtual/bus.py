@@ -116,8 +116,9 @@ class VirtualCanBus(Bus):
     def name(self) -> str:
         return f"bus virtual:{self._emulated}"
 
-    def fits(self, medium: str) -> bool:
-        """Drivers of CAN devices, and of programs that make values."""
+    @classmethod
+    def fits(cls, medium: str) -> bool:
+        """Return whether a driver of CAN devices, or of a program that makes values, can use the bus."""
         return medium in ("can", "virtual")
 
     def instead(self, medium: str) -> str:

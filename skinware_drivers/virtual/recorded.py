@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.bus import Bus
+from skinware_drivers.bus import Bus, chosen_by
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
@@ -109,6 +109,17 @@ class ReplayedSerialBus(SerialBus):
             self._hear(chunk, self._recorded.read_ns)
 
 
+_CLASSES: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": ReplayedModbusBus}
+
+
+def _class_of(channel: str, options: dict[str, str]) -> type[Bus]:
+    wanted = options_from_strings(ReplayOptions, options)
+    with _open(channel) as recording:
+        medium = medium_of(recording, wire_of(recording, wanted.bus, wanted.driver))
+        return _CLASSES.get(medium, ReplayedCanBus)
+
+
+@chosen_by(_class_of)
 def replayed_bus(
     channel: str,
     options: dict[str, str] | None = None,

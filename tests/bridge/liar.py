@@ -103,7 +103,7 @@ def lying(net: Net, lies: Lies) -> Iterator[NetLink]:
         who, asked_ns = struct.unpack("<16sq", message)
         mask = (1 << 64) - 1
         heard_ns, answered_ns = (time_ns & mask for time_ns in lies.clock(now_ns()))
-        link.tell(keys.pong(who.decode()), struct.pack("<qQQ", asked_ns, heard_ns, answered_ns))
+        link.put(keys.pong(who.decode()), struct.pack("<qQQ", asked_ns, heard_ns, answered_ns))
 
     def push() -> None:
         sender, count = link.sender(keys.frame("pose")), 0
@@ -117,10 +117,10 @@ def lying(net: Net, lies: Lies) -> Iterator[NetLink]:
     link.answer(keys.services, lambda question: question.reply(lies.services()))
     link.answer(keys.of("*", "generation"), lambda question: question.reply(lies.generation()))
     link.answer(keys.of("*", "newest"), asked.put)
-    link.answer(keys.call("*", "*"), lambda question: question.reply(lies.call()))
+    link.answer(keys.of("*", "call/*"), lambda question: question.reply(lies.call()))
     link.listen(keys.ping, ping)
     for token in (keys.token, *lies.tokens):
-        link.be_there(token)
+        link.declare_token(token)
     pusher = threading.Thread(target=push, name="liar")
     pusher.start()
     try:

@@ -121,7 +121,7 @@ def joining(
     here = Namespace(f"{namespace.name}-{into}")
     events: list[dict[str, Any]] = []
     link = NetLink(net)
-    joiner = Joiner(robot, link, here, mode=mode, wish=wish, tell=events.append)
+    joiner = Joiner(robot, link, here, mode=mode, wish=wish, on_event=events.append)
     thread = threading.Thread(target=joiner.run, name="join")
     thread.start()
     try:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, Skin
-from skinware.bridge.giving import Stream
-from skinware.bridge.messages import coded_part, parts_of
+from skinware.bridge.link import Question
+from skinware.bridge.messages import FrameMessage, split_frame
+from skinware.bridge.streaming import Stream
 from skinware.errors import Paused, PeerGone, RequestError, RequestFailed, RequestRefused, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
@@ -107,10 +108,8 @@ def test_a_pulled_frame_is_the_difference_to_one_that_is_kept_and_comes_once(nam
             ends.net.answered.clear()
             for _ in range(20):
                 until_read(there, publish(writer))
-        messages = [
-            reply.payload for key, reply in ends.net.answered if parts_of(key)[-1] == "newest" and reply.payload
-        ]
-        pulled = [(np.frombuffer(coded_part(message)[0], HEADER, 1)[0], coded_part(message)[1]) for message in messages]
+        messages = [split_frame(answer) for key, answer in ends.net.answered if key.endswith("/newest") and answer]
+        pulled = [(head_of(message), message.keeps) for message in messages]
     sequences = [int(header["sequence"]) for header, _ in pulled]
     kept = {int(header["sequence"]) for header, keeps in pulled if keeps}
     others = [int(header["after"]) for header, keeps in pulled if not keeps]
@@ -119,19 +118,22 @@ def test_a_pulled_frame_is_the_difference_to_one_that_is_kept_and_comes_once(nam
     assert len(set(sequences)) > 0.75 * len(sequences)
 
 
-class _Asked:
+def head_of(message: FrameMessage) -> np.void:
+    head: np.void = np.frombuffer(message.content, HEADER, 1)[0]
+    return head
+
+
+class Asked:
     """A question of a puller, with its answers."""
 
     def __init__(self, others: int, base: int = 0) -> None:
-        self.key, self.payload = "", b""
-        self.parameters = {"who": "x", "others": str(others), "base": str(base)}
-        self.answers: list[bytes] = []
+        self.answers: list[FrameMessage] = []
+        parameters = {"who": "x", "others": str(others), "base": str(base)}
+        self.question = Question("", parameters, b"", lambda payload: self.answers.append(split_frame(payload)), _fail)
 
-    def reply(self, payload: bytes) -> None:
-        self.answers.append(payload)
 
-    def fail(self, error: bytes) -> None:
-        raise AssertionError(error)
+def _fail(error: bytes) -> None:
+    raise AssertionError(error)
 
 
 def test_each_of_several_open_questions_has_a_frame_of_its_own(namespace: Namespace) -> None:
@@ -143,22 +145,22 @@ def test_each_of_several_open_questions_has_a_frame_of_its_own(namespace: Namesp
         publish(writer)
         first = reader.read()
         stream.begin(first.generation, [CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
-        asked = [_Asked(others) for others in range(4)]
+        asked = [Asked(others) for others in range(4)]
         for question in asked:
-            stream.asked(question)
+            stream.asked(question.question)
         for _ in range(5):
             stream.take(reader.read())
             publish(writer)
-        heads = [np.frombuffer(coded_part(question.answers[0])[0], HEADER, 1)[0] for question in asked]
+        heads = [head_of(question.answers[0]) for question in asked]
         assert [int(head["sequence"]) for head in heads] == [1, 2, 3, 4]
-        assert [coded_part(question.answers[0])[1] for question in asked] == [True, False, False, False]
-        again = [_Asked(0, base=1), _Asked(1, base=1), _Asked(2, base=99)]
+        assert [question.answers[0].keeps for question in asked] == [True, False, False, False]
+        again = [Asked(0, base=1), Asked(1, base=1), Asked(2, base=99)]
         for question in again:
-            stream.asked(question)
+            stream.asked(question.question)
         for _ in range(2):
             stream.take(reader.read())
             publish(writer)
-        heads = [np.frombuffer(coded_part(question.answers[0])[0], HEADER, 1)[0] for question in again]
+        heads = [head_of(question.answers[0]) for question in again]
         assert [int(head["sequence"]) for head in heads] == [5, 6, 7]
         assert [int(head["after"]) for head in heads] == [1, 1, 0], "who does not have the frame gets a whole one"
 
@@ -330,7 +332,7 @@ def test_what_is_served_twice_or_in_another_version_is_told(ends: Ends) -> None:
     with serving(ends.net, ends.there), driver(ends.there) as writer:
         until_appeared(ends, writer)
         other = NetLink(ends.net)
-        other.be_there(f"skinware/live/{ROBOT}/2/00000000000000ab")
+        other.declare_token(f"skinware/live/{ROBOT}/2/00000000000000ab")
         wait_until(lambda: any("version 2 of the bridge" in event.get("why", "") for event in ends.events))
         with serving(ends.net, Namespace(f"{ends.there.name}-other")):
             wait_until(lambda: any("served by two bridges" in event.get("why", "") for event in ends.events))

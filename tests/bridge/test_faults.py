@@ -7,13 +7,14 @@ import os
 import random
 import shutil
 import socket
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
 
 from skinware import DriverReader, DriverWriter
-from skinware.bridge.messages import VERSION, About, Head, generation_message
+from skinware.bridge.messages import VERSION, About, generation_message
 from skinware.errors import ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware_drivers.testing.waiting import wait_until
@@ -241,7 +242,7 @@ def test_another_version_is_told_whichever_is_older(
     monkeypatch.setattr("skinware.bridge.messages.VERSION", ours)
     with joined(namespace) as ends:
         other = NetLink(ends.net)
-        other.be_there(f"skinware/live/{ROBOT}/{theirs}/abcd")
+        other.declare_token(f"skinware/live/{ROBOT}/{theirs}/abcd")
         until_told(ends, f"robot {ROBOT} is served by version {theirs} of the bridge; this one is {ours}: install")
         other.close()
 
@@ -249,8 +250,9 @@ def test_another_version_is_told_whichever_is_older(
 def test_a_robot_whose_files_are_of_another_version_is_told(
     namespace: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def of_another(about: About, head: Head) -> bytes:
-        return generation_message(about, Head(head.raw[:8] + bytes([9]) + head.raw[9:]))
+    def of_another(about: About, packed: bytes) -> bytes:
+        raw = zlib.decompress(packed)
+        return generation_message(about, zlib.compress(raw[:8] + bytes([9]) + raw[9:]))
 
     monkeypatch.setattr("skinware.bridge.serving.generation_message", of_another)
     with (

@@ -19,11 +19,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinware.bridge.giving import Stream
-from skinware.bridge.link import Guard, Reply, Room
+from skinware.bridge.link import Guard, Question
 from skinware.bridge.messages import (
     About,
-    Answered,
+    CallResult,
     Service,
     Services,
     Summary,
@@ -32,7 +31,9 @@ from skinware.bridge.messages import (
     split_generation,
     token_parts,
 )
-from skinware.bridge.peer import Turns
+from skinware.bridge.mirror import MemoryBudget
+from skinware.bridge.peer import Jobs
+from skinware.bridge.streaming import Stream
 from skinware.bridge.watching import Watcher
 from skinware.errors import BridgeError, RequestError
 from skinware.memory.namespace import Namespace
@@ -140,7 +141,7 @@ def test_no_lie_ends_a_join_and_each_is_counted(namespace: Namespace, name: str)
             wait_until(lambda: any(f"robot {ROBOT}: {lie.why}" in event.get("why", "") for event in ends.events))
         if lie.comes:
             wait_until(lambda: "pose" in ends.here.services())
-        ends.joiner._turns.soon((answered := threading.Event()).set)
+        ends.joiner._jobs.add((answered := threading.Event()).set)
         assert answered.wait(30), "it goes on"
 
 
@@ -160,13 +161,13 @@ def test_an_odd_answer_to_a_call_is_an_error_of_the_call(namespace: Namespace, a
 
 
 def test_the_rings_of_a_robot_have_one_limit() -> None:
-    room = Room(100)
-    room.take("a", 60)
-    room.take("a", 90)
+    budget = MemoryBudget(100)
+    budget.reserve("a", 60)
+    budget.reserve("a", 90)
     with pytest.raises(BridgeError, match=r"beside 0\.0 MB of other services"):
-        room.take("b", 11)
-    room.give_back("a")
-    room.take("b", 100)
+        budget.reserve("b", 11)
+    budget.release("a")
+    budget.reserve("b", 100)
 
 
 def test_a_generation_that_swells_costs_no_more_than_it_may() -> None:
@@ -183,16 +184,16 @@ def test_a_generation_that_swells_costs_no_more_than_it_may() -> None:
 
 
 def test_what_waits_for_its_turn_is_bounded() -> None:
-    turns = Turns()
+    jobs = Jobs()
     try:
         done: list[int] = []
         for number in range(10_000):
-            turns.soon(partial(done.append, number), 1 << 16)
-        assert turns.left_out > 0
-        turns.take()
-        assert len(done) + turns.left_out == 10_000
+            jobs.add(partial(done.append, number), 1 << 16)
+        assert jobs.left_out > 0
+        jobs.run()
+        assert len(done) + jobs.left_out == 10_000
     finally:
-        turns.close()
+        jobs.close()
 
 
 # -- every kind of message, changed in every way ------------------------------------------------------------------
@@ -201,7 +202,7 @@ TRUE: list[tuple[type[Any], Any]] = [
     (Services, Services(INSTANCE, "x", ("me",), {"arm": Service(7)}, "", "nao")),
     (Summary, Summary("lab")),
     (About, About({"tare": "x"})),
-    (Answered, Answered(7, 1, msgspec.Raw(b'{"a":[1]}'))),
+    (CallResult, CallResult(7, 1, msgspec.Raw(b'{"a":[1]}'))),
     (Wish, Wish(("palm",), ())),
 ]
 ODD: list[Any] = [None, True, -1, 2**63, 10**400, 1.5, "", "\x1b[2J", "a" * 100_000, [], {}, [[]] * 3, {"": {}}]
@@ -243,8 +244,8 @@ def test_every_token_is_read_or_refused(text: str) -> None:
 def test_no_question_ends_a_robots_bridge_and_each_is_counted(namespace: Namespace) -> None:
     with network() as net, serving(net, namespace) as server:
         eve = NetLink(net)
-        answers: list[Reply] = []
-        root = server._keys._root
+        answers: list[bytes | None] = []
+        root = server._keys.root
         keys = (f"{root}/services", f"{root}/arm/generation", f"{root}/arm/newest", f"{root}/arm/call/tare")
         odd: tuple[dict[str, object], ...] = (
             {"sequence": "²"},
@@ -257,8 +258,8 @@ def test_no_question_ends_a_robots_bridge_and_each_is_counted(namespace: Namespa
             for parameters in odd:
                 for payload in (b"", DEEP, b"\xff", b'{"patches": [5]}', b"[" * 2_000_000):
                     eve.ask(key, answers.append, timeout_s=1, priority=None, parameters=parameters, payload=payload)
-        eve.tell(f"{root}/ping", b"")
-        eve.tell(f"{root}/ping", os.urandom(24))
+        eve.put(f"{root}/ping", b"")
+        eve.put(f"{root}/ping", os.urandom(24))
         net.idle()
         wait_until(lambda: len(answers) == len(keys) * len(odd) * 5)
         asked = threading.Event()
@@ -270,14 +271,8 @@ class Asked:
     """A question for the newest frame, with its answers."""
 
     def __init__(self, **parameters: str) -> None:
-        self.key, self.payload, self.parameters = "", b"", parameters
         self.answers: list[bytes] = []
-
-    def reply(self, payload: bytes) -> None:
-        self.answers.append(payload)
-
-    def fail(self, error: bytes) -> None:
-        self.answers.append(error)
+        self.question = Question("", parameters, b"", self.answers.append, self.answers.append)
 
 
 class NoSender:
@@ -291,12 +286,12 @@ def test_pullers_and_their_questions_are_bounded() -> None:
     stream = Stream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
     many = [Asked(who=f"w{number}") for number in range(500)]
     for question in many:
-        stream.asked(question)
+        stream.asked(question.question)
     assert stream.n_pullers <= 64
     assert sum(bool(question.answers) for question in many) >= 400
     often = [Asked(who="w") for _ in range(3000)]
     for question in often:
-        stream.asked(question)
+        stream.asked(question.question)
     assert sum(b"too many" in b"".join(question.answers) for question in often) >= 1900
     stream.close()
     assert all(question.answers for question in (*many, *often))
@@ -306,11 +301,11 @@ def test_what_cannot_be_read_of_a_robot_is_counted_where_robots_are_listed() -> 
     with network() as net:
         link, eve = NetLink(net), NetLink(net)
         watcher = Watcher(link)
-        eve.be_there(f"skinware/live/{ROBOT}/1/{INSTANCE}")
+        eve.declare_token(f"skinware/live/{ROBOT}/1/{INSTANCE}")
         for token in ("skinware/live/x y/1/z", f"skinware/live/{ROBOT}/²/{INSTANCE[::-1]}"):
-            eve.be_there(token)
+            eve.declare_token(token)
         for payload in (DEEP, b"\xff", b'{"namespace": "\\u001b[31m"}', b'{"drivers": {"a": {}}}'):
-            eve.tell(f"skinware/1/{ROBOT}/{INSTANCE}/summary", payload)
+            eve.put(f"skinware/1/{ROBOT}/{INSTANCE}/summary", payload)
         net.idle()
         seen = next(seen for seen in watcher.robots() if seen.instance == INSTANCE)
         assert seen.guard.count == 4

@@ -18,17 +18,16 @@ from skinware.bridge.messages import (
     CODED,
     RAW,
     About,
-    Head,
+    FrameMessage,
     Keys,
     coded_message,
-    form_of,
     generation_message,
-    generation_of,
     raw_message,
-    slot_of,
+    split_frame,
     split_generation,
 )
 from skinware.bridge.pacing import Pacing
+from skinware.bridge.parts import Head
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
@@ -151,10 +150,10 @@ def test_pushed_frames_that_grow_old_are_asked_for() -> None:
     pacing = Pacing(PERIOD_NS)
     assert pacing.probed(0, MS)
     at_ns = 0
-    while not pacing.saw(at_ns, 2 * MS, MS) and at_ns < 10 * NS_PER_S:
+    while not pacing.arrived(at_ns, 2 * MS, MS) and at_ns < 10 * NS_PER_S:
         at_ns += PERIOD_NS
     assert pacing.mode == "push"
-    while not pacing.saw(at_ns, 50 * MS, MS):
+    while not pacing.arrived(at_ns, 50 * MS, MS):
         at_ns += PERIOD_NS
         assert at_ns < 13 * NS_PER_S
     assert pacing.mode == "pull"
@@ -168,7 +167,7 @@ def test_delay_alone_is_no_reason_to_ask_for_single_frames(delay_ns: int) -> Non
     assert pacing.probed(0, MS)
     at_ns = 0
     for jitter_ns in np.random.default_rng(3).integers(0, 20 * MS, 3000).tolist():
-        assert not pacing.saw(at_ns, delay_ns + jitter_ns, 2 * delay_ns)
+        assert not pacing.arrived(at_ns, delay_ns + jitter_ns, 2 * delay_ns)
         at_ns += PERIOD_NS
 
 
@@ -182,7 +181,7 @@ def asked_at_once(pacing: Pacing, until_ns: int, wait_of: Callable[[int], int], 
     """How many questions are open after each frame; ``wait_of``: how long a frame waits with so many, ns."""
     at_ns = 0
     while at_ns < until_ns:
-        pacing.saw(at_ns, round_trip_ns // 2 + wait_of(pacing.open), round_trip_ns)
+        pacing.arrived(at_ns, round_trip_ns // 2 + wait_of(pacing.open), round_trip_ns)
         at_ns += max(PERIOD_NS, round_trip_ns // pacing.open)
         yield pacing.open
 
@@ -209,7 +208,7 @@ def test_frames_behind_a_lost_packet_are_no_queue(mode: str) -> None:
         assert pacing.probed(0, MS)
     for number in range(4000):
         late_ns = max(0, 120 * MS - number % 20 * PERIOD_NS)
-        pacing.saw(at_ns, 50 * MS + late_ns, 100 * MS)
+        pacing.arrived(at_ns, 50 * MS + late_ns, 100 * MS)
         at_ns += PERIOD_NS
     assert pacing.mode == mode
     assert mode == "push" or pacing.open == 22
@@ -219,8 +218,8 @@ def test_a_moment_of_waiting_changes_little() -> None:
     pacing = Pacing(PERIOD_NS, "pull")
     list(asked_at_once(pacing, 20 * NS_PER_S, lambda _: 0, 200 * MS))
     wanted = pacing.open
-    pacing.saw(21 * NS_PER_S, 900 * MS, 200 * MS)
-    pacing.saw(22 * NS_PER_S, 900 * MS, 200 * MS)
+    pacing.arrived(21 * NS_PER_S, 900 * MS, 200 * MS)
+    pacing.arrived(22 * NS_PER_S, 900 * MS, 200 * MS)
     assert pacing.open == wanted
 
 
@@ -228,7 +227,7 @@ def test_a_moment_of_waiting_changes_little() -> None:
 def test_a_mode_that_a_person_wants_stays(mode: str) -> None:
     pacing = Pacing(PERIOD_NS, mode)
     assert not pacing.wants_probe(0, MS)
-    assert not any(pacing.saw(at_ns, NS_PER_S, MS) for at_ns in range(0, 9 * NS_PER_S, PERIOD_NS))
+    assert not any(pacing.arrived(at_ns, NS_PER_S, MS) for at_ns in range(0, 9 * NS_PER_S, PERIOD_NS))
     assert pacing.mode == mode
 
 
@@ -241,20 +240,21 @@ def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
         with ServiceReader("arm", namespace=namespace) as reader:
             frame = reader.read()
             message = raw_message(frame)
-            assert (form_of(message), generation_of(message)) == (RAW, frame.generation)
-            assert slot_of(message).tobytes() == bytes(frame.slot)
+            assert split_frame(message) == (RAW, frame.generation, frame.slot, False)
             encoder = Encoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
-            message = coded_message(encoder.encode(frame), True)
-            assert (form_of(message), generation_of(message)) == (CODED, frame.generation)
+            coded = encoder.encode(frame)
+            for keeps in (True, False):
+                expected = FrameMessage(CODED, frame.generation, memoryview(coded), keeps)
+                assert split_frame(coded_message(coded, keeps)) == expected
     about = About({"tare": "Take the present load as none."})
-    head = Head(b"head" * 1000)
-    assert split_generation(generation_message(about, head)) == (about, head.raw)
-    assert head.packed() is head.packed(), "it is packed once for all who ask"
+    head = Head("arm", b"head" * 1000)
+    assert split_generation(generation_message(about, head.packed)) == (about, head.raw)
+    assert head.packed is head.packed, "it is packed once for all who ask"
 
 
 @given(st.binary(max_size=200))
 def test_random_bytes_are_refused_and_nothing_else(message: bytes) -> None:
-    for read in (form_of, split_generation):
+    for read in (split_frame, split_generation):
         with contextlib.suppress(BridgeError):
             read(message)
 

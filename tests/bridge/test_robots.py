@@ -147,8 +147,8 @@ def test_nothing_is_told_where_nobody_listens_and_nonsense_is_left_out(namespace
             wait_until(lambda: told(watcher, "walle") is not None)
             nonsense = NetLink(net)
             for payload in (b"", b"\xff\xfe", b"[]", b'{"drivers": 5}'):
-                nonsense.tell(Keys("walle", watcher.robots()[0].instance).summary, payload)
-                nonsense.tell(Keys("eve", "00000000000000ee").summary, payload)
+                nonsense.put(Keys("walle", watcher.robots()[0].instance).summary, payload)
+                nonsense.put(Keys("eve", "00000000000000ee").summary, payload)
             net.idle()
             assert [seen.robot for seen in watcher.robots()] == ["walle"]
 
@@ -156,7 +156,7 @@ def test_nothing_is_told_where_nobody_listens_and_nonsense_is_left_out(namespace
 def test_a_robot_of_another_version_is_there_and_tells_nothing() -> None:
     with network() as net, watching(net) as watcher:
         other = NetLink(net)
-        other.be_there("skinware/live/eve/9/abcd")
+        other.declare_token("skinware/live/eve/9/abcd")
         wait_until(lambda: [(seen.robot, seen.version) for seen in watcher.robots()] == [("eve", 9)])
         other.close()
         wait_until(lambda: not watcher.robots())
@@ -170,7 +170,7 @@ def test_a_robot_that_goes_as_its_clock_is_asked_for_leaves_nothing(moment: str)
         class Vanishing(NetLink):
             """The robot goes right before, or right after, somebody listens to the answers of its clock."""
 
-            def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:
+            def listen(self, key: str, heard: Callable[[str, bytes], object]) -> Callable[[], None]:
                 end = super().listen(key, heard) if moment == "after" else None
                 if "/pong/" in key:
                     robot.close()
@@ -180,7 +180,7 @@ def test_a_robot_that_goes_as_its_clock_is_asked_for_leaves_nothing(moment: str)
 
         link = Vanishing(net)
         watcher = Watcher(link)
-        robot.be_there(Keys("eve", "00000000000000ee").token)
+        robot.declare_token(Keys("eve", "00000000000000ee").token)
         watcher.run()
         assert not watcher.robots()
         assert not [key for key, _ in net.listeners if "/pong/" in key]

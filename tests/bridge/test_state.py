@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 
 from skinware import DriverWriter, ServiceWriter
-from skinware.bridge.clock import answering
+from skinware.bridge.clock import answer_pings
 from skinware.bridge_state import MOST, BridgeReader, BridgeState, BridgeStateWriter, ServiceState, service_name
 from skinware.cli._report import report
 from skinware.cli.info import as_text
@@ -109,13 +109,13 @@ def test_the_true_error_of_the_clock_is_not_more_than_what_is_told(
     def clock() -> int:
         return now_ns() + away_ns + round((now_ns() - begin_ns) * 50e-6)
 
-    monkeypatch.setattr("skinware.bridge.serving.answering", partial(answering, clock=clock))
+    monkeypatch.setattr("skinware.bridge.serving.answer_pings", partial(answer_pings, clock=clock))
     ended = threading.Event()
     with joined(namespace, "push") as ends, serving(ends.net, ends.there):
         wait_until(lambda: ends.joiner.clock.is_known)
         for _ in range(30):
             ended.wait(0.05)
-            with ends.joiner._lock:
+            with ends.joiner._mirror.lock:
                 time_ns = now_ns()
                 true_ns = -away_ns - round((time_ns - begin_ns) * 50e-6)
                 assert abs(ends.joiner.clock.offset_ns(time_ns) - true_ns) <= ends.joiner.clock.error_ns

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values

@@ -16,15 +16,14 @@ from skinware.cli import _top_app
 from skinware.cli._command import exit_status
 from skinware.cli._contacts import TITLES, labels_of, line_of, lines_of, plain_text
 from skinware.cli._heat_map import arrange
-from skinware.cli._heat_widget import HeatMap
+from skinware.cli._painting import HeatMap
 from skinware.cli._top_app import SkinTop
 from skinware.cli.top import command
 from skinware.geometry import Geometry
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
-from skinware.views import live
-from skinware.views.beside import live_contacts, places_of
+from skinware.views.live import live_contacts, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until
@@ -58,7 +57,7 @@ def touched_skin(*taxels: int, driver: str = "a") -> Iterator[ContactsWriter]:
 
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
 
 
@@ -148,7 +147,7 @@ def test_labels_stand_over_the_sensors_that_are_drawn() -> None:
 def test_services_that_come_and_go_are_followed() -> None:
     contacts = live_contacts(Namespace())
     with touched_skin() as writer:
-        contacts.look(["a", "contacts"])
+        contacts.look()
         frame = contacts.of("a")
         assert frame is not None
         assert len(frame.contacts) == 2
@@ -159,7 +158,7 @@ def test_services_that_come_and_go_are_followed() -> None:
         writer.publish(value * 5.0, value, now_ns())
         wait_until(lambda: contacts.of("a") is not None)
     assert contacts.of("a") is None
-    contacts.look([])
+    contacts.look()
     contacts.close()
     contacts.close()
 

@@ -19,7 +19,7 @@ from skinware_drivers.cli.find import command
 from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on_a_pty
 from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.sdk.driving import driving, emulated
@@ -138,7 +138,7 @@ def test_a_bus_that_cannot_be_heard_does_not_spoil_the_report(
 
 
 def test_probing_tells_who_answers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "to ask who is there: skin-find virtual?boards=3 --probe" in found(capsys, "virtual?boards=3")
+    assert "to ask which devices are on it: skin-find virtual?boards=3 --probe" in found(capsys, "virtual?boards=3")
     assert "answers: ROBOSKIN: board 3 (mtb4 1.25.0)" in found(capsys, "virtual?boards=3", "--probe")
     (bus,) = found_data(capsys, "virtual?boards=3", "--probe", "--driver", "roboskin")["buses"]
     assert bus["probe"]["asked"] == ["roboskin"]
@@ -216,7 +216,7 @@ def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
         (["nonsense:0"], 2, "no interface 'nonsense'"),
         (["--force"], 2, "--probe"),
         (["--listen", "-1"], 2, "seconds"),
-        (["--udev", "can0"], 2, "no serial port"),
+        (["--udev", "can0"], 2, "not a serial port"),
         (["serial:?serial_number=A5"], 1, "there is no serial port"),
         (["tcp://127.0.0.1", "--probe"], 2, "bus tcp://127.0.0.1: which port? Write tcp://HOST:PORT"),
         (["modbus:tcp://:70000"], 2, "ports have numbers up to 65535"),

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Structure
-from skinware import state as health
+from skinware import state as state_module
 from skinware.memory.ring import Sample
 from skinware.state import (
     bus_state_name,
     count_statuses,
-    health_of,
     life_of,
     patch_ages_ns,
     patch_state_name,
     rate_now_hz,
+    report_of,
     status_now,
 )
 from skinware.status import Status
@@ -36,8 +36,8 @@ def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool =
 
 @pytest.fixture
 def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "now_ns", lambda: NOW_NS)
-    monkeypatch.setattr(health, "_LEAST_SILENCE_NS", SECOND)
+    monkeypatch.setattr(state_module, "now_ns", lambda: NOW_NS)
+    monkeypatch.setattr(state_module, "_LEAST_SILENCE_NS", SECOND)
 
 
 def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,14 +107,14 @@ def test_states_of_a_later_version_stay_numbers() -> None:
 
 def test_a_driver_in_a_few_figures() -> None:
     with FakeSkin("a", fake_structure(2, 4)) as skin, DriverReader("a") as reader:
-        assert health_of(reader, None, None).life == "starting"
+        assert report_of(reader, None, None).life == "starting"
         skin.break_some()
         skin.publish()
-        health = health_of(reader, reader.read(), 19.5)
-    assert (health.name, health.life, health.rate_hz, health.sensors) == ("a", "live", 19.5, 96)
-    assert health.statuses["fresh"] == 48 - 7
-    assert health.patches == {"live": 1, "stale": 1}
-    assert health.counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
+        report = report_of(reader, reader.read(), 19.5)
+    assert (report.name, report.life, report.rate_hz, report.sensors) == ("a", "live", 19.5, 96)
+    assert report.statuses["fresh"] == 48 - 7
+    assert report.patch_states == {"live": 1, "stale": 1}
+    assert report.counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
 
 
 def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:
@@ -123,14 +123,14 @@ def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:
     with DriverReader("a") as reader:
         frame = reader.read()
         skin.close()
-        health = health_of(reader, frame, 20.0)
-    assert (health.life, health.rate_hz) == ("dead", 0.0)
-    assert (health.statuses["fresh"], health.statuses["stale"]) == (0, 24)
-    assert health.patches == {"was live": 1}
+        report = report_of(reader, frame, 20.0)
+    assert (report.life, report.rate_hz) == ("dead", 0.0)
+    assert (report.statuses["fresh"], report.statuses["stale"]) == (0, 24)
+    assert report.patch_states == {"was live": 1}
 
 
 def test_a_patch_is_as_old_as_its_newest_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "now_ns", lambda: 5000)
+    monkeypatch.setattr(state_module, "now_ns", lambda: 5000)
     structure = fake_structure(3, 2)
     frame = SimpleNamespace(structure=structure, group_time_ns=np.array([1000, 4000, 0, 2000, 0, 0]))
     assert patch_ages_ns(cast(Any, frame)) == [1000, 3000, None]

@@ -9,7 +9,6 @@ import pytest
 
 from skinware import Namespace, ServiceWriter
 from skinware.realtime import now_ns
-from skinware.views import live
 from skinware.views.live import LiveDriver, LiveDrivers
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.specification import ring
@@ -17,7 +16,7 @@ from tests.specification import ring
 
 @pytest.fixture(autouse=True)
 def look_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
 
 
 def names(drivers: LiveDrivers) -> list[str]:
@@ -44,7 +43,7 @@ def test_poll_tells_of_newer_frames_only() -> None:
         assert driver.frame is not None
         assert driver.frame.sequence == 2
         assert not drivers.poll(driver)
-        assert driver.health().life == "live"
+        assert driver.report().life == "live"
 
 
 def test_a_dead_driver_stays_until_its_file_goes() -> None:
@@ -55,7 +54,7 @@ def test_a_dead_driver_stays_until_its_file_goes() -> None:
             kill(process)
             assert names(drivers) == ["a"]
             drivers.poll(driver)
-            assert driver.health().life == "dead"
+            assert driver.report().life == "dead"
         assert names(drivers) == []
 
 
@@ -68,7 +67,7 @@ def test_a_driver_may_come_back_changed() -> None:
         with FakeSkin("a", fake_structure(1, 3)) as again:
             drivers.poll(driver)
             assert driver.reader.structure.n_sensors == 36
-            assert driver.health().life in ("live", "starting")
+            assert driver.report().life in ("live", "starting")
             again.publish()
             assert drivers.poll(driver)
             assert driver.frame is not None
@@ -121,8 +120,7 @@ def test_the_rate_is_measured_over_two_seconds() -> None:
             patch_interval_counts=counts,
             structure=fake_structure(2, 2),
         )
-        driver._sample(cast(Any, frame))
-        driver.frame = cast(Any, frame)
+        driver.take(cast(Any, frame))
 
     assert driver.rate_hz == 7.0  # that of the ring
     assert driver.patch_rates_hz == [None, None]
@@ -130,13 +128,13 @@ def test_the_rate_is_measured_over_two_seconds() -> None:
         take(2 * tenth + 1, tenth * 100_000_000)  # every other frame at 20 Hz
     assert driver.rate_hz == pytest.approx(20.0)
     assert driver.patch_rates_hz == pytest.approx([20.0, 5.0])
-    assert len(driver._samples) <= 21
+    assert len(driver._counts) <= 21
     for tenth in range(50, 100):
         take(4 * tenth, tenth * 100_000_000)  # then at 40 Hz
     assert driver.rate_hz == pytest.approx(40.0)
     take(0, 10 * 10**9, generation=2)
     take(0, 11 * 10**9, generation=2)
     assert driver.patch_rates_hz == [None, None]  # nobody counts
-    driver._samples.clear()
+    driver._counts.clear()
     take(1, 12 * 10**9, generation=2)
     assert driver.rate_hz == 7.0

@@ -14,7 +14,7 @@ from skinware.cli._heat_map import LEVELS
 from skinware.cli._picture import RANGE, Picture, describe_sensor
 from skinware.cli._top_rows import BUS, DRIVER, PATCH, RowKey
 from skinware.tactile.regions import Region, Regions
-from skinware.views import quantities
+from skinware.views import history
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 DRIVER_ROW, BUS_ROW, PATCH_ROW = RowKey("a", DRIVER, 0), RowKey("a", BUS, 0), RowKey("a", PATCH, 1)
@@ -116,7 +116,7 @@ def test_the_baseline_is_taken_anew_on_request() -> None:
 def test_a_taxel_stuck_at_a_plausible_value_is_found_by_a_wipe_test(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(quantities, "SETTLING_S", 0.0)
+    monkeypatch.setattr(history, "SETTLING_S", 0.0)
     with published() as (skin, reader):
         assert skin.values is not None
         picture = Picture()

@@ -104,7 +104,7 @@ def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
     with running("skin-replay", str(path), "--wire", "--loop", "--bus", f"pty:{link}") as replay:
         replay.wait_for("ready")
         adapter = kind(kind.Options())
-        after = record(again, adapter, make_bus(str(link), payload_size=adapter.payload_size), 15)
+        after = record(again, adapter, make_bus(str(link), payload_size=adapter.payload_size), 15, updates=20)
         replay.stop()
     assert after.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
     for old, new in zip(updates_of(before), updates_of(after), strict=True):
@@ -116,9 +116,9 @@ def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["--wire"], "--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:walk.mcap"),
-        (["--bus", "vcan0"], "--bus is for --wire"),
+        (["--bus", "vcan0"], "--bus needs --wire"),
         (["--wire", "--bus", "x", "--paused"], "--paused is about drivers and services"),
-        (["--wire", "--bus", "x", "--times", "recorded"], "--times is about the frames of drivers"),
+        (["--wire", "--bus", "x", "--times", "recorded"], "--times is about snapshots of drivers"),
         (["--wire", "--bus", "vcan0"], "walk.mcap: which bus? there are: bus=can0&driver=torso, bus=can1&driver=torso"),
         (["--wire", "--bus", "can0=a", "--bus", "can0=b"], "--bus can0=b: can0 is sent already"),
     ],

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from skinware.sensor_types import PRESSURE
-from skinware.views.quantities import Rest
+from skinware.views.history import Rest
 from tests.cli.fake_skin import fake_structure
 
 STRUCTURE = fake_structure(1, 1)

@@ -3,21 +3,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware.cli._picture import ChangeScale, ValueScale
-from skinware.views.quantities import rounded_up
+from skinware.cli._heat_map import levels_of
+from skinware.cli._picture import change_levels
+from skinware.views.history import ChangeSpan, ValueLimits, rounded_up
 
 NOISE = 3.0
-FRESH = np.ones(5, bool)
 S = 10**9
+UNKNOWN = (-np.inf, np.inf)
 
 
-def levels(scale: ChangeScale, change: list[float], time_ns: int = S) -> list[int]:
-    return scale.draw(np.array(change, np.float32), FRESH, NOISE, time_ns, None).levels.tolist()  # type: ignore[no-any-return]
+def levels(change: list[float]) -> list[int]:
+    """Levels of changes that were never greater before."""
+    array = np.array(change, np.float32)
+    return change_levels(array, NOISE, ChangeSpan().follow(array, NOISE, S))[0].tolist()  # type: ignore[no-any-return]
 
 
 def test_a_light_press_is_seen_beside_a_hard_one() -> None:
     """At rest 12 to 17 of 255, pressed up to 136: the figures of a real fingertip."""
-    rest, noisy, light, firm, hard = levels(ChangeScale(), [0, 3, 10, 50, 122])
+    rest, noisy, light, firm, hard = levels([0, 3, 10, 50, 122])
     assert rest == noisy == 0
     assert light >= 2
     assert firm >= light + 4
@@ -25,35 +28,29 @@ def test_a_light_press_is_seen_beside_a_hard_one() -> None:
 
 
 def test_rest_alone_is_dark() -> None:
-    assert levels(ChangeScale(), [0, 1, 2, 3, 3]) == [0] * 5
+    assert levels([0, 1, 2, 3, 3]) == [0] * 5
 
 
-def test_the_scale_says_what_it_means() -> None:
-    scale = ChangeScale()
-    assert scale.draw(np.full(5, 122, np.float32), FRESH, NOISE, S, None).values == (0, 37.5, 150)
-    assert scale.draw(np.zeros(5, np.float32), FRESH, NOISE, 2 * S, None).values == (0, 37.5, 150)
-    assert scale.draw(np.zeros(5, np.float32), FRESH, NOISE, 200 * S, None).values == (0, 7.5, 30)  # forgotten
-
-
-def test_what_is_not_fresh_does_not_count() -> None:
-    fresh = np.array([True, True, True, True, False])
-    drawn = ChangeScale().draw(np.array([0, 1, 2, 3, 9999], np.float32), fresh, NOISE, S, None)
-    assert drawn.values[-1] == 30
-    drawn = ValueScale().draw(np.array([0, 1, 2, 3, 9999], np.float32), fresh, (-np.inf, np.inf), None)
-    assert drawn.values == (0, 3)
+def test_the_scale_follows_changes_and_forgets_them() -> None:
+    span, nothing = ChangeSpan(), np.zeros(5, np.float32)
+    assert span.follow(np.full(5, 122, np.float32), NOISE, S) == 150
+    assert span.follow(nothing, NOISE, 2 * S) == 150
+    assert span.follow(nothing, NOISE, 200 * S) == 30
+    assert change_levels(nothing, NOISE, 150)[1] == (0, 37.5, 150)
 
 
 def test_values_between_known_limits() -> None:
-    drawn = ValueScale().draw(np.array([0, 64, 128, 192, 255], np.float32), FRESH, (0, 255), None)
-    assert (drawn.levels.tolist(), drawn.values) == ([0, 4, 8, 12, 15], (0, 255))
+    values = np.array([0, 64, 128, 192, 255], np.float32)
+    limits = ValueLimits().follow(values, (0, 255))
+    assert limits == (0, 255)
+    assert levels_of(values, *limits).tolist() == [0, 4, 8, 12, 15]
 
 
 def test_values_between_what_was_seen() -> None:
-    scale = ValueScale()
-    nothing = scale.draw(np.full(5, np.nan, np.float32), FRESH, (-np.inf, np.inf), None)
-    assert nothing.values == (0, 1)
-    assert scale.draw(np.full(5, 7, np.float32), FRESH, (0, np.inf), None).values == (7, 7)
-    assert scale.draw(np.full(5, 3, np.float32), FRESH, (0, np.inf), None).values == (3, 7)
+    limits = ValueLimits()
+    assert limits.follow(np.full(5, np.nan, np.float32), UNKNOWN) == (0, 1)
+    assert limits.follow(np.full(5, 7, np.float32), (0, np.inf)) == (7, 7)
+    assert limits.follow(np.full(5, 3, np.float32), (0, np.inf)) == (3, 7)
 
 
 @pytest.mark.parametrize(

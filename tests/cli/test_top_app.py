@@ -16,13 +16,11 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware import state as health
 from skinware.cli import _top_app
-from skinware.cli._heat_widget import HeatMap
-from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
+from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, HeatMap, Palette
 from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region, Regions
-from skinware.views import live
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 
 SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
@@ -82,7 +80,7 @@ def go(scene: Callable[[], Awaitable[None]]) -> None:
 
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
 
 
@@ -357,7 +355,7 @@ def test_nothing_is_drawn_again_that_has_not_changed(monkeypatch: pytest.MonkeyP
 
 
 def _taken(app: SkinTop) -> int:
-    driver = app._drivers.get("a")
+    driver = app._overview.drivers.get("a")
     return driver.frame.sequence if driver is not None and driver.frame is not None else 0
 
 

@@ -13,53 +13,62 @@ from skinware.cli._top_rows import (
     PATCH,
     RowKey,
     as_data,
-    counters_text,
     patches_of,
     plain_line,
     rows_of,
 )
-from skinware.state import SkinHealth, health_of
+from skinware.state import BusReport, DriverReport, PatchReport, report_of
+from skinware.text import counters_text
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
-HEALTH = SkinHealth(
+BUS_REPORT = BusReport("can0", "live", None, None, {"frames": 5156, "lost": 0})
+PATCH_REPORT = PatchReport("board 7", 0, "live", 192, 192, 0, 12_000_000, None, {"orphans": 0})
+STALE, UNCOUNTED = replace(PATCH_REPORT, state="stale"), replace(PATCH_REPORT, counters={})
+REPORT = DriverReport(
     name="roboskin",
     life="live",
     rate_hz=20.0,
     age_ns=12_000_000,
     sensors=768,
     statuses={"fresh": 766, "stale": 2, "never_seen": 0},
-    patches={"live": 4},
-    counters={"frames": 5156, "lost": 0, "orphans": 3},
+    buses=(BUS_REPORT,),
+    patches=(replace(PATCH_REPORT, counters={"orphans": 3}), *[PATCH_REPORT] * 3),
 )
 
 
 def test_a_plain_line() -> None:
-    assert plain_line(HEALTH) == (
+    assert plain_line(REPORT) == (
         "roboskin  20.0 Hz  age 12 ms  sensors 768 (fresh 766, stale 2)  patches 4 live  lost 0  orphans 3"
     )
 
 
 @pytest.mark.parametrize(
-    ("health", "words"),
+    ("report", "words"),
     [
-        (replace(HEALTH, rate_hz=None), "roboskin  ? Hz  age 12 ms"),
-        (replace(HEALTH, life="dead", rate_hz=0.0), "roboskin  DEAD, this is its last frame  age 12 ms"),
-        (replace(HEALTH, life="silent"), "roboskin  SILENT, its process publishes nothing  age 12 ms"),
-        (replace(HEALTH, life="paused"), "roboskin  paused  age 12 ms"),
-        (replace(HEALTH, life="starting", age_ns=None), "roboskin  starting, no frame yet  sensors 768"),
-        (replace(HEALTH, patches={"live": 3, "stale": 1}), "patches 3 live, 1 stale  lost 0"),
-        (replace(HEALTH, statuses={"fresh": 1, "stale": 0, "never_seen": 7}), "(fresh 1, stale 0, never seen 7)"),
-        (replace(HEALTH, counters={"frames": 3}), "patches 4 live"),  # what a driver does not count is not shown
-        (replace(HEALTH, patches={}, counters={}), "patches -"),
+        (replace(REPORT, rate_hz=None), "roboskin  ? Hz  age 12 ms"),
+        (replace(REPORT, life="dead", rate_hz=0.0), "roboskin  DEAD, this is its last frame  age 12 ms"),
+        (replace(REPORT, life="silent"), "roboskin  SILENT, its process publishes nothing  age 12 ms"),
+        (replace(REPORT, life="paused"), "roboskin  paused  age 12 ms"),
+        (replace(REPORT, life="starting", age_ns=None), "roboskin  starting, no frame yet  sensors 768"),
+        (
+            replace(REPORT, patches=(*[PATCH_REPORT] * 3, replace(PATCH_REPORT, state="stale"))),
+            "patches 3 live, 1 stale  lost 0",
+        ),
+        (replace(REPORT, statuses={"fresh": 1, "stale": 0, "never_seen": 7}), "(fresh 1, stale 0, never seen 7)"),
+        (
+            replace(REPORT, buses=(), patches=(replace(PATCH_REPORT, counters={}),) * 4),
+            "patches 4 live",
+        ),  # what a driver does not count is not shown
+        (replace(REPORT, buses=(), patches=()), "patches -"),
     ],
 )
-def test_plain_lines_of_all_kinds(health: SkinHealth, words: str) -> None:
-    assert words in plain_line(health)
-    assert ("lost" in plain_line(health)) == ("lost" in health.counters and health.life != "starting")
+def test_plain_lines_of_all_kinds(report: DriverReport, words: str) -> None:
+    assert words in plain_line(report)
+    assert ("lost" in plain_line(report)) == ("lost" in report.counters and report.life != "starting")
 
 
 def test_json_of_a_plain_line() -> None:
-    assert as_data(HEALTH, []) == {
+    assert as_data(REPORT, []) == {
         "driver": "roboskin",
         "state": "live",
         "rate_hz": 20.0,
@@ -70,7 +79,7 @@ def test_json_of_a_plain_line() -> None:
         "counters": {"frames": 5156, "lost": 0, "orphans": 3},
         "contacts": [],
     }
-    nothing = as_data(replace(HEALTH, rate_hz=None, age_ns=None), [])
+    nothing = as_data(replace(REPORT, rate_hz=None, age_ns=None), [])
     assert (nothing["rate_hz"], nothing["age_ms"]) == (None, None)
 
 
@@ -79,7 +88,7 @@ def test_a_row_per_driver_bus_and_patch() -> None:
         skin.break_some()
         skin.publish()
         frame = reader.read()
-        rows = rows_of(reader, frame, health_of(reader, frame, 19.96))
+        rows = rows_of(report_of(reader, frame, 19.96))
     assert [(row.key.kind, row.key.number, row.cells[0]) for row in rows] == [
         (DRIVER, 0, "torso"),
         (BUS, 0, "  can0"),
@@ -98,24 +107,24 @@ def test_a_row_per_driver_bus_and_patch() -> None:
     assert cells[6][1:3] + cells[6][4:] == ("stale", "", "0/24", "", "0", "")
     assert rows[6].state == "stale"
     assert rows[1].counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7}
-    assert [patches_of(row.key, frame) for row in rows] == [[0, 1, 2, 3], [0, 1], [0], [1], [2, 3], [2], [3]]
-    assert patches_of(RowKey("torso", PATCH, 9), frame) == []
-    assert patches_of(RowKey("torso", BUS, 9), frame) == []
+    assert [patches_of(row.key, frame.structure) for row in rows] == [[0, 1, 2, 3], [0, 1], [0], [1], [2, 3], [2], [3]]
+    assert patches_of(RowKey("torso", PATCH, 9), frame.structure) == []
+    assert patches_of(RowKey("torso", BUS, 9), frame.structure) == []
 
 
 def test_patches_have_rates_as_far_as_they_are_known() -> None:
     with FakeSkin("torso", fake_structure(3, 2)) as skin, DriverReader("torso") as reader:
         skin.publish()
         frame = reader.read()
-        health = health_of(reader, frame, 20.0)
-        rates = [row.cells[2] for row in rows_of(reader, frame, health, [19.96, 0.0, None])]
+        rates = [row.cells[2] for row in rows_of(report_of(reader, frame, 20.0, [19.96, 0.0, None]))]
         assert rates == ["20.0 Hz", "", "20.0 Hz", "0.0 Hz", ""]
-        assert [row.cells[2] for row in rows_of(reader, frame, health, [19.96])][2:] == [""] * 3  # of another structure
+        other = report_of(reader, frame, 20.0, [19.96])  # of another structure
+        assert [row.cells[2] for row in rows_of(other)][2:] == [""] * 3
 
 
 def test_a_driver_without_a_frame_is_one_row() -> None:
     with FakeSkin("torso") as _, DriverReader("torso") as reader:
-        (row,) = rows_of(reader, None, health_of(reader, None, None))
+        (row,) = rows_of(report_of(reader, None))
     assert row.cells == ("torso", "starting", "0.0 Hz", "-", "0/768", "-", "-", "")
 
 
@@ -125,7 +134,7 @@ def test_the_last_states_of_a_dead_driver_are_told_as_such() -> None:
     with DriverReader("torso") as reader:
         frame = reader.read()
         skin.close()
-        rows = rows_of(reader, frame, health_of(reader, frame, 20.0))
+        rows = rows_of(report_of(reader, frame, 20.0))
     assert [row.cells[1] for row in rows] == ["dead", "was live", "was live"]
     assert [row.cells[4] for row in rows] == ["0/24", "", "0/24"]
     assert rows[0].cells[2] == "0.0 Hz"

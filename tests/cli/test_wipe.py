@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skinware.views.wiping import WipeTest
+from skinware.views.history import WipeTest
 from tests.cli.fake_skin import fake_structure
 
 STRUCTURE = fake_structure(1, 2)

@@ -6,8 +6,7 @@
  */
 
 #include "../../skinware/native/library.c"
-#include "../../skinware/native/look.c"
-#include "../../skinware/native/turns.c"
+#include "../../skinware/native/take.c"
 
 #include <inttypes.h>
 #include <pthread.h>
@@ -15,7 +14,7 @@
 #include <stdlib.h>
 #include <sys/mman.h>
 
-enum { WORDS = 509, STRIDE = 64 + 8 * 512, SLOT_OFFSET = 4096, READERS = 5 };
+enum { WORDS = 509, STRIDE = 64 + 8 * 512, SLOT_OFFSET = 4096, READERS = 4 };
 
 static unsigned char *map;
 static uint64_t slots, frames;
@@ -70,82 +69,63 @@ static void compare(tally *mine, const unsigned char *frame) {
     mine->torn += !whole;
 }
 
-/* Looks at the ring as if it were two. */
-static void *look_at_frames(void *argument) {
+/* Takes samples of the ring: in a loop, in order, or (way 3) as if it were two rings. */
+static void *take_frames(void *argument) {
     tally *mine = (tally *)argument;
-    unsigned char *to = (unsigned char *)malloc(2 * STRIDE);
-    skinware_native_look *look = (skinware_native_look *)calloc(1, sizeof *look);
+    const int count = mine->way == 3 ? 2 : 1;
+    unsigned char *to = (unsigned char *)malloc((size_t)count * STRIDE); /* exactly: the checker sees one byte more */
+    skinware_native_take *take = (skinware_native_take *)calloc(1, sizeof *take);
     int i, result;
-    if (to == NULL || look == NULL)
+    if (to == NULL || take == NULL)
         abort();
-    look->count = 2;
-    look->news_only = 1;
-    for (i = 0; i < 2; i++) {
-        look->rings[i].start = (uint64_t)i * STRIDE;
-        look->rings[i].turns = (skinware_native_turns *)calloc(1, sizeof(skinware_native_turns));
-        if (look->rings[i].turns == NULL)
+    take->count = (uint64_t)count;
+    take->is_loop = count == 1;
+    take->wanted = mine->way == 1 ? NEXT : NEWER;
+    take->timeout_ns = 1000000;
+    take->until_ns = INT64_MAX;
+    take->process = getpid();
+    for (i = 0; i < count; i++) {
+        take->places[i].start = (uint64_t)i * STRIDE;
+        take->places[i].reader = (skinware_native_reader *)calloc(1, sizeof(skinware_native_reader));
+        if (take->places[i].reader == NULL)
             abort();
-        look->rings[i].turns->ring = ring_of();
-        look->rings[i].turns->descriptor = descriptor;
-        look->rings[i].turns->writer = SKINWARE__UNKNOWN;
-        look->rings[i].turns->process = getpid();
+        take->places[i].reader->ring = ring_of();
+        take->places[i].reader->descriptor = descriptor;
+        take->places[i].reader->writer = SKINWARE__UNKNOWN;
     }
     while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {
-        look->until_ns = skinware__clock_ns(CLOCK_MONOTONIC) + 1000000;
-        result = skinware_native_newest(look, to);
-        for (i = 0; i < 2; i++) {
-            skinware_native_turns *turns = look->rings[i].turns;
+        result = skinware_native_take_next(take, to);
+        for (i = 0; i < count; i++) {
+            skinware_native_reader *reader = take->places[i].reader;
             if (result == NEWS)
                 compare(mine, to + i * STRIDE);
             if (result == PYTHONS_TURN) { /* as Python: begin with the newest again */
-                turns->last = skinware__latest(&turns->ring);
-                turns->noted = 0;
+                reader->last = skinware__latest(&reader->ring);
+                reader->noted = 0;
             }
         }
         mine->overtaken += result == PYTHONS_TURN;
     }
-    for (i = 0; i < 2; i++)
-        free(look->rings[i].turns);
-    free(look);
+    for (i = 0; i < count; i++)
+        free(take->places[i].reader);
+    free(take);
     free(to);
     return NULL;
 }
 
-static void *read_frames(void *argument) {
+static void *copy_frames(void *argument) {
     tally *mine = (tally *)argument;
-    unsigned char *to = (unsigned char *)malloc(STRIDE); /* exactly a frame: the checker of addresses sees one byte more */
-    skinware_native_turns *turns = (skinware_native_turns *)calloc(1, sizeof *turns);
-    skinware_native_request request;
+    unsigned char *to = (unsigned char *)malloc(STRIDE);
+    const skinware__ring ring = ring_of();
     int result;
-    if (to == NULL || turns == NULL)
+    if (to == NULL)
         abort();
-    turns->ring = request.ring = ring_of();
-    turns->in_order = mine->way == 1;
-    turns->until_ns = turns->timeout_ns = INT64_MAX;
-    turns->descriptor = descriptor;
-    turns->writer = SKINWARE__UNKNOWN;
-    turns->process = getpid();
     while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {
-        if (mine->way < 2) {
-            result = skinware_native_turn(turns, to);
-            if (result == 0) { /* as Python: begin with the newest again */
-                turns->last = skinware__latest(&turns->ring);
-                turns->noted = 0;
-            }
-        } else if (mine->way == 2) {
-            result = skinware_native_copy(&request.ring, 0, to);
-        } else {
-            request.wake_count = skinware__load_32(map + SKINWARE__WAKE_WORD_OFFSET);
-            request.known = skinware__latest(&request.ring);
-            request.wanted = 0;
-            request.timeout_ns = 1000000;
-            result = skinware_native_wait(&request, to);
-        }
+        result = skinware_native_copy(&ring, 0, to);
         if (result == COPIED)
             compare(mine, to);
         mine->overtaken += result == OVERTAKEN;
     }
-    free(turns);
     free(to);
     return NULL;
 }
@@ -173,7 +153,7 @@ int main(int count, char **arguments) {
     skinware_native_fence();
     for (i = 0; i < READERS; i++) {
         tallies[i].way = i;
-        if (pthread_create(&readers[i], NULL, i == 4 ? look_at_frames : read_frames, &tallies[i]) != 0)
+        if (pthread_create(&readers[i], NULL, i == 2 ? copy_frames : take_frames, &tallies[i]) != 0)
             return 5;
     }
     if (pthread_create(&writer, NULL, write_frames, NULL) != 0)
@@ -184,12 +164,10 @@ int main(int count, char **arguments) {
         torn += tallies[i].torn;
     }
     printf("{\"torn\": %" PRIu64 ", \"turns\": %" PRIu64 ", \"in_order\": %" PRIu64 ", \"copies\": %" PRIu64
-           ", \"waits\": %" PRIu64 ", \"looks\": %" PRIu64 ", \"timed\": %" PRIu64 ", \"ages\": %" PRIu64
-           ", \"sizes\": [%zu, %zu, %zu, %zu]}\n",
-           torn, tallies[0].compared, tallies[1].compared, tallies[2].compared, tallies[3].compared, tallies[4].compared,
+           ", \"looks\": %" PRIu64 ", \"timed\": %" PRIu64 ", \"ages\": %" PRIu64 ", \"sizes\": [%zu, %zu, %zu]}\n",
+           torn, tallies[0].compared, tallies[1].compared, tallies[2].compared, tallies[3].compared,
            skinware__load_64(map + 576), skinware__load_64(map + 640 + 8 * (SKINWARE__BUCKETS - 1)),
-           sizeof(skinware_native_request), sizeof(skinware_native_turns), sizeof(skinware_ring_writer),
-           sizeof(skinware_native_look));
+           sizeof(skinware_native_reader), sizeof(skinware_ring_writer), sizeof(skinware_native_take));
     munmap(map, size);
     close(descriptor);
     close(owner);

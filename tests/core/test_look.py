@@ -17,7 +17,7 @@ import pytest
 from skinware import DriverWriter, Skin, Snapshot
 from skinware import skin as skin_module
 from skinware.errors import Closed, ServiceTimeout
-from skinware.memory.look import Look
+from skinware.memory.take import Take
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 
@@ -42,7 +42,7 @@ class LookingIn(Skin):
     def read(self, **how: Any) -> Snapshot:
         with self.monkeypatch.context() as patch:
             if self.way == "Python":
-                patch.setattr(skin_module, "look_at", lambda _: None)
+                patch.setattr(skin_module, "take_of", lambda _: None)
             return super().read(**how)
 
 
@@ -118,7 +118,7 @@ def test_both_ways_see_the_same_whatever_happens(seed: int, skins: dict[str, Ski
                 publish(writer, value)
             newest[name] = writer.position
             wait_until(both_have_it)
-            in_c += isinstance(skins["C"]._in_c, Look)
+            in_c += isinstance(skins["C"]._in_c, Take)
             assert seen(known["C"]) == seen(known["Python"])
             for path, skin in skins.items():
                 with pytest.raises(ServiceTimeout):

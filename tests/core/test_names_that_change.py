@@ -28,7 +28,7 @@ def driver(name: str) -> DriverWriter:
 
 def look(skin: Skin) -> tuple[str, ...]:
     """The drivers of a skin that looks at every file now."""
-    skin._next_discovery_ns = skin._next_look_ns = 0
+    skin.refresh()
     return skin.read().layout.drivers
 
 
@@ -132,7 +132,7 @@ def test_a_living_service_that_is_no_driver_is_looked_at_once(
         assert sorted(attached) == ["live", "pose", "pose"]
         with monkeypatch.context() as patched:  # a refusal may have been want of memory
             later_ns = time.monotonic_ns() + 11_000_000_000
-            patched.setattr("skinware.skin.now_ns", lambda: later_ns)
+            patched.setattr("skinware.drivers.now_ns", lambda: later_ns)
             look(skin)
         assert sorted(attached) == ["live", "pose", "pose", "pose"]
 

@@ -6,6 +6,7 @@ import ctypes
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import threading
@@ -20,9 +21,9 @@ import pytest
 
 from skinware import Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Closed, PlatformError, ServiceTimeout
-from skinware.memory import look, ring_reader, ring_writer
 from skinware.memory.ring_reader import RingReader
-from skinware.memory.ring_writer import RingWriter
+from skinware.memory.ring_writer import RingWriter, WriterState
+from skinware.memory.take import ReaderPlace, ReaderState, RingWords, TakeState
 from skinware.service import _attachment, _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled
@@ -315,9 +316,28 @@ def test_no_frame_is_torn_whatever_is_checked(
     told = json.loads(result.stdout)
     assert told["torn"] == 0
     assert told["timed"] == told["ages"] == 10000
-    assert all(told[way] > 0 for way in ("turns", "in_order", "copies", "waits", "looks")), told
-    structures = ring_reader._Request, ring_reader._TurnsState, ring_writer._WriterState, look._LookState
+    assert all(told[way] > 0 for way in ("turns", "in_order", "copies", "looks")), told
+    structures = ReaderState, WriterState, TakeState
     assert told["sizes"] == [ctypes.sizeof(one) for one in structures]
+
+
+def test_structures_have_the_fields_that_c_has() -> None:
+    of_ring = [name for name, *_ in RingWords._fields_]
+    for structure, file, name in (
+        (RingWords, "../include/skinware.h", "skinware__ring"),
+        (ReaderState, "take.c", "skinware_native_reader"),
+        (ReaderPlace, "take.c", "place"),
+        (TakeState, "take.c", "skinware_native_take"),
+        (WriterState, "ring.h", "skinware_ring_writer"),
+    ):
+        text = (Path(native.__file__).parent / file).read_text()
+        found = re.search(rf"typedef struct {name} {{(.*?)}} {name};", text, re.DOTALL)
+        assert found is not None
+        declared = re.sub(r"/\*.*?\*/", "", found[1], flags=re.DOTALL)
+        in_c = re.findall(r"(\w+)(?:\[\w+\])?;", declared)
+        expected = of_ring + in_c[1:] if in_c[0] == "ring" else in_c
+        inherited = [] if structure.__base__ is ctypes.Structure else of_ring
+        assert [*inherited, *(name for name, *_ in structure._fields_)] == expected
 
 
 def test_a_reader_beside_a_thread_that_computes_gets_every_frame() -> None:

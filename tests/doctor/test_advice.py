@@ -1,15 +1,11 @@
-"""Every finding is made once, and each command line that it advises is one that the command takes."""
+"""Every rule is applied once, and each command line that it advises is one that the command takes."""
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import inspect
 import shlex
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import click
@@ -22,7 +18,7 @@ from skinware.cli._command import exit_status
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware_drivers.cli import config
-from skinware_drivers.doctor import bridges, buses, files, interfaces, machine, patches, permissions, taxels, timing
+from skinware_drivers.doctor import buses, files, machine, patches, programs, taxels
 from skinware_drivers.doctor.evidence import (
     BusSeen,
     Change,
@@ -38,8 +34,8 @@ from skinware_drivers.doctor.evidence import (
     RecordingSeen,
     TaxelFault,
 )
-from skinware_drivers.doctor.examining import CHECKS, Examination, examine
-from skinware_drivers.doctor.finding import Finding
+from skinware_drivers.doctor.examining import Examination, examine
+from skinware_drivers.doctor.finding import Finding, Rule
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.finding.running import RunningDriver
@@ -49,7 +45,7 @@ from tests.cli.test_regions import placed_structure
 from tests.commands import COMMANDS, parse, refused, running
 from tests.doctor.rig import found, found_until, looked, of
 
-MODULES = (bridges, buses, files, interfaces, machine, patches, permissions, taxels, timing)
+MODULES = (buses, files, machine, patches, programs, taxels)
 _OF_OTHERS = ("docker", "du", "findmnt", "free", "ip", "journalctl", "ls", "modprobe", "pip", "ps", "rm", "sysctl",
               "usermod")  # fmt: skip
 
@@ -72,13 +68,13 @@ def patch(name: str, bus: str, state: str, **changes: object) -> PatchSeen:
 
 
 def bus(name: str, state: str = "live", reason: str = "") -> BusSeen:
-    return BusSeen(name, state, reason, 3.0, 0.97, counted(buses._LOSSES), ("unknown: 7FF",), (Change(0.0, state),))
+    return BusSeen(name, state, reason, 3.0, 0.97, counted(buses.LOSSES), ("unknown: 7FF",), (Change(0.0, state),))
 
 
 def ill(driver: DriverSeen, name: str, kind: str) -> Iterator[DriverSeen]:
     """Drivers with everything that a driver can have, on a bus, between them."""
-    reasons = [bus(name, "down", reason) for reason in buses._BY_REASON]
-    states = [bus(name, state) for state in buses._BY_STATE]
+    reasons = [bus(name, "down", reason) for reason in buses.REASONS]
+    states = [bus(name, state) for state in buses.STATES]
     away = (Change(0.0, "live"), Change(1.0, "gone"), Change(2.0, "live"))
     flapping = dataclasses.replace(bus(name), changes=away * 3)
     back = dataclasses.replace(bus(name), changes=away)
@@ -88,11 +84,11 @@ def ill(driver: DriverSeen, name: str, kind: str) -> Iterator[DriverSeen]:
         patch("board 9", name, "restarted"),
         patch("board 10", name, "live", fresh=0),
         patch("board 11", name, "live", changes=(Change(0.0, "live"), Change(1.0, "stale"), Change(2.0, "live"))),
-        patch("board 12", name, "live", counted=counted(patches._LOSSES)),
+        patch("board 12", name, "live", counted=counted(patches.LOSSES)),
     ]
     twice = Counted({}, {"updates": 9000, "orphans": 9000})
     sick += [patch("board 13", name, "live", counted=twice), patch("board 14", name, "live")]
-    statuses = {"fresh": 1, **dict.fromkeys(taxels._BY_STATUS, 5)}
+    statuses = {"fresh": 1, **dict.fromkeys(taxels.STATUSES, 5)}
     faults = HealthSeen("skin-calm", 8, (TaxelFault("taxel 1", "stuck", "at 7"),), {"noisy": "too short"})
     times = dataclasses.replace(
         driver.timing, period_ns=10_000_000, missed=1000, age=late(BUCKETS - 2), future_ns=10**9, backwards=3,
@@ -131,7 +127,7 @@ def ill_machine(seen: Evidence) -> Evidence:
             NamespaceSeen("mine", "/dev/shm/skinware.mine", True, "others may write it"),
             NamespaceSeen("old", "/dev/shm/skinware.old", False, dead=("torso",), idle_s=7200.0),
         ),
-        interfaces=tuple(InterfaceSeen(one, counted(interfaces._DROPS)) for one in controllers),
+        interfaces=tuple(InterfaceSeen(one, counted(machine.DROPS)) for one in controllers),
         ports=tuple(ports),
         readers=(ReaderSeen("python3", 17, "torso", 5, 9),),
         bridges=(BridgeState("icub", False, 0, None, None, 0, states, "1", "", 2, 3, 4, "nonsense"),),
@@ -167,36 +163,37 @@ def everything() -> list[Examination]:
     return [examine(one) for one in (live, bad, dataclasses.replace(bad, drivers=()), ill_recording(live))]
 
 
-def sites(module: ModuleType) -> set[tuple[str, int]]:
-    """Where a module makes findings."""
-    file = inspect.getsourcefile(module) or ""
-    tree = ast.parse(Path(file).read_text())
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    return {(file, call.lineno) for call in calls if getattr(call.func, "id", "") == "Finding"}
+def rules() -> list[Rule]:
+    """All rules of the tables, and those that stand alone."""
+    values = [value for module in MODULES for value in vars(module).values()]
+    tables = [list(value.values()) if isinstance(value, dict) else [value] for value in values]
+    return [one for table in tables for one in table if isinstance(one, Rule)]
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, int]]:
-    """Where findings were made so far."""
-    noted: set[tuple[str, int]] = set()
+def applied(monkeypatch: pytest.MonkeyPatch) -> list[Rule]:
+    """The rules that made findings so far."""
+    noted: list[Rule] = []
+    found_by = Rule.found
 
-    def make(*arguments: Any, **named: Any) -> Finding:
-        caller = sys._getframe(1)
-        noted.add((caller.f_code.co_filename, caller.f_lineno))
-        return Finding(*arguments, **named)
+    def note(rule: Rule, *arguments: Any, **named: Any) -> Finding:
+        noted.append(rule)
+        return found_by(rule, *arguments, **named)
 
-    for module in MODULES:
-        monkeypatch.setattr(module, "Finding", make)
+    monkeypatch.setattr(Rule, "found", note)
     return noted
 
 
-def test_every_finding_is_made_here(made: set[tuple[str, int]], everything: list[Examination]) -> None:
+def test_every_rule_makes_a_finding_here(applied: list[Rule], everything: list[Examination]) -> None:
+    assert len(rules()) > 60
+    assert [rule.what for rule in rules() if rule not in applied] == []
+
+
+def test_findings_come_from_rules() -> None:
+    """Only the advice on an interface is made by the interface itself."""
     folder = Path(skinware_drivers.doctor.__file__).parent
-    makers = {path.stem for path in folder.glob("*.py") if "yield Finding(" in path.read_text()}
-    assert makers <= {module.__name__.rpartition(".")[2] for module in MODULES}
-    assert len(CHECKS) == len(MODULES)
-    wanted = set().union(*(sites(module) for module in MODULES))
-    assert sorted((Path(file).name, line) for file, line in wanted - made) == []
+    texts = {path.stem: path.read_text() for path in folder.glob("*.py")}
+    assert {name for name, text in texts.items() if "yield Finding(" in text} == {"machine"}
 
 
 def advised(everything: list[Examination]) -> set[str]:

@@ -133,7 +133,7 @@ def test_restarts_with_the_same_and_with_other_sensors(tmp_path: Path) -> None:
     evidence, findings = seen(file)
     (driver,) = evidence.drivers
     assert (driver.restarts, driver.structure.n_patches) == (2, 3)
-    assert findings["the driver was started anew"].evidence == "2 times"
+    assert findings["the driver was restarted"].evidence == "2 times"
     assert driver.patches[0].counted.grown["orphans"] == 600  # of all three, under the one name
     assert len(driver.patches) == 3
 

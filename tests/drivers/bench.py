@@ -139,7 +139,7 @@ class Bench:
         adapter = self.adapter
         tables = assemble([("bus", self.patches)], adapter.types, adapter.dtype)
         self._decoder = Decoder([adapter.layout], tables)
-        self._batch = FrameBatch(4096, adapter.payload_size, self._decoder.headroom)
+        self._batch = FrameBatch(4096, adapter.payload_size, self._decoder.compiled.headroom)
         adapter.heard_by = self._tell
         self._attending = asyncio.create_task(adapter.attend(self.link))
         await self.during(adapter.configure(self.link))

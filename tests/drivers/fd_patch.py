@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link

@@ -28,7 +28,7 @@ def allegro(model: str, **options: object) -> AllegroV5Driver:
 def paxini(board: Literal["converter", "high_speed"], points: Mapping[int, int]) -> PaxiniDriver:
     """A board of Paxini's with sensors of these ids, or modules in these slots, of so many taxels."""
     adapter = PaxiniDriver(PaxiniOptions(board=board))
-    how: dict[str, Any] = {"use": adapter.change_framing, "tell": adapter.tell}
+    how: dict[str, Any] = {"use": adapter.change_framing, "report": adapter.tell}
     known: Board
     if board == "converter":
         known = ConverterBoard((), 0, lambda: False, period_s=0.01, **how)

@@ -22,7 +22,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.hand import FINGERS
 from skinware_drivers.link import Link, Match
-from skinware_drivers.registry import class_for, load_driver
+from skinware_drivers.registry import NamedBus, load_driver
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
@@ -38,7 +38,7 @@ def shown(adapter: AnyAdapter, *frames: tuple[int, str] | int) -> Decoder:
     """What is known after these frames; a number is a pause, ms."""
     tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
     decoder = Decoder([adapter.layout], tables, [adapter.period_s])
-    batch = FrameBatch(4096, 8, decoder.headroom)
+    batch = FrameBatch(4096, 8, decoder.compiled.headroom)
     time_ns = MS
     for frame in frames:
         if isinstance(frame, int):
@@ -520,11 +520,11 @@ def test_other_datagrams_are_counted_and_not_shown(datagram: str) -> None:
 def test_one_name_stands_for_both_kinds_of_bus() -> None:
     driver = load_driver("allegro_v5")
     assert driver is AllegroV5Driver
-    assert class_for(driver, "virtual", "allegro_v5") is AllegroV5Driver
-    assert class_for(driver, "vcan0", "allegro_v5") is AllegroV5Driver
-    assert class_for(driver, "udp://:8000", "allegro_v5") is AllegroV5UdpDriver
-    assert class_for(driver, "virtual:allegro_v5_udp", "allegro_v5") is AllegroV5UdpDriver
-    assert class_for(LinkerHandDriver, "udp://:8000", "linkerhand") is LinkerHandDriver
+    assert NamedBus("virtual", "allegro_v5").choose(driver) is AllegroV5Driver
+    assert NamedBus("vcan0", "allegro_v5").choose(driver) is AllegroV5Driver
+    assert NamedBus("udp://:8000", "allegro_v5").choose(driver) is AllegroV5UdpDriver
+    assert NamedBus("virtual:allegro_v5_udp", "allegro_v5").choose(driver) is AllegroV5UdpDriver
+    assert NamedBus("udp://:8000", "linkerhand").choose(LinkerHandDriver) is LinkerHandDriver
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

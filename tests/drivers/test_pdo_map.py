@@ -36,7 +36,7 @@ def tpdo(number: int, cob_id: int, *entries: tuple[int, int]) -> Tpdo:
 
 def decoded(made: PdoMap, *frames: tuple[int, str]) -> Decoder:
     decoder = Decoder([made.layout], assemble([("bus", made.patches)], made.types, made.dtype))
-    batch = FrameBatch(100, 8, decoder.headroom)
+    batch = FrameBatch(100, 8, decoder.compiled.headroom)
     for identifier, payload in frames:
         batch.append(0, 1, identifier, bytes.fromhex(payload))
     updates, foreign = decoder.decode(batch)
@@ -110,7 +110,7 @@ def test_nodes_that_map_the_same_identifiers_differently() -> None:
 def test_tpdos_that_are_not_in_use() -> None:
     assert Tpdo.make(1, 1 << 31 | 0x183, 255, [0x60000008]) is None
     assert Tpdo.make(1, 0x183, 255, []) is None
-    assert Entry.from_number(0x60010310) == Entry(0x6001, 3, 16)
+    assert Tpdo.make(1, 0x183, 255, [0x60010310]) == Tpdo(1, 0x183, 255, (Entry(0x6001, 3, 16),))
 
 
 def test_the_example_eds() -> None:

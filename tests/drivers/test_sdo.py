@@ -15,6 +15,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import canopen_objects
 from skinware_drivers.can.canopen_objects import SdoAborted, SdoClient
 from skinware_drivers.link import Link
+from tests.commands import PATIENCE_S
 
 T = TypeVar("T")
 NODE = 5
@@ -45,7 +46,7 @@ class Wire:
 
 def transfer(wire: Wire, what: Callable[[SdoClient], Awaitable[T]]) -> T:
     async def run() -> T:
-        return await asyncio.wait_for(what(SdoClient(wire.link, NODE)), 10)
+        return await asyncio.wait_for(what(SdoClient(wire.link, NODE)), PATIENCE_S)
 
     return asyncio.run(run())
 

@@ -24,7 +24,7 @@ from tests.sdk.driving import driving_lines
 
 def decoded(adapter: AnyAdapter, *frames: tuple[int, str]) -> Decoder:
     decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
-    batch = FrameBatch(100, 8, decoder.headroom)
+    batch = FrameBatch(100, 8, decoder.compiled.headroom)
     for number, (identifier, payload) in enumerate(frames):
         batch.append(0, 1 + 130_000 * number, identifier, bytes.fromhex(payload))
     updates, foreign = decoder.decode(batch)

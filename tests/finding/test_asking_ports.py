@@ -16,7 +16,7 @@ from skinware_drivers.finding import ports
 from skinware_drivers.finding.guess import known_drivers
 from skinware_drivers.finding.looking import Answer, ask_port, can_ask
 from skinware_drivers.finding.ports import SerialPort
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini

@@ -11,7 +11,7 @@ import numpy as np
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.finding.guess import Guess, Traffic, guess, known_drivers

@@ -25,7 +25,7 @@ MTB4 = {"type": "mtb4", "runs": "application", "firmware": "1.25.0", "protocol":
 @pytest.fixture(autouse=True)
 def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.05)
-    monkeypatch.setattr(roboskin, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
     monkeypatch.setattr(roboskin_boards, "_BETWEEN_CHECKS_S", 0.01)
     monkeypatch.setattr(roboskin_boards, "_ADDRESS_CHECKS", 2)
     monkeypatch.setattr(without_driver, "_LISTEN_S", 0.15)

@@ -160,7 +160,7 @@ def test_nothing_is_written_over_unasked(made: Made, capsys: pytest.CaptureFixtu
     out = made.folder / "out"
     made.write("out/torso_skin.toml", "mine")
     assert call(made.folder, "-o", out) == 2
-    assert "torso_skin.toml: there already; give another folder, or --force" in capsys.readouterr().err
+    assert "torso_skin.toml: exist already; give another folder, or --force" in capsys.readouterr().err
     assert (out / "torso_skin.toml").read_text() == "mine"
     assert not (out / "arm.toml").exists()
     assert call(made.folder, "-o", out, "--force") == 0

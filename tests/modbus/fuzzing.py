@@ -136,7 +136,7 @@ class _InC(_InPython):
         line = BusLine("line", 0, adapter, self.bus, epoll)
         line.patches = adapter.patches
         self.bus.open()
-        line._is_open()
+        line.connection.opened()
         tables = assemble([("line", adapter.patches)], adapter.types, np.dtype(np.uint16))
         decoder = Decoder([adapter.layout], tables, [adapter.period_s])
         writer = DriverWriter(

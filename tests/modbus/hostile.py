@@ -130,7 +130,7 @@ class _Hostile:
 
     @property
     def _pending(self) -> int:
-        return sum(line.pending for line in (self.master._tcp, self.master._rtu) if line is not None)
+        return self.master.pending
 
     def _begin(self) -> None:
         timing = Timing(20 * MS, 5 * MS, MS // 2)

@@ -17,8 +17,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.modbus import ModbusAdapter, Registers
 from skinware_drivers.operations import operation
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.testing.driving import Driving, EmulatedSkin, driving_lines, emulated_skin
+from skinware_drivers.testing.driving import Driving, EmulatedSkin, driving_lines, emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from tests.modbus.hands import FINGER_AT
 from tests.modbus.peers import Action, device

@@ -20,7 +20,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.dfrobot import DfrobotDriver, DfrobotOptions
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot, EmulatedDfrobotOptions
 from tests.modbus.peers import Action, device, rtu_server

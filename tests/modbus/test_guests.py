@@ -30,14 +30,14 @@ WRITES = [
 
 
 class Program(Guest):
-    """Keeps what it is told."""
+    """Keeps the replies to it."""
 
     def __init__(self) -> None:
         super().__init__()
         self.told: list[Message] = []
 
-    def tell(self, reply: Message) -> None:
-        self.told.append(reply)
+    def reply(self, message: Message) -> None:
+        self.told.append(message)
 
 
 class Room:
@@ -48,7 +48,7 @@ class Room:
         self.talk = Conversation(*blocks, over_tcp=over_tcp, guests=self.guests)
         self.programs = [Program() for _ in range(count)]
         for program in self.programs:
-            self.guests.come(program)
+            self.guests.join(program)
 
     def ask(self, data: bytes, *, who: int = 0, unit: int = 1, number: int = 1) -> None:
         self.guests.ask(self.programs[who], Message(unit, data, number))

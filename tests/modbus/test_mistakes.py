@@ -95,7 +95,7 @@ def test_blocks_of_several_patches_may_have_the_same_channels() -> None:
         ("modbus:", r"over TCP that is modbus:tcp://HOST, and a serial port modbus:/dev/ttyUSB0"),
         ("modbus:ttyUSB0", r"or modbus:\./ttyUSB0"),
         ("modbus:tcp://::1:502", r"an IPv6 address stands in brackets; write modbus:tcp://HOST:PORT"),
-        ("modbus:tcp://host:abc", r"'abc' is no number of a port"),
+        ("modbus:tcp://host:abc", r"'abc' is no port number"),
         ("modbus:tcp://host:99999", r"ports have numbers up to 65535"),
         ("modbus:tcp://host:502&byte_order=little", r"options begin with a question mark"),
         ("modbus:tcp://host?byte_order=middle", r"option byte_order=middle: give one of big, little$"),
@@ -113,5 +113,5 @@ def test_a_mistake_in_a_name_is_said_in_words(name: str, told: str) -> None:
 def test_a_line_has_no_unit_0_and_a_connection_may_have_one() -> None:
     driver = type("Fingertip", (Fingertip,), {"registers": [Registers(7, 12, unit=0)]})(NoOptions())
     driver.fit(make_bus("modbus:tcp://10.0.0.2"))
-    with pytest.raises(ConfigurationError, match="unit 0 is everybody on a line, and nobody answers"):
+    with pytest.raises(ConfigurationError, match="unit 0 means all units of a line, and none answers"):
         driver.fit(make_bus("modbus:/dev/ttyUSB0"))

@@ -53,7 +53,7 @@ def test_names() -> None:
         ("modbus:tcp://", "which host"),
         ("modbus:tcp://host:0x10", "HOST:PORT"),
         ("modbus:tcp://host?baudrate=9600", "unknown option"),
-        ("modbus:tcp://host?listen=yes", "only a line can be tapped"),
+        ("modbus:tcp://host?listen=yes", "a connection cannot be tapped"),
         ("modbus:/dev/ttyUSB0?timeout_ms=0", "timeout_ms"),
         ("modbus:/dev/ttyUSB0?byte_order=middle", "byte_order"),
         ("modbus:/dev/ttyUSB0?patience_s=3", "unknown option"),
@@ -84,8 +84,8 @@ def test_a_driver_reads_a_server(over: Any, way: str) -> None:
         counters = counted(driving)
         assert counters["polls_unanswered"] == counters["errors"] == counters["skipped_bytes"] == 0
         assert driving.runner is not None
-        assert driving.runner.generation is not None
-        assert driving.runner.generation.flows == (way == "native")
+        assert driving.runner.builder.generation is not None
+        assert driving.runner.builder.generation.flows == (way == "native")
 
 
 def test_values_follow_in_the_order_of_the_device(over: Any) -> None:

@@ -13,11 +13,9 @@ from skinware import DriverReader, Structure
 from skinware.errors import ConfigurationError
 from skinware_drivers.description import assemble
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
-from skinware_drivers.modbus.revo3_mappings import places
+from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options, places
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
+from skinware_drivers.testing.driving import driving_lines, emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
 from skinware_drivers.virtual.emulator import Device

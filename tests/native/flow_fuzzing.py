@@ -24,7 +24,7 @@ from skinware.driver_service import DriverWriter
 from skinware.wire import read_pieces
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import read_own
 from skinware_drivers.decoding.decoder import Decoder
@@ -286,7 +286,7 @@ class _Fuzz:
                 self._happen()
         self._take_all()
         for wire, line in zip(self._wires, self._lines, strict=True):
-            if not line.lost.is_set():
+            if not line.connection.lost.is_set():
                 wire.check()
         return self._generation.publisher.writer.sequence
 
@@ -310,7 +310,7 @@ class _Fuzz:
 
     def _open(self, line: BusLine) -> None:
         line.bus.open()
-        line._is_open()
+        line.connection.opened()
 
     def _send(self, *, is_good: bool) -> None:
         script = self._script
@@ -344,7 +344,7 @@ class _Fuzz:
         what = self._script.number(6)
         if what == 0:
             wire.break_off()
-        elif what == 1 and line.lost.is_set():
+        elif what == 1 and line.connection.lost.is_set():
             self._open(line)
         elif what == 2:
             value, mask = (int.from_bytes(self._script.bytes(4), "little") for _ in range(2))

@@ -65,7 +65,7 @@ def decoded(
     driver = OpenPatchDriver(OpenPatchOptions())
     patches = asyncio.run(driver.describe(ScriptedLink(answering(said.items()))))
     decoder = Decoder([driver.layout], assemble([("bus", patches)], driver.types, driver.dtype))
-    batch = FrameBatch(64, driver.payload_size, decoder.headroom)
+    batch = FrameBatch(64, driver.payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
     times_ns = range(1, len(messages) + 1) if received_ns is None else received_ns
     for time_ns, (identifier, payload) in zip(times_ns, messages, strict=True):

@@ -1,8 +1,7 @@
-"""The vectors of docs/protocols/patch-serial.md: openpatch.h makes them, the driver's framing reads and makes them."""
+"""The vectors of the open patch protocol: openpatch.h makes them, the driver's framing reads and makes them."""
 
 from __future__ import annotations
 
-import re
 import struct
 import subprocess
 from collections.abc import Sequence
@@ -14,16 +13,15 @@ from skinware_drivers.serial.openpatch import OpenPatchDriver
 from tests.openpatch import wire
 from tests.openpatch.microcontroller import HERE, program
 
-PAGE = Path(__file__).parents[2] / "docs/protocols/patch-serial.md"
+VECTORS = Path(__file__).parents[2] / "docs/protocols/patch-serial-vectors.txt"
 LANGUAGES = ("c99", "c++11", "sanitized")
 SAID = wire.Said(modules=[(0, 1), (0, 1)])  # as the header says it: each by itself
 
 
 def vectors() -> list[tuple[str, str]]:
     """(word, rest) of every line."""
-    block = re.search(r"## Test vectors.*?```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert block
-    return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in block[1].splitlines())]
+    lines = (line.partition(" ") for line in VECTORS.read_text().splitlines())
+    return [(word, rest.strip()) for word, _, rest in lines]
 
 
 def frames(word: str) -> list[bytes]:

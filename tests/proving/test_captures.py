@@ -161,7 +161,7 @@ def test_what_cannot_be_compared(capture: Path, tmp_path: Path, mistaken: Path) 
         told = refused("skin-prove", "--captured", str(capture), *more)
         assert (told.returncode, words in told.stderr) == (2, True), told.stderr
     alone = refused("skin-prove", "--save")
-    assert (alone.returncode, "--save is for --captured" in alone.stderr) == (2, True)
+    assert (alone.returncode, "--save needs --captured" in alone.stderr) == (2, True)
 
 
 @pytest.mark.thorough

@@ -14,7 +14,7 @@ import pytest
 from skinware_drivers.proving.captures import check_capture
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.streams.tcp import TcpBus
-from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on, emulated_on_a_pty
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.recording.test_wire_replay import record, require_equal
 from tests.streams.peers import LOCAL, free_port

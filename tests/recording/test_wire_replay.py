@@ -17,8 +17,8 @@ from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording import Series, WireItem
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
-from skinware_drivers.bus_names import place_of_bus
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.bus_names import BusName
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.captures import check_capture
@@ -65,9 +65,10 @@ def cable() -> Iterator[Cable]:
     cable.close()
 
 
-def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, **options: Any) -> Series:
-    """So many frames of a driver, with what goes over its wire; what was recorded of it."""
-    with recording(path, with_wires=True) as recorder, driving_lines([(adapter, bus)], "skin", **options):
+def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, *, updates: int = 0) -> Series:
+    """Record a driver and its wire until there are so many snapshots, and of each patch so many updates."""
+    with recording(path, with_wires=True) as recorder, driving_lines([(adapter, bus)], "skin") as driver:
+        wait_until(lambda: all(patch["updates"] >= updates for patch in driver.status()["patches"]))
         wait_until(lambda: recorder.messages.get("/skin/skin/frame", 0) >= frames)
     with skinware.recording.open(path) as opened:
         assert opened.problems == []
@@ -345,7 +346,9 @@ def test_files_that_cannot_be_replayed(tmp_path: Path) -> None:
 
 
 def test_two_recorded_buses_are_two_places() -> None:
-    places = [place_of_bus(f"replay:walk.mcap?bus={bus}&speed={speed}") for bus in ("can0", "can1") for speed in (1, 2)]
+    places = [
+        BusName.of(f"replay:walk.mcap?bus={bus}&speed={speed}").place for bus in ("can0", "can1") for speed in (1, 2)
+    ]
     assert places[0] == places[1] != places[2] == places[3]
 
 

@@ -25,7 +25,7 @@ from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import Channels
 from skinware.wire import COLUMNS, IS_CUT, IS_FD, KIND, WISH, service_name
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.layout import Frame as FrameKind
 from skinware_drivers.layout import Identifier, Layout, Values

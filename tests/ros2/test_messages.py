@@ -13,8 +13,7 @@ from skinware.conversion import ros_messages
 from skinware.conversion.ros_messages import Cdr
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
-from skinware.ros2 import diagnostics, discovery, types
-from skinware.ros2.taring import response
+from skinware.ros2 import messages, types
 from skinware.ros2.transport import Distro, Identity, MessageType
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.test_viewers import placed
@@ -158,8 +157,8 @@ def test_ages_of_points_are_those_of_their_modules() -> None:
 
 def test_diagnostics() -> None:
     told = [
-        diagnostics.Status(diagnostics.Level.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}),
-        diagnostics.Status(diagnostics.Level.OK, "skin: arm: can0", "live", "can0", {}),
+        messages.Status(messages.Level.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}),
+        messages.Status(messages.Level.OK, "skin: arm: can0", "live", "can0", {}),
     ]
     status = [
         made(
@@ -173,19 +172,19 @@ def test_diagnostics() -> None:
         for each in told
     ]
     expected = made("diagnostic_msgs/msg/DiagnosticArray", header=header(SECOND_NS), status=status)
-    assert diagnostics.message(told, SECOND_NS) == serialised(expected, "diagnostic_msgs/msg/DiagnosticArray")
+    assert messages.diagnostics(told, SECOND_NS) == serialised(expected, "diagnostic_msgs/msg/DiagnosticArray")
 
 
 @pytest.mark.parametrize("text", ["", "paused", "größer"])
 def test_answers_of_a_service(text: str) -> None:
     expected = made("std_srvs/srv/Trigger_Response", success=not text, message=text)
-    assert response(not text, text) == serialised(expected, "std_srvs/srv/Trigger_Response")
+    assert messages.trigger_response(not text, text) == serialised(expected, "std_srvs/srv/Trigger_Response")
 
 
 @pytest.mark.parametrize("distro", Distro)
 def test_what_tells_which_node_has_which_endpoints(distro: Distro) -> None:
     ids = [bytes(range(first, first + 16)) for first in range(4)]
-    told = discovery.entities(Identity("skin", "/robot", distro=distro), ids[0], [ids[1]], ids[2:])
+    told = messages.entities(Identity("skin", "/robot", distro=distro), ids[0], [ids[1]], ids[2:])
     size = 24 if distro is Distro.HUMBLE else 16
 
     def gid(data: bytes) -> Any:
@@ -208,5 +207,5 @@ def test_what_tells_which_node_has_which_endpoints(distro: Distro) -> None:
 
 
 def test_endpoints_tell_the_hash_of_their_type() -> None:
-    assert discovery.endpoint_data(types.IMAGE.hash, Distro.JAZZY) == f"typehash={types.IMAGE.hash};".encode()
-    assert discovery.endpoint_data(types.IMAGE.hash, Distro.HUMBLE) == b""
+    assert messages.endpoint_data(types.IMAGE.hash, Distro.JAZZY) == f"typehash={types.IMAGE.hash};".encode()
+    assert messages.endpoint_data(types.IMAGE.hash, Distro.HUMBLE) == b""

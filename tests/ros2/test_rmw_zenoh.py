@@ -42,7 +42,7 @@ READY = b"ready"
 
 @contextmanager
 def node(at: Router, identity: Identity, tell: Callable[[bool, str], None] = print) -> Iterator[ZenohNode]:
-    one = ZenohNode(identity, connect=[at.endpoint], tell=tell)
+    one = ZenohNode(identity, connect=[at.endpoint], router_changed=tell)
     try:
         yield one
     finally:

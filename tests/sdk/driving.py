@@ -17,7 +17,7 @@ from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.running.runner import PublishMode
+from skinware_drivers.running.building import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -73,11 +73,11 @@ class EveryFrame:
 
     def __init__(self, running: Driving, name: str = "roboskin") -> None:
         assert running.runner is not None
-        assert running.runner.writer is not None
+        assert running.runner.builder.writer is not None
         self.taken: list[DriverSnapshot] = []
         self.reader: DriverReader = DriverReader(name)
-        assert running.runner.generation is not None
-        generation = running.runner.generation
+        assert running.runner.builder.generation is not None
+        generation = running.runner.builder.generation
         places: list[tuple[object, str]] = [(generation, "digest"), (generation.path, "publish_if_due")]
         frames = self.reader.in_order(timeout_s=30)
 

@@ -45,7 +45,7 @@ def tables_of(*buses: list[Patch], dtype: str = "<u2") -> SkinTables:
 
 def run(decoder: Decoder, frames: Sequence[tuple[int, int, bytes]], payload_size: int = 8) -> list[int]:
     """Shows frames (bus, identifier, payload), all in one batch; the rows that were nobody's."""
-    batch = FrameBatch(64 + len(frames), payload_size, decoder.headroom)
+    batch = FrameBatch(64 + len(frames), payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
     for number, (bus, identifier, payload) in enumerate(frames):
         batch.append(bus, 1 + number, identifier, payload)

@@ -7,8 +7,8 @@ import pytest
 
 from skinware import PatchState
 from skinware.realtime import NS_PER_S
-from skinware_drivers.running import attention
-from skinware_drivers.running.attention import Attention, HoldUp
+from skinware_drivers.running import data_loop
+from skinware_drivers.running.data_loop import Attention, HoldUp
 from tests.sdk.test_publisher import Desk
 
 MS = 1_000_000
@@ -17,8 +17,8 @@ MS = 1_000_000
 class Clocks:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_ns, self.slept_ns = 10 * NS_PER_S, 0
-        monkeypatch.setattr(attention, "now_ns", lambda: self.now_ns)
-        monkeypatch.setattr(attention, "_slept_ns", lambda: self.slept_ns)
+        monkeypatch.setattr(data_loop, "now_ns", lambda: self.now_ns)
+        monkeypatch.setattr(data_loop, "_slept_ns", lambda: self.slept_ns)
 
 
 def test_being_late_is_being_held_up(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -51,7 +51,7 @@ def test_patches_that_lived_are_excused_and_values_of_before_are_old(monkeypatch
     desk.feed(desk.burst(1))
     before_ns = desk.clock.now_ns
     desk.clock.now_ns += 5 * NS_PER_S
-    desk.publisher.excuse(HoldUp(before_ns, 0))
+    desk.publisher.excuse(before_ns, 0)
     desk.publisher.publish_if_due(desk.clock.now_ns)
     frame = desk.reader.read()
     assert frame.patch_state.tolist() == [PatchState.LIVE]
@@ -60,7 +60,7 @@ def test_patches_that_lived_are_excused_and_values_of_before_are_old(monkeypatch
     desk.clock.now_ns += NS_PER_S
     desk.publisher.publish_if_due(desk.clock.now_ns)
     assert desk.reader.read().patch_state.tolist() == [PatchState.STALE]
-    desk.publisher.excuse(HoldUp(desk.clock.now_ns, 0))  # it was silent before
+    desk.publisher.excuse(desk.clock.now_ns, 0)  # it was silent before
     desk.publisher.publish()
     assert desk.reader.read().patch_state.tolist() == [PatchState.STALE]
     desk.close()
@@ -70,7 +70,7 @@ def test_what_was_heard_before_the_machine_slept_is_not_fresh(monkeypatch: pytes
     desk = Desk(monkeypatch)
     desk.feed(desk.burst(1))
     assert desk.reader.read().fresh("pressure", at_ns=desk.clock.now_ns)[:180].all()
-    desk.publisher.excuse(HoldUp(desk.clock.now_ns, 60 * NS_PER_S))
+    desk.publisher.excuse(desk.clock.now_ns, 60 * NS_PER_S)
     desk.publisher.publish()
     frame = desk.reader.read()
     assert not frame.fresh("pressure", at_ns=desk.clock.now_ns).any()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.bus_names import BusName
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from skinware_drivers.bus_names import place_of_bus
     ],
 )
 def test_one_bus(one: str, other: str) -> None:
-    assert place_of_bus(one) == place_of_bus(other)
+    assert BusName.of(one).place == BusName.of(other).place
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,9 @@ def test_one_bus(one: str, other: str) -> None:
     ],
 )
 def test_two_buses(one: str, other: str) -> None:
-    assert place_of_bus(one) != place_of_bus(other)
+    assert BusName.of(one).place != BusName.of(other).place
 
 
 def test_links_are_followed(tmp_path: Path) -> None:
     (tmp_path / "port").symlink_to("/dev/null")
-    assert place_of_bus(f"{tmp_path}/port") == place_of_bus("serial:/dev/null?baudrate=9600")
+    assert BusName.of(f"{tmp_path}/port").place == BusName.of("serial:/dev/null?baudrate=9600").place

@@ -13,7 +13,7 @@ from skinware.geometry import Geometry
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.description import SkinTables, assemble
-from skinware_drivers.running.places import put_in_place
+from skinware_drivers.running.building import put_in_place
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus

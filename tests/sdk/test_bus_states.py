@@ -15,11 +15,11 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running import bus_line, news, runner
+from skinware_drivers.running import bus_line, connection, news, runner
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
@@ -191,7 +191,7 @@ def test_a_driver_stops_while_an_interface_is_being_opened() -> None:
 def test_an_interface_that_hangs_while_it_is_opened_holds_up_no_other(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(bus_line, "_OPENING_S", 0.2)
+    monkeypatch.setattr(connection, "_OPENING_S", 0.2)
     slow, other = reporting(SlowBus), emulated(boards=(8,))
     slow.opening.clear()
     with driving(slow, other), DriverReader("roboskin") as reader:
@@ -295,13 +295,13 @@ def test_silence_counts_only_where_devices_send_of_themselves(
 
         def hear() -> None:
             clock.pass_s(0.01)
-            line.heard_ns = clock()
+            line.condition.heard_ns = clock()
             line.look(0)
 
         def say_nothing() -> None:
             clock.pass_s(10)
             line.look(0)
-            assert line.state == BusState.SILENT
+            assert line.condition.state == BusState.SILENT
 
         adapter.while_set_up = say_nothing
         with caplog.at_level(logging.WARNING):

@@ -41,7 +41,7 @@ def payload(value: int, stamp_ms: int, sequence: int) -> bytes:
 
 def test_late_frames_have_the_time_of_their_values_and_gaps_are_counted_too() -> None:
     compiled = decoder(Layout([frame("one", 1, 0), frame("two", 2, 2)]), n_buses=2)
-    batch = FrameBatch(64, 8, compiled.headroom)
+    batch = FrameBatch(64, 8, compiled.compiled.headroom)
     told: list[tuple[int, int]] = []
     for number in range(400):
         true_ns = BEGIN_NS + number * 10 * MS
@@ -67,7 +67,7 @@ def test_late_frames_have_the_time_of_their_values_and_gaps_are_counted_too() ->
 def test_frames_that_wait_for_their_partners_are_told_their_time_once() -> None:
     cycle = Cycle(["one", "two"], maximum_age_s=0.1)
     compiled = decoder(Layout([frame("one", 1, 0), frame("two", 2, 2)], cycle))
-    batch = FrameBatch(64, 8, compiled.headroom)
+    batch = FrameBatch(64, 8, compiled.compiled.headroom)
     for number in range(50):
         true_ns = BEGIN_NS + number * 10 * MS
         for identifier, kind in ((1, 0), (2, 1)):  # each in a batch of its own
@@ -83,7 +83,7 @@ def test_frames_that_wait_for_their_partners_are_told_their_time_once() -> None:
 
 def one_frame(compiled: Decoder, time_ns: int, stamp_ms: int) -> int:
     """The time that the module has after it."""
-    batch = FrameBatch(1, 8, compiled.headroom)
+    batch = FrameBatch(1, 8, compiled.compiled.headroom)
     batch.append(0, time_ns, 1, payload(0, stamp_ms, 0))
     updates, _ = compiled.decode(batch)
     return int(updates.newest_ns[0])
@@ -108,7 +108,7 @@ def test_a_patch_that_was_set_up_anew_has_a_clock_that_begins_anew() -> None:
 
 def test_a_stamp_before_boot_becomes_the_earliest_and_is_counted_on_its_bus() -> None:
     compiled = decoder(Layout([Frame("one", [Identifier(1)], [8], Values(0, "<u2", 2))]), n_buses=2)
-    batch = FrameBatch(8, 8, compiled.headroom)
+    batch = FrameBatch(8, 8, compiled.compiled.headroom)
     for bus, time_ns in ((0, 5), (1, -5), (1, -1 << 62), (1, 0), (1, 6)):
         batch.append(bus, time_ns, 1, bytes(8))
     updates, _ = compiled.decode(batch)

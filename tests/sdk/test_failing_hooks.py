@@ -20,7 +20,7 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.polling import Poll, Watch
-from skinware_drivers.running import bus_line
+from skinware_drivers.running import serving
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
@@ -86,8 +86,8 @@ class Faulty(RoboskinDriver):
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_line, "_FIRST_PAUSE_ASIDE_S", 0.5)
-    monkeypatch.setattr(bus_line, "_LONGEST_PAUSE_ASIDE_S", 0.5)
+    monkeypatch.setattr(serving, "_FIRST_PAUSE_S", 0.5)
+    monkeypatch.setattr(serving, "_LONGEST_PAUSE_S", 0.5)
 
 
 def faulty(fault: str, error: type[BaseException] = KeyError) -> type[Faulty]:
@@ -224,7 +224,7 @@ def test_a_watch_that_fails_ends_the_driver(when: str) -> None:
                 raise KeyError("oops")
             return Blind(tables)
 
-    words = "buses bus0: `watch` failed" if when == "made" else "bus bus0: `Watch.look` failed"
+    words = "bus bus0: `watch` failed" if when == "made" else "bus bus0: `Watch.look` failed"
     bus = emulated(boards=(7,), no_ack=("7/0",))
     with fails(f"{words}: KeyError: 'oops'", driving(bus, driver=Watched, wait=False)):
         pass
@@ -286,12 +286,12 @@ def test_nothing_that_fails_in_the_event_loop_is_only_logged(where: str, error: 
     with fails(words, driving(emulated(boards=(7,)))) as running, DriverReader("roboskin") as reader:
         runner = running.runner
         assert runner is not None
-        assert runner.generation is not None
-        assert runner._desk is not None
+        assert runner.builder.generation is not None
+        assert runner.builder.desk is not None
         broken, method = {
-            "a take": (runner.generation, "digest"),
-            "a publication": (runner.generation.path, "publish_if_due"),
-            "requests": (runner._desk._server, "take"),
+            "a take": (runner.builder.generation, "digest"),
+            "a publication": (runner.builder.generation.path, "publish_if_due"),
+            "requests": (runner.builder.desk._server, "take"),
         }[where]
         running.do(lambda: setattr(broken, method, fail))
         with contextlib.suppress(PeerGone):

@@ -35,12 +35,12 @@ from skinware_drivers.registry import load_driver
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["xela", "--bus", "virtual"], "'xela' is no option: name the driver with --driver"),
+        (["xela", "--bus", "virtual"], "'xela' is not an option; name a driver with --driver"),
         (["--bus", "virtual", "--bus", "virtual"], "bus virtual is named twice"),
-        (["--bus", "can0", "--bus", "can0"], "bus can0 is named twice; a driver"),
+        (["--bus", "can0", "--bus", "can0"], "bus can0 is named twice; name each"),
         (
             ["--bus", "can0", "--bus", "socketcan:can0?x=1"],
-            r"bus socketcan:can0\?x=1 is named twice, also as can0; a driver",
+            r"bus socketcan:can0\?x=1 is named twice, also as can0; name each",
         ),
         (["--bus", "virtual", "--driver", "xelo"], r"did you mean 'xela'\?.*pip install -e \."),
         (["--bus", "virtual", "--driver", "xela", "--boards", "a"], r"boards=a: give a whole number \(number 1"),

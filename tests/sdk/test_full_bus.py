@@ -11,7 +11,7 @@ import pytest
 from skinware import DriverReader
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.can.roboskin_setup import BoardSetUp, tell_what_fits
+from skinware_drivers.can.roboskin_setup import BoardSetUp, warn_of_full_bus
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.testing.waiting import wait_until
@@ -60,7 +60,7 @@ def test_boards_that_find_no_room_are_not_taken_for_restarted(
 )
 def test_how_many_boards_fit_is_told(boards: int, period_ms: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
     options = RoboskinOptions(period_ms=period_ms)
-    tell_what_fits("can0", [BoardSetUp(options, board + 1) for board in range(boards)])
+    warn_of_full_bus("can0", [BoardSetUp(options, board + 1) for board in range(boards)])
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == bool(words)
     assert all(re.match(f"can0: {words}", line) for line in told)

@@ -21,8 +21,8 @@ def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, name
         async with Running(case, clock, lively(EmulatedFingertips)) as rig:
             await rig.until_fresh()
             assert rig.runner is not None
-            assert rig.runner.generation is not None
-            generation: Any = rig.runner.generation
+            assert rig.runner.builder.generation is not None
+            generation: Any = rig.runner.builder.generation
             ask = generation.interrupted
 
             def interrupted() -> list[int]:

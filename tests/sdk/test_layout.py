@@ -44,7 +44,7 @@ def decode(
     layout: Layout, modules: Sequence[Module], dtype: str, frames: Sequence[tuple[int, bytes]], gap_ns: int = 1000
 ) -> Decoder:
     decoder = Decoder([layout], assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
-    batch = FrameBatch(256, layout.payload_size, decoder.headroom)
+    batch = FrameBatch(256, layout.payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
     for number, (identifier, payload) in enumerate(frames):
         batch.append(0, 1 + number * gap_ns, identifier, payload)
@@ -191,7 +191,7 @@ def test_frames_of_one_patch_and_one_module_alone() -> None:
         Patch("second", [Module(taxels(1, first_uid=7), key=5)], key=2),
     ]
     decoder = Decoder([layout], assemble([("bus", patches)], TYPES, "u1"))
-    batch = FrameBatch(8, 8, decoder.headroom)
+    batch = FrameBatch(8, 8, decoder.compiled.headroom)
     for identifier, value in ((0x345, 20), (0x7FF, 30), (0x181, 10), (0x182, 99)):
         batch.append(0, 1, identifier, bytes([value]))
     updates, foreign = decoder.decode(batch)
@@ -338,7 +338,7 @@ def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
     layout = one(Values(2, "u1", 1), sequence=SequenceNumber(0, "<u2"))
     decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, (40000).to_bytes(2, "little") + bytes(6))])
     decoder.forget(0)
-    batch = FrameBatch(16, 8, decoder.headroom)
+    batch = FrameBatch(16, 8, decoder.compiled.headroom)
     decoder.put_back(batch)
     batch.append(0, 1, 0x100, bytes(8))
     decoder.decode(batch)
@@ -352,7 +352,7 @@ def test_sequence_numbers_tell_losses_and_repeats() -> None:
     numbers = [254, 255, 0, 3, 3]
     frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
     decoder = Decoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
-    batch = FrameBatch(16, 8, decoder.headroom)
+    batch = FrameBatch(16, 8, decoder.compiled.headroom)
     for identifier, payload in frames:
         decoder.put_back(batch)
         batch.append(0, 1, identifier, payload)

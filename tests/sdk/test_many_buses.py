@@ -201,11 +201,11 @@ def test_a_slow_bus_that_was_removed_slows_nothing_down() -> None:
     with driving_lines(lines, "roboskin") as running:
         runner = running.runner
         assert runner is not None
-        assert runner._period_s == 0.25
+        assert runner.builder._period_s == 0.25
         do(running, lambda: runner.buses.change_to({"bus0": fast}, lambda _name, _adapter: emulated()))
-        assert runner._period_s == 0.02
-        assert runner.generation is not None
-        assert runner.generation.period_s == 0.02
+        assert runner.builder._period_s == 0.02
+        assert runner.builder.generation is not None
+        assert runner.builder.generation.period_s == 0.02
 
 
 def test_sighup_reads_the_buses_of_the_file_again(tmp_path: Path) -> None:

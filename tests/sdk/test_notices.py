@@ -12,7 +12,7 @@ import pytest
 from skinware import DriverReader, PatchState, Status
 from skinware.errors import DriverError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match

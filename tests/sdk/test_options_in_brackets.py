@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.cli import driver, emulate
 from skinware_drivers.cli.hardware_options import reserved_names
 from skinware_drivers.options import HasOptions, NoOptions

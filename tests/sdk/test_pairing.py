@@ -69,7 +69,7 @@ class Device:
             cuts: after how many frames each batch ends.
         """
         decoder, found = self.decoder, list[list[int]]()
-        batch = FrameBatch(len(sent) + 1, 8, decoder.headroom)
+        batch = FrameBatch(len(sent) + 1, 8, decoder.compiled.headroom)
         for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
             decoder.put_back(batch)
             for frame in sent[begin:end]:
@@ -244,7 +244,7 @@ def test_what_is_known_to_be_lost_between_two_batches_joins_nothing() -> None:
     device = Device(2, "given", "module", 1, PERIOD_NS // 2)
     first, second = (Sent(MS, 0, 0, 0, 0), Sent(2 * MS, 0, 1, 1, 1))
     decoder = device.decoder
-    batch = FrameBatch(8, 8, decoder.headroom)
+    batch = FrameBatch(8, 8, decoder.compiled.headroom)
     batch.append(0, first.time_ns, 0x100, bytes(8))
     decoder.decode(batch)
     decoder.put_back(batch)

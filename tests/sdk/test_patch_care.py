@@ -12,7 +12,7 @@ import pytest
 from skinware.errors import HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import PatchState
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
@@ -82,12 +82,11 @@ class Stage:
             name="can0",
             adapter=adapter,
             link=None,
-            lost=asyncio.Event(),
+            connection=SimpleNamespace(lost=asyncio.Event(), opened_ns=0),
+            condition=SimpleNamespace(limits=self),
             busy=asyncio.Lock(),
-            opened_ns=0,
             revived_ns=0,
             suspects=set(),
-            limits=self,
             set_up_ns=0,
         )
         self.care = PatchCare(cast(Any, line), lambda: cast(Any, generation), False, lambda: None, self._begin)

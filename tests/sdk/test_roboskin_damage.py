@@ -103,7 +103,7 @@ class DirtyBatch(FrameBatch):
 
 def test_what_lies_behind_the_end_of_a_payload_means_nothing() -> None:
     rig = Rig()
-    rig.batch = DirtyBatch(100, 8, rig.decoder.headroom)
+    rig.batch = DirtyBatch(100, 8, rig.decoder.compiled.headroom)
     assert rig.feed(halves(3, 7, tail="")) == [3]
     assert rig.values(3) == [7] * 12
     assert rig.status(3) == [0] * 12

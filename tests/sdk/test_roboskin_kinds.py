@@ -9,7 +9,7 @@ import pytest
 
 from skinware import Structure
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
-from skinware_drivers.can.roboskin_setup import BoardSetUp, tell_of_chips
+from skinware_drivers.can.roboskin_setup import BoardSetUp, warn_of_uneven_triangles
 from tests.sdk.test_roboskin_wire import Rig
 
 
@@ -52,7 +52,7 @@ def test_different_shifts_on_a_hand_of_type_3_are_warned_of(uneven: Any, warned:
     modules = (Kind(board=7, triangles=(8,), **uneven),) if uneven else ()
     for skin_type in (0, 3):
         options = RoboskinOptions(boards=(7,), skin_type=skin_type, modules=modules)
-        tell_of_chips("can0", [BoardSetUp(options, 7)])
+        warn_of_uneven_triangles("can0", [BoardSetUp(options, 7)])
     assert ("skin type 3 takes them as meant at its first set-up only" in caplog.text) == warned
     assert caplog.text.count("board 7") == int(warned)
 

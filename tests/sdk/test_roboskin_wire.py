@@ -31,7 +31,7 @@ class Rig:
         patches = self.driver.patches_set_up(boards)
         buses = [(f"bus{i}", patches) for i in range(n_buses)]
         self.decoder = Decoder([self.driver.layout] * len(buses), assemble(buses, self.driver.types, self.driver.dtype))
-        self.batch = FrameBatch(4096, 8, self.decoder.headroom)
+        self.batch = FrameBatch(4096, 8, self.decoder.compiled.headroom)
 
     def feed(self, frames: Sequence[Wire], bus: int = 0) -> list[int]:
         """Decode frames as one batch; returns the modules that were updated, in order."""

@@ -11,7 +11,7 @@ from skinware.samples import Unused, sample_report, sample_text
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import counters
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import Samples
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Values

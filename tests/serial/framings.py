@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from skinware_drivers.serial.checksums import (
     CRC8,
@@ -19,11 +19,10 @@ from skinware_drivers.serial.checksums import (
     XOR,
     Sum,
 )
+from skinware_drivers.serial.delimited import COBS, HDLC, LINES, SLIP, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited, Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
-from skinware_drivers.serial.text_matrix import TextMatrix
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ EXAMPLES: dict[str, Example] = {
             sync=b"\x7e",
             length=Length(Field(1, 2, "big"), 8),
             maximum=5000,
-            checksum=CRC32C.with_order("big"),
+            checksum=replace(CRC32C, order="big"),
             identifier=Field(3, mask=0x7F),
         ),
         range(128),

@@ -10,8 +10,8 @@ import random
 from collections.abc import Sequence
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.packets import Packet
 from tests.serial.framings import EXAMPLES, ONLY_IN_PYTHON, Example
 from tests.serial.streams import cut, outcome

@@ -25,9 +25,8 @@ from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import CRC16_XMODEM
+from skinware_drivers.serial.delimited import COBS, Delimited
 from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.framings import Delimited
-from skinware_drivers.serial.stuffing import COBS
 from skinware_drivers.testing.waiting import wait_until
 
 FRAMING = Delimited(COBS, maximum_body=64, checksum=CRC16_XMODEM, identifier=Field(0))

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.serial.delimited import LINES, Delimited
 from skinware_drivers.serial.framing import Framed, Framer, Framing
-from skinware_drivers.serial.framings import Delimited, Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.serial.stuffing import LINES
-from skinware_drivers.serial.text_matrix import TextMatrix
 from tests.serial.framings import Example
 from tests.specification.path_tests import made
 
@@ -51,7 +50,7 @@ def held_at_most(framer: Framer) -> int:
     if isinstance(framing, Recurring):
         return 3 * (len(framing.marker) + framing.maximum_body) + len(framing.marker)
     if isinstance(framing, TextMatrix):
-        return framing.longest + 2
+        return framing.rows * (4 * framing.columns + 2) + 2  # a number and a space each, and the ends of lines
     assert isinstance(framing, Delimited)
     return framing.stuffing.longest(framing.maximum_body + framing.overhead)
 

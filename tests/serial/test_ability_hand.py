@@ -71,7 +71,7 @@ def shown(
     with line() as port:
         bus = SerialBus(port.path, payload_size=driver.payload_size, listen_only=listen_only)
         with driving_lines([(driver, bus)], "hand", listen_only=listen_only, wait=False) as running:
-            wait_until(lambda: running.runner is not None and running.runner.writer is not None)
+            wait_until(lambda: running.runner is not None and running.runner.builder.writer is not None)
             with DriverReader("hand", timeout_s=30) as reader:
 
                 def is_seen(frame: DriverSnapshot) -> bool:

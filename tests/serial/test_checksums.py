@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -52,7 +54,10 @@ def bit_by_bit(crc: Crc, data: bytes) -> int:
 
 
 @settings(BUSY, max_examples=60)
-@given(crc=st.sampled_from([crc for crc, _ in KNOWN if type(crc) is Crc]), data=st.binary(max_size=300))
+@given(
+    crc=st.sampled_from([crc for crc, _ in KNOWN if isinstance(crc, Crc) and not crc.plain_table]),
+    data=st.binary(max_size=300),
+)
 def test_a_crc_is_as_bit_by_bit(crc: Crc, data: bytes) -> None:
     assert crc.of(data) == bit_by_bit(crc, data)
 
@@ -66,7 +71,7 @@ def test_weiss_vectors() -> None:
 
 
 def test_order() -> None:
-    assert checksums.CRC16_XMODEM.with_order("big").to_bytes(CHECK) == b"\x31\xc3"
+    assert replace(checksums.CRC16_XMODEM, order="big").to_bytes(CHECK) == b"\x31\xc3"
 
 
 def test_widths_that_cannot_be_had() -> None:

@@ -15,7 +15,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
@@ -80,7 +80,7 @@ def test_it_is_unplugged_and_comes_back_as_another(
     bus = SerialBus(str(link), payload_size=driver.payload_size)
 
     def is_live(running: Driving, count: int) -> bool:
-        generation = running.runner and running.runner.generation
+        generation = running.runner and running.runner.builder.generation
         if not generation or generation.tables.structure.n_sensors != count:
             return False
         return bool(running.status()["patches"][0]["state"] == "live")

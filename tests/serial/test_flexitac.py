@@ -14,11 +14,9 @@ from skinware import DriverReader, DriverSnapshot, Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.flexitac import FlexiTacDriver, FlexiTacOptions
-from skinware_drivers.serial.framings import Recurring
+from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.serial.text_matrix import TextMatrix
-from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.driving import emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac, EmulatedFlexiTacOptions
 from tests.sdk.driving import driving_lines, read_until
@@ -129,7 +127,7 @@ def shown(stream: bytes, **options: Any) -> DriverSnapshot:
 
             def is_shown() -> bool:
                 port.write(stream)
-                return running.runner is not None and running.runner.writer is not None
+                return running.runner is not None and running.runner.builder.writer is not None
 
             wait_until(is_shown)
             with DriverReader("pad", timeout_s=30) as reader:
@@ -205,7 +203,7 @@ def test_another_pad_is_plugged_in(firmware: str, tmp_path: Path) -> None:
                 link.symlink_to(path)
 
                 def is_live(count: int = rows * columns) -> bool:
-                    generation = running.runner and running.runner.generation
+                    generation = running.runner and running.runner.builder.generation
                     if not generation or generation.tables.structure.n_sensors != count:
                         return False
                     return bool(running.status()["patches"][0]["state"] == "live")

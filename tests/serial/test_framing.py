@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framed
-from skinware_drivers.serial.framings import Delimited
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from tests.serial.framings import EXAMPLES, Example
 from tests.serial.streams import BUSY, cut, feed, frames, noise, outcome, streams

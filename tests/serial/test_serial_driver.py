@@ -99,8 +99,8 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
                         and bus._is_garbled
                     ):
                         break
-                wait_until(lambda: runner.lines[1].reason == BusReason.BUS_ERRORS)
-                assert runner.lines[0].reason == BusReason.NONE
+                wait_until(lambda: runner.lines[1].condition.reason == BusReason.BUS_ERRORS)
+                assert runner.lines[0].condition.reason == BusReason.NONE
                 assert values == sorted(values)
                 assert len(set(values)) > 80
                 assert bus.counters.framing.bytes_in - bus.counters.framing.skipped_bytes < 200_000

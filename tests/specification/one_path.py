@@ -147,7 +147,7 @@ class Way:
         )
         self.publisher.buses.counters = [BusCounters() for _ in layouts]
         longest = max((layout.payload_size for layout in layouts if layout is not None), default=8)
-        self.batch = FrameBatch(rows, payload_size or longest, self.decoder.headroom)
+        self.batch = FrameBatch(rows, payload_size or longest, self.decoder.compiled.headroom)
 
     def empty(self) -> None:
         """Empty the batch, but for what waits for partners."""
@@ -184,7 +184,7 @@ class Way:
                 [(patch, sorted(vars(clock).items())) for patch, clock in sorted(decoder.device_stamps.clocks.items())]
             ),
         }
-        for number, cycle in enumerate(decoder.cycles):
+        for number, cycle in enumerate(decoder.compiled.cycles):
             if cycle.punctuality is not None:
                 found[f"cycle {number}, last_ns"] = cycle.punctuality.last_ns
                 found[f"cycle {number}, spacings_ns"] = cycle.punctuality.spacings_ns

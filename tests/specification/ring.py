@@ -37,12 +37,24 @@ _STATISTICS = slice(file_layout.STATISTICS_OFFSET // 8, file_layout.COLUMN_OFFSE
 _TIMED, _WALL, _CPU, _BEFORE_BOOT, _AGE = 0, 1, 4, 7, 8
 
 
+class NothingInC:
+    """In the place of C: each turn is Python's."""
+
+    begun_ns = 0
+
+    def next(self, wanted: int, timeout_ns: int) -> None:
+        self.begun_ns = now_ns()
+
+    def leave_until(self, until_ns: int) -> None:
+        pass
+
+
 class SpecifiedReader(RingReader[SampleT]):
     """A reader that copies, waits and goes round in Python."""
 
-    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> SampleT | None:
-        self.wake_word.wait(wake_count, timeout_ns)
-        return self.copy(sequence) if self.latest != latest else None
+    def __init__(self, segment: Segment, frame_class: type[SampleT], context: object = None) -> None:
+        super().__init__(segment, frame_class, context)
+        self.take: Any = NothingInC()
 
     def copy(self, sequence: int | None = None) -> SampleT | None:
         if sequence is not None:
@@ -55,9 +67,6 @@ class SpecifiedReader(RingReader[SampleT]):
             if sample is not None:
                 return sample
         raise self._overrun()
-
-    def next_turn(self, timeout_ns: int | None, in_order: bool) -> None:
-        self.turns.begun_ns = now_ns()
 
     def _copy(self, sequence: int) -> SampleT | None:
         slot = sequence % len(self._slots)

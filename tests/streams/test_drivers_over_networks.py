@@ -8,8 +8,7 @@ import pytest
 
 from skinware.status import BusState, PatchState
 from skinware_drivers.registry import load_driver, make_bus
-from skinware_drivers.testing.carrying import emulated_on
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
+from skinware_drivers.testing.driving import driving_lines, emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.commands import run, running
@@ -43,7 +42,7 @@ def test_a_device_that_hangs_up_is_called_again_and_again(namespace: object) -> 
     bus = make_bus(f"tcp://{LOCAL}:{port}", payload_size=adapter.payload_size)
     device = f"tcp://{LOCAL}:{port}"
     with driving_lines([(adapter, bus)], "wts", wait=False, wait_for_buses=True) as driving:
-        wait_until(lambda: driving.runner is not None and driving.runner.lines[0].lost.is_set())
+        wait_until(lambda: driving.runner is not None and driving.runner.lines[0].connection.lost.is_set())
         for _ in range(2):
             with emulated_on(make_bus(device, payload_size=4096, for_devices=True), emulator):
                 driving.wait()
@@ -84,7 +83,7 @@ def test_who_is_behind_a_connection_is_asked_only_on_request(namespace: object) 
     device = make_bus(f"tcp://{LOCAL}:{(port := free_port())}", payload_size=4096, for_devices=True)
     with emulated_on(device, load_emulator("weiss_wts")):
         looked = run("skin-find", f"tcp://{LOCAL}:{port}")
-        assert (looked.returncode, "not listened to" in looked.stdout) == (0, True), looked.stderr
+        assert (looked.returncode, "not opened" in looked.stdout) == (0, True), looked.stderr
         assert device.counters.framing.bytes_in == 0
         asked = run("skin-find", f"tcp://{LOCAL}:{port}", "--probe", "--driver", "weiss_wts")
         assert "answers: WTS with" in asked.stdout

@@ -13,8 +13,7 @@ from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.framing import Framed
 from skinware_drivers.streams.icub_eth import IcubEthOptions, rops
-from skinware_drivers.testing.carrying import emulated_on
-from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.driving import emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, datagram
 from tests.streams.peers import LOCAL, free_port

@@ -11,7 +11,7 @@ import pytest
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.bus_names import parse_bus_name, place_of_bus
+from skinware_drivers.bus_names import BusName, parse_bus_name
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial import native_stream
 from skinware_drivers.serial.bus import SerialBus
@@ -45,8 +45,8 @@ def test_names() -> None:
     assert parse_bus_name("tcp://host:5000?patience_s=9") == ("tcp", "host:5000", {"patience_s": "9"})
     assert parse_bus_name("tcp:host:5000") == ("tcp", "host:5000", {})
     assert parse_bus_name("socket://host:5000").interface == "serial"
-    assert place_of_bus("tcp://host:5000?patience_s=9") == place_of_bus("tcp:host:5000")
-    assert place_of_bus("tcp://host:5000") != place_of_bus("udp://host:5000")
+    assert BusName.of("tcp://host:5000?patience_s=9").place == BusName.of("tcp:host:5000").place
+    assert BusName.of("tcp://host:5000").place != BusName.of("udp://host:5000").place
     assert isinstance(make_bus("tcp://[::1]:5000"), TcpBus)
     assert isinstance(make_bus("tcp://:0", for_devices=True), TcpServerBus)
 

@@ -15,8 +15,7 @@ from skinware.status import PatchState
 from skinware_drivers.link import Link, Reply
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.tesollo import _TIPS, TesolloDriver, TesolloOptions, _Hand
-from skinware_drivers.testing.carrying import emulated_on
-from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.driving import emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from tests.commands import run
@@ -142,7 +141,7 @@ class Says:
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ("0007 08 5F22 0105", "does not tell which sensors it has: say sensors"),
+        ("0007 08 5F22 0105", "does not report its sensors: say sensors"),
         ("0009 08 5F22 0105 00 00", "says it has no sensors"),
         ("0009 08 5F22 0105 03 00", "says it has no sensors"),
         ("0009 08 5F22 0105 09 1F", "says it has no sensors"),

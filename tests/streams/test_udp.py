@@ -192,7 +192,7 @@ def test_a_driver_counts_datagrams_that_were_lost_or_overtook_each_other(namespa
     bus = make_bus(f"udp://:{port}", payload_size=64)
     with sender() as device, contextlib.ExitStack() as stack:
         running = stack.enter_context(driving_lines([(Numbered(NoOptions()), bus)], "finger", wait=False))
-        wait_until(lambda: running.runner is not None and running.runner.generation is not None)
+        wait_until(lambda: running.runner is not None and running.runner.builder.generation is not None)
         say(1)  # what came before that belongs to nobody
         running.wait()
         for number in (2, 3, 5, 4, 6, 9, 10, 11):

@@ -15,8 +15,7 @@ from websockets.sync.server import ServerConnection
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import make_bus
-from skinware_drivers.serial.framings import Delimited
-from skinware_drivers.serial.stuffing import LINES
+from skinware_drivers.serial.delimited import LINES, Delimited
 from skinware_drivers.streams.websocket import WebSocketBus
 from skinware_drivers.testing.waiting import wait_until
 from tests.streams.peers import LOCAL, free_port, received, server, why_lost

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values

@@ -64,7 +64,12 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
         (),
         r"frames of other devices came, \d+ were counted",
     ),
-    (f.FilledIn, "test_nothing_is_valid_before_the_first_data", (), r"filled in that no frame had told of"),
+    (
+        f.FilledIn,
+        "test_nothing_is_valid_before_the_first_data",
+        (),
+        r"sensors without a frame of theirs were filled in",
+    ),
     (f.RaisesOnGarbage, "test_garbage_raises_nothing", (), r"Expand function raised ValueError: there is no such half"),
     (
         f.AnyLength,
@@ -89,9 +94,9 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
         f.ChangesItsMind,
         "test_the_description_is_valid_complete_and_stable",
         (),
-        r"says something else when it is asked",
+        r"returns another structure for the same devices",
     ),
-    (f.WrongPeriod, "test_the_rate_is_the_one_it_tells", (), r"`period_s` is 0.04 s, but device 1 sends every 0.02 s"),
+    (f.WrongPeriod, "test_the_rate_is_the_declared_one", (), r"`period_s` is 0.04 s, but device 1 sends every 0.02 s"),
     (f.Sleeps, VALUES, (), r"blocks: .*fingertips.py:\d+, in start, calls time.sleep\(0.01\)"),
     (f.Hangs, VALUES, (), r"blocks, nothing is read(?s:.*)go_on.wait"),
     (f.WaitsForEver, "test_devices_that_come_late_are_found", (), r"nothing was published .*the devices sent no frame"),
@@ -99,12 +104,12 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
     (f.LeaksThreads, "test_nothing_leaks", (), r"left behind after .*thread 'forgotten'"),
     (f.LeaksTasks, VALUES, (), r"a task was left running at the end: .*sleep"),
     (f.LeaksMemory, "test_memory_does_not_grow", (), r"memory grows with the data: \d+ pieces more.*fingertips.py"),
-    (f.TalksWhenItShouldListen, "test_a_listener_sends_nothing", (), r"listen only, and tried to send \d+ frames"),
+    (f.TalksWhenItShouldListen, "test_a_listener_sends_nothing", (), r"may only listen, and tried to send \d+ frames"),
     (
         f.NeverStops,
         "test_devices_are_silent_again_after_stop",
         (),
-        r"go on sending .* `stop` does not make them silent",
+        r"continue to send .* `stop` does not make them silent",
     ),
     (f.IgnoresRestarts, "test_restarted_devices_come_back", (), r"lost its power .*look at `probe` and `revive`"),
     (f.RaisesOnStop, "test_handshakes_in_any_order", (), r"`stop` raised AttributeError: .*only BusError may be"),
@@ -206,6 +211,6 @@ def test_the_period_that_is_measured_is_the_real_one(real_s: float) -> None:
     suite = TestFingertips()
     suite.emulator = type("Emulated", (f.EmulatedFingertips,), {"period_s": real_s})  # type: ignore[misc, assignment]
     with pytest.raises(pytest.fail.Exception, match=r"`period_s` is 0.02 s, but device 1 sends every") as raised:
-        suite.test_the_rate_is_the_one_it_tells()
+        suite.test_the_rate_is_the_declared_one()
     (told,) = re.findall("sends every (.*) s", str(raised.value))
     assert float(told) == pytest.approx(real_s, rel=0.02)

@@ -19,9 +19,8 @@ from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framings import Delimited
+from skinware_drivers.serial.delimited import COBS, Delimited
 from skinware_drivers.serial.openpatch import OpenPatchDriver
-from skinware_drivers.serial.stuffing import COBS
 from skinware_drivers.testing import lab
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.driving import EmulatedSkin

@@ -15,7 +15,7 @@ from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import assemble
 from skinware_drivers.layout import Cycle, Identifier, Layout, SequenceNumber
 from skinware_drivers.options import NoOptions
-from skinware_drivers.testing.replaying import BURSTS, Recording, record, try_troubles
+from skinware_drivers.testing.torn_tests import BURSTS, Recording, record, try_troubles
 from tests.testing.fingertips import Fingertips
 
 PERIOD_NS = 20_000_000

@@ -109,12 +109,12 @@ def test_what_is_whole_is_shown() -> None:
         ),
         (lambda **m: stream("55 F0 01 02 F3", **m), r"1 bytes belong to no good packet"),
         (lambda **m: stream("F0 01 02 F3 F0 01", **m), r"the last 2 bytes are no whole packet"),
-        (lambda **m: stream("", **m), r"nothing of it is data of this driver"),
+        (lambda **m: stream("", **m), r"no part of it is data of this driver"),
         (lambda **m: registers(REPLIED, **m), r"bytes belong to no good packet|no whole packet"),
         (lambda **m: registers(ASKED + REPLIED[:-2] + "FF", **m), r"1 x the checksum is wrong|no whole packet"),
         (lambda **m: registers(ASKED + REPLIED[:-3], **m), r"the last 8 bytes are no whole packet"),
-        (lambda **m: registers(ASKED_ELSE + REPLIED_ELSE, **m), r"nothing of it is data of this driver"),
-        (lambda **m: registers(ASKED + REFUSED, **m), r"nothing of it is data of this driver"),
+        (lambda **m: registers(ASKED_ELSE + REPLIED_ELSE, **m), r"no part of it is data of this driver"),
+        (lambda **m: registers(ASKED + REFUSED, **m), r"no part of it is data of this driver"),
     ],
 )
 def test_what_is_not_shown_fails_the_test_unless_it_is_meant_to(decoding: Callable[..., Shown], words: str) -> None:

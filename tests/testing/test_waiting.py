@@ -27,7 +27,7 @@ def test_it_waits_for_seconds_not_for_frames_and_says_what_it_saw() -> None:
         assert 0.5 <= time.monotonic() - begun < 30
     words = str(told.value)
     assert "frames of 0.5 s fulfils" in words
-    assert "of the last, 41 of 96 sensors are fresh, 1 NEVER_SEEN, 52 STALE" in words
+    assert "in the last, 41 of 96 sensors are fresh, 1 NEVER_SEEN, 52 STALE" in words
     assert "unknown: 7, for example 18DA00F1 [8] 01 02 03 04 05 06 07 08" in words
 
 

@@ -7,18 +7,16 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from skinware import Namespace
+from skinware import DriverReader, Namespace
 from skinware.errors import ServiceNotFound
-from skinware.views import live
 from skinware.views.following import Follower
-from skinware.views.live import LiveDriver
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 
 @pytest.fixture(autouse=True)
 def look_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
 
 
 def names(follower: Follower) -> list[str]:
@@ -79,13 +77,13 @@ def test_a_driver_that_goes_at_the_worst_moment(namespace: Namespace, monkeypatc
         skin.publish()
         follower.take(0)
 
-        def gone(_self: LiveDriver) -> bool:
+        def gone(_self: DriverReader) -> None:
             raise ServiceNotFound("gone")
 
         with monkeypatch.context() as patch:
-            patch.setattr(live, "_LOOK_EVERY_NS", 200_000_000)
+            patch.setattr("skinware.drivers.LOOK_EVERY_NS", 200_000_000)
             follower.take(0)
-            patch.setattr(LiveDriver, "poll", gone)
+            patch.setattr(DriverReader, "refresh", gone)
             assert names(follower) == names(follower) == []
         skin.publish()
         wait_until(lambda: names(follower) == ["a"])

@@ -67,7 +67,7 @@ def test_a_driver_that_lives_is_no_replay(serving: Serve) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))), serving() as url, page_of(url) as page:
         page.pull_picture()
         page.say("replay", action="pause")
-        assert page.pull_until(lambda turn: "error" in turn)["error"] == "what is shown is no replay"
+        assert page.pull_until(lambda turn: "error" in turn)["error"] == "no replay is shown"
         page.state = {}
         page.pull_until(lambda _: page.state)
         assert page.state["replay"] is None

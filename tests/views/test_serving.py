@@ -12,7 +12,7 @@ from skinware import Namespace, Status
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
-from skinware.views import quantities
+from skinware.views import history
 from skinware.views.robot import Robot
 from skinware.views.turns import PROTOCOL
 from skinware_drivers.testing.waiting import wait_until
@@ -176,7 +176,7 @@ def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch
     skin.values = np.full(24, 240)
     touched = skin.values.copy()
     touched[4:8] = 140
-    monkeypatch.setattr(quantities, "SETTLING_S", 0.1)
+    monkeypatch.setattr(history, "SETTLING_S", 0.1)
     with publishing(skin), serving() as url, page_of(url) as page:
         page.say("look", mode="change")
         for _ in range(5):
@@ -241,7 +241,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
 
 
 def test_shear_is_how_far_two_axes_are_from_rest(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quantities, "SETTLING_S", 0.1)
+    monkeypatch.setattr(history, "SETTLING_S", 0.1)
     skin = FakeSkin("finger", structure_of([(0, "2x3", 6)], FORCE))
     skin.values = np.arange(18) * 10
     with publishing(skin), serving() as url, page_of(url) as page:

@@ -16,7 +16,7 @@ import pytest
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.bus_names import is_only_asked, place_of_bus
+from skinware_drivers.bus_names import BusName
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.yarp_bus import YarpBus
 from skinware_drivers.streams.yarp_messages import LENGTH, YarpMessages
@@ -108,8 +108,12 @@ def test_impossible_names(name: str) -> None:
 
 
 def test_what_the_name_of_such_a_bus_means() -> None:
-    assert is_only_asked("yarp://h:1/x")
-    assert place_of_bus("yarp://h:1/x?silence_s=0") == place_of_bus("yarp://h:1/x") != place_of_bus("yarp://h:1/y")
+    assert BusName.of("yarp://h:1/x").is_only_asked
+    assert (
+        BusName.of("yarp://h:1/x?silence_s=0").place
+        == BusName.of("yarp://h:1/x").place
+        != BusName.of("yarp://h:1/y").place
+    )
     with pytest.raises(ConfigurationError, match="silence"):
         make_bus("yarp://h/x?silense_s=3")
 

@@ -112,7 +112,7 @@ def test_what_cannot_be_served_says_why() -> None:
     structure = assemble(
         [("bus", YarpDriver(YarpOptions())._of_places(6)[0])], [PRESSURE.measured(unit="N"), *FORCE], np.float32
     ).structure
-    with pytest.raises(ConfigurationError, match="say --full-scale"):
+    with pytest.raises(ConfigurationError, match="give --full-scale"):
         vectors_of("skin", structure, "other")
     with pytest.raises(ConfigurationError, match="no sensors of the type 'heat'"):
         vectors_of("skin", structure, "other", type_name="heat")

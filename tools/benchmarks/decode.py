@@ -92,7 +92,7 @@ class Numpy:
             self.writer, self.decoder, driver.watch(tables), driver.period_s, driver.by_cycle
         )
         self.publisher.buses.counters = [self.bus.counters]
-        self.batch = FrameBatch(2048, 8, self.decoder.headroom)
+        self.batch = FrameBatch(2048, 8, self.decoder.compiled.headroom)
 
     def drain(self) -> int:
         """Take and decode everything that waits; returns the number of frames."""

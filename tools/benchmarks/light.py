@@ -146,16 +146,16 @@ class WatchedJoiner(Joiner):
 
     def came(self) -> Account:
         """What came since the last call."""
-        with self._lock:
-            self._services_state()
+        with self._mirror.lock:
+            self._service_states()
             came, self._came = self._came, Account()
         return came
 
-    def _services_state(self) -> dict[str, ServiceState]:
+    def _service_states(self) -> dict[str, ServiceState]:
         for follower in self._followers.values():
-            traffic = follower.traffic
-            self._came.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=traffic.ages_ns))
-        return super()._services_state()
+            traffic = follower.output.traffic
+            self._came.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=list(traffic.ages_ns)))
+        return super()._service_states()
 
 
 @contextmanager

@@ -22,8 +22,7 @@ from skinware.conversion import ros_messages
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.geometry import Geometry
-from skinware.ros2 import discovery, types
-from skinware.ros2.taring import response
+from skinware.ros2 import messages, types
 from skinware.ros2.transport import Distro, Identity, MessageType, Qos
 from skinware.sensor_types import PRESSURE
 
@@ -129,7 +128,7 @@ def check_service(peer: Peer, node: DdsNode) -> tuple[list[str], bool]:
 
     def answer(request: bytes) -> bytes:
         asked.append(request)
-        return response(True, "done")
+        return messages.trigger_response(True, "done")
 
     node.service(SERVICE, types.TRIGGER, answer)
     request, reply = types.TRIGGER.request, types.TRIGGER.response
@@ -199,7 +198,7 @@ def main() -> int:
         came = peer.messages[f"rt{topic}"]
         padded = [message + bytes(-len(message) % 4) for message in sent]
         equal = sum(one in padded for one in came)
-        hash_told = peer.data.get(f"rt{topic}") == discovery.endpoint_data(message_type.hash, Distro.JAZZY).decode()
+        hash_told = peer.data.get(f"rt{topic}") == messages.endpoint_data(message_type.hash, Distro.JAZZY).decode()
         is_good &= came == padded and hash_told
         print(
             f"{message_type.name:32} {len(sent[0]):8} B: {len(sent):3} sent, {len(came):3} came, {equal:3} byte-equal,"

@@ -60,9 +60,9 @@ def heard(name: str, emulated: dict[str, Any], options: dict[str, Any]) -> tuple
             rig.devices.emit = listen
             await rig.sleep(_HEARD_S)
             assert rig.runner is not None
-            assert rig.runner.generation is not None
+            assert rig.runner.builder.generation is not None
             assert isinstance(rig.adapter, SerialAdapter)
-            return rig.adapter, rig.runner.generation.tables, b"".join(said)
+            return rig.adapter, rig.runner.builder.generation.tables, b"".join(said)
 
     return play(scenario)
 

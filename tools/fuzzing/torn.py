@@ -32,10 +32,9 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
-from skinware_drivers.testing.replaying import Recording, find_torn, record
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
-from skinware_drivers.testing.torn_tests import Heard
+from skinware_drivers.testing.torn_tests import Heard, Recording, find_torn, record
 from skinware_drivers.virtual.hand_clock import HandClock
 
 Indices = npt.NDArray[np.int64]

@@ -30,9 +30,9 @@ async def picture(namespace: str) -> str:
     app = SkinTop(Namespace(namespace), palette=TRUE_COLOURS)
     async with app.run_test(size=SIZE) as pilot:
         async with asyncio.timeout(PATIENCE_S):
-            while not app.query_one("#list", DataTable).row_count or not app._drivers.look()[0].frame:
+            while not app.query_one("#list", DataTable).row_count or not app._overview.drivers.look()[0].frame:
                 await pilot.pause(0.1)
-            if app._drivers.others:
+            if app._overview.contacts.readers:
                 await _followed(app, pilot)
             else:
                 await pilot.press("down", "down")
@@ -44,8 +44,8 @@ async def _followed(app: SkinTop, pilot: Pilot[None]) -> None:
     """Wait until nearly all sensors are at rest, and two contacts are there for a while."""
     while True:
         await pilot.pause(0.05)
-        (driver,) = app._drivers.look()
-        contacts = app._contacts.of(driver.name)
+        (driver,) = app._overview.drivers.look()
+        contacts = app._overview.contacts.of(driver.name)
         rested = driver.frame is not None and (driver.frame.status == 0).mean() > 0.98
         if rested and contacts and len(contacts.contacts) == 2 and contacts.contacts.age_s.min() > 1.5:
             return

@@ -1,0 +1,280 @@
+"""Remember values from frame to frame: at rest, their spans, the last seconds, and a wipe test."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import NS_PER_S
+from skinware.structure import Structure
+
+Floats = npt.NDArray[np.float32]
+
+_LEAST_SPAN = 8
+"""The least span of a scale of changes, in multiples of the noise."""
+_FORGET_S = 20.0
+_STEPS = (1, 1.5, 2, 3, 4, 6, 8, 10)
+SETTLING_S = 1.0
+_FALL_S = 1.0
+_DRIFT_S = 60.0
+_GROW_WHEN_TOUCHED = ("pressure", "force")
+LENGTH_S = 10.0
+_FRAMES = 320
+"""Snapshots that are kept at most: ten seconds at 32 a second."""
+_TIMES_THE_NOISE = 6
+
+
+class ChangeSpan:
+    """The greatest change from rest seen lately, rounded up; it is forgotten slowly."""
+
+    def __init__(self) -> None:
+        self._greatest = 0.0
+        self._time_ns = 0
+
+    def follow(self, change: Floats, noise: float, time_ns: int) -> float:
+        """Take changes into account and return the span.
+
+        Args:
+            change: (k,) physical, 0 or more, of the sensors that count.
+            noise: how far values move without a touch; the span is at least 8 times as large.
+            time_ns: of the frame.
+        """
+        passed_s = max(0, time_ns - self._time_ns) / 1e9
+        self._time_ns = time_ns
+        self._greatest *= math.exp(-passed_s / _FORGET_S)
+        self._greatest = max(self._greatest, float(change.max(initial=0)))
+        return rounded_up(max(self._greatest, _LEAST_SPAN * noise))
+
+
+class ValueLimits:
+    """The two limits of values where they are known, otherwise the extremes seen so far."""
+
+    def __init__(self) -> None:
+        self._low, self._high = math.inf, -math.inf
+
+    def follow(self, values: Floats, limits: tuple[float, float]) -> tuple[float, float]:
+        """Take values into account and return the limits.
+
+        Args:
+            values: (k,) of the sensors that count.
+            limits: of the sensor type; infinite where they are not known.
+        """
+        if all(map(math.isfinite, limits)):
+            return limits
+        counting = values[np.isfinite(values)]
+        self._low = min(self._low, float(counting.min(initial=math.inf)))
+        self._high = max(self._high, float(counting.max(initial=-math.inf)))
+        return (self._low, self._high) if self._low <= self._high else (0.0, 1.0)
+
+
+def rounded_up(value: float) -> float:
+    """Return the next of a few round numbers, of any size."""
+    if not value > 0 or not math.isfinite(value):
+        return 1.0
+    unit = 10.0 ** math.floor(math.log10(value))
+    return next(step * unit for step in _STEPS if step * unit >= value * (1 - 1e-9))
+
+
+class Rest:
+    """The baseline of every sensor of a driver, and its noise.
+
+    A baseline is the mean of the first second. Then it follows slowly, over a minute: a touch stays visible, drift does
+    not. Pressure and force only grow when touched, and their baselines follow a lower value within a second: a sensor
+    that was touched at the start is right again soon after it was let go.
+
+    Args:
+        structure: of the driver.
+
+    Attributes:
+        baseline: (n,) float32, physical; NaN for a sensor that had no fresh value so far.
+    """
+
+    def __init__(self, structure: Structure) -> None:
+        self._structure = structure
+        growing = [t.id for t in structure.types if t.name in _GROW_WHEN_TOUCHED]
+        self._fall_s = np.where(np.isin(structure.sensor_type, growing), _FALL_S, _DRIFT_S).astype(np.float32)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget everything; the next values are the baseline."""
+        n = self._structure.n_sensors
+        self.baseline: Floats = np.full(n, np.nan, np.float32)
+        self._age_s = np.zeros(n, np.float32)
+        self._unrest = np.zeros(n, np.float32)
+        self._time_ns: int | None = None
+
+    def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_], time_ns: int) -> None:
+        """Take a snapshot into account; the same one again changes nothing.
+
+        Args:
+            physical: (n,) physical values.
+            fresh: (n,) bool; other sensors are left out.
+            time_ns: when it was published, CLOCK_MONOTONIC.
+        """
+        passed_s = np.float32(0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9))
+        self._time_ns = time_ns
+        counts = fresh & np.isfinite(physical)
+        self.baseline = np.where(counts & np.isnan(self.baseline), physical, self.baseline)
+        change = np.where(counts, physical - self.baseline, np.float32(0))
+        settling = self._age_s < SETTLING_S
+        np.maximum(self._unrest, np.where(settling, np.abs(change), 0), out=self._unrest)
+        slow_s = np.where(change < 0, self._fall_s, np.float32(_DRIFT_S))
+        self._age_s += passed_s * counts
+        follow_s = np.where(settling, self._age_s, slow_s)
+        self.baseline += change * (passed_s / np.maximum(follow_s + passed_s, np.float32(1e-9)))
+
+    def change(self, physical: Floats) -> Floats:
+        """Return (n,) float32, 0 or more: distance of values from the baseline, up or down; 0 without a baseline."""
+        change: Floats = np.nan_to_num(np.abs(physical - self.baseline), posinf=0.0)
+        return change
+
+    def noise(self, type_name: str) -> float:
+        """Return the noise of a type: half of its sensors moved less in their first second; at least one count."""
+        unrest = self._unrest[self._structure.index(type_name)]
+        count = abs(self._structure.type(type_name).scale) if self._structure.dtype.kind != "f" else 0.0
+        return max(float(np.median(unrest)), count)
+
+
+class Past:
+    """Values of n sensors in the last seconds.
+
+    Args:
+        n: sensors.
+        dtype: of their values.
+    """
+
+    def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
+        self._values: npt.NDArray[Any] = np.zeros((_FRAMES, n), dtype)
+        self._time_ns = np.zeros(_FRAMES, np.int64)
+        self._count = 0
+
+    def add(self, values: npt.NDArray[Any], time_ns: int) -> None:
+        """Keep the values of a snapshot.
+
+        Args:
+            values: (n,) raw.
+            time_ns: when it was published; later than all before.
+        """
+        row = self._count % _FRAMES
+        self._values[row], self._time_ns[row] = values, time_ns
+        self._count += 1
+
+    def series(self, position: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
+        """Return (k,) int64 ns and (k,) raw values of a sensor in the ten seconds before the newest snapshot."""
+        rows = self._rows()
+        return self._time_ns[rows], self._values[rows, position]
+
+    def noise(self, positions: list[int]) -> npt.NDArray[np.float64]:
+        """Return (k,) float64, standard deviation of raw values from snapshot to snapshot; NaN before the third."""
+        rows = self._rows()
+        if len(rows) < 3:
+            return np.full(len(positions), np.nan)
+        values = self._values[np.ix_(rows, np.array(positions, np.int64))].astype(np.float64)
+        noise: npt.NDArray[np.float64] = np.diff(values, axis=0).std(axis=0) / np.sqrt(2)
+        return noise
+
+    def _rows(self) -> npt.NDArray[np.int64]:
+        """Return the rows of the last ten seconds, the oldest first."""
+        rows = np.arange(max(0, self._count - _FRAMES), self._count) % _FRAMES
+        if not len(rows):
+            return rows
+        times = self._time_ns[rows]
+        recent: npt.NDArray[np.int64] = rows[times >= times[-1] - LENGTH_S * NS_PER_S]
+        return recent
+
+
+class WipeTest:
+    """How far every sensor of a driver has moved while a hand goes over the whole skin.
+
+    A sensor that never moved is broken, however plausible its value is.
+
+    Args:
+        structure: of the driver.
+    """
+
+    def __init__(self, structure: Structure) -> None:
+        self._structure = structure
+        self._lowest: Floats = np.full(structure.n_sensors, np.inf, np.float32)
+        self._highest: Floats = np.full(structure.n_sensors, -np.inf, np.float32)
+
+    def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_]) -> None:
+        """Take a snapshot into account.
+
+        Args:
+            physical: (n,) physical values.
+            fresh: (n,) bool; other sensors are left out.
+        """
+        np.fmin(self._lowest, physical, out=self._lowest, where=fresh)
+        np.fmax(self._highest, physical, out=self._highest, where=fresh)
+
+    def travel(self) -> Floats:
+        """Return (n,) float32, from the lowest to the highest value of each sensor; 0 without any fresh value."""
+        travel: Floats = np.nan_to_num(np.maximum(self._highest - self._lowest, 0))
+        return travel
+
+    def never_moved(self, type_name: str, noise: float) -> npt.NDArray[np.int64]:
+        """Return positions of the sensors of a type that never moved by more than ``threshold(noise)``."""
+        index = self._structure.index(type_name)
+        positions = np.arange(self._structure.n_sensors)[index]
+        return positions[self.travel()[index] <= threshold(noise)]
+
+    def save(self, folder: Path, driver: str, type_name: str, noise: float) -> Path:
+        """Write a list of the sensors that never moved.
+
+        Args:
+            folder: of the new file.
+            driver: name of the driver.
+            type_name: which sensors.
+            noise: of that type, physical.
+
+        Returns:
+            The new file; its name contains the time.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        structure = self._structure
+        never = self.never_moved(type_name, noise)
+        unit = structure.type(type_name).unit
+        size = len(np.arange(structure.n_sensors)[structure.index(type_name)])
+        path = folder / f"never-moved-{driver}-{type_name}-{time.strftime('%Y%m%d-%H%M%S')}.txt"
+        head = f"# {driver}: {len(never)} of {size} {type_name} sensors never moved by more than"
+        lines = [f"{head} {threshold(noise):.4g} {unit}".rstrip(), "# position in a frame, uid, name"]
+        lines += [f"{p}\t{int(structure.sensor_uid[p]):#x}\t{structure.sensor_name(p)}" for p in never.tolist()]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return path
+
+
+def threshold(noise: float) -> float:
+    """Return how far a sensor moves at least when it is touched."""
+    return _TIMES_THE_NOISE * noise
+
+
+class Memory:
+    """Everything that a picture of one driver remembers from snapshot to snapshot.
+
+    Args:
+        structure: of the driver.
+        rest: its values at rest, if others follow them too; default: its own.
+    """
+
+    def __init__(self, structure: Structure, rest: Rest | None = None) -> None:
+        self.structure = structure
+        self.rest = rest or Rest(structure)
+        self.wipe: WipeTest | None = None
+        self.peak: tuple[str, Floats] | None = None
+        self._spans: dict[tuple[str, str], ChangeSpan] = {}
+        self._limits: dict[tuple[str, str], ValueLimits] = {}
+
+    def span(self, key: tuple[str, str], change: Floats, noise: float, time_ns: int) -> float:
+        """Return the span of one kind of change; see :meth:`ChangeSpan.follow`."""
+        return self._spans.setdefault(key, ChangeSpan()).follow(change, noise, time_ns)
+
+    def limits(self, key: tuple[str, str], values: Floats, known: tuple[float, float]) -> tuple[float, float]:
+        """Return the limits of one kind of values; see :meth:`ValueLimits.follow`."""
+        return self._limits.setdefault(key, ValueLimits()).follow(values, known)

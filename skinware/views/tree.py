@@ -1,0 +1,145 @@
+"""Write for the page how all drivers are doing: a tree of buses and patches, and problems with the worst first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.state import (
+    DEAD,
+    LIVE,
+    PAUSED,
+    SILENT,
+    STARTING,
+    WITHOUT_NEWS,
+    DriverReport,
+    bus_state_name,
+    patch_state_name,
+)
+from skinware.status import BusState, PatchState, Status
+from skinware.structure import Structure
+from skinware.text import age_text, count_text, plural, words
+from skinware.views.following import ShownDriver
+
+ERROR, WARNING, NOTE = "error", "warning", "note"
+_SEVERITIES = (ERROR, WARNING, NOTE)
+_LIVES = {
+    DEAD: (ERROR, "its process is gone; the last snapshot is shown"),
+    SILENT: (ERROR, "its process publishes nothing"),
+    PAUSED: (NOTE, "paused"),
+    STARTING: (NOTE, "no snapshot yet"),
+}
+_STATUSES = {
+    Status.NEVER_SEEN: (WARNING, "never seen"),
+    Status.NO_ACK: (WARNING, "do not answer their board"),
+    Status.UNHEALTHY: (WARNING, "unhealthy"),
+    Status.SUSPECT: (NOTE, "suspect"),
+    Status.OUT_OF_RANGE: (NOTE, "out of range"),
+    Status.NOT_CONNECTED: (NOTE, "not connected"),
+    Status.MASKED: (NOTE, "switched off"),
+}
+
+
+def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
+    """Return the part of the tree for a driver, as the page reads it."""
+    lost = [bus.counters.get("lost", 0) for bus in report.buses]
+    loads = [bus.load for bus in report.buses if bus.load is not None]
+    return {
+        "id": driver.number,
+        "name": report.name,
+        "namespace": driver.namespace,
+        "state": report.life,
+        "rate_hz": _rounded(report.rate_hz),
+        "age_ms": _milliseconds(report.age_ns),
+        "sensors": driver.structure.n_sensors,
+        "fresh": int(np.count_nonzero(driver.status == 0)),
+        "lost": sum(lost),
+        "load": max(loads, default=None),
+        "buses": [
+            {
+                "name": bus.name,
+                "state": report.last(bus.state),
+                "reason": bus.reason,
+                "load": bus.load,
+                "lost": own_lost,
+                "counters": _nonzero(bus.counters),
+            }
+            for bus, own_lost in zip(report.buses, lost, strict=True)
+        ],
+        "patches": [
+            {
+                "name": patch.name,
+                "bus": report.buses[patch.bus].name,
+                "state": report.last(patch.state),
+                "age_ms": _milliseconds(patch.age_ns),
+                "sensors": patch.sensors,
+                "fresh": patch.fresh,
+                "rate_hz": _rounded(patch.rate_hz),
+                "counters": _nonzero(patch.counters),
+            }
+            for patch in report.patches
+        ],
+    }
+
+
+def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any]]:
+    """Return the problems of a driver, each with its severity (``error``, ``warning`` or ``note``) and its place."""
+    found: list[dict[str, Any]] = []
+
+    def add(severity: str, text: str, **where: str) -> None:
+        found.append({"severity": severity, "driver": driver.number, **where, "text": text})
+
+    if report.life != LIVE:
+        add(*_LIVES.get(report.life, (NOTE, report.life)))
+    if report.life not in WITHOUT_NEWS:
+        for bus in report.buses:
+            reason = f": {words(bus.reason)}" if bus.reason else ""
+            if bus.state != bus_state_name(BusState.LIVE):
+                add(ERROR, f"{bus.name} is {bus.state}{reason}", bus=bus.name)
+            elif reason:
+                add(WARNING, f"{bus.name}{reason}", bus=bus.name)
+        for patch in report.patches:
+            if patch.state != patch_state_name(PatchState.LIVE):
+                age = "" if patch.age_ns is None else f", its newest data is {age_text(patch.age_ns)} old"
+                on = report.buses[patch.bus].name
+                add(WARNING, f"{patch.name} is {patch.state}{age}", bus=on, patch=patch.name)
+    for bit, (severity, text) in _STATUSES.items():
+        sensors = np.flatnonzero(driver.status & np.uint8(bit))
+        if len(sensors) and driver.frame is not None:
+            shares = f"{count_text(len(sensors))} of {plural(driver.structure.n_sensors, 'sensor')}"
+            add(severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
+    lost = sum(bus.counters.get("lost", 0) for bus in report.buses)
+    if lost:
+        add(NOTE, f"{plural(lost, 'frame')} lost on its buses since it started")
+    return found
+
+
+def problem_of_all(text: str) -> dict[str, Any]:
+    return {"severity": ERROR, "driver": None, "text": text}
+
+
+def worst_first(problems: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return errors, then warnings, then notes; otherwise in their order."""
+    return sorted(problems, key=lambda problem: _SEVERITIES.index(problem["severity"]))
+
+
+def _common_patch(structure: Structure, sensors: npt.NDArray[np.intp]) -> dict[str, str]:
+    """Return bus and patch that all these sensors have; empty if they are of several patches."""
+    patch, *others = np.unique(structure.sensor_patch[sensors]).tolist()
+    if others:
+        return {}
+    return {"bus": structure.buses[int(structure.patch_bus[patch])], "patch": structure.patch_names[patch]}
+
+
+def _nonzero(counters: dict[str, int]) -> dict[str, int]:
+    return {name: count for name, count in counters.items() if count}
+
+
+def _rounded(rate_hz: float | None) -> float | None:
+    return None if rate_hz is None else round(rate_hz, 2)
+
+
+def _milliseconds(age_ns: int | None) -> float | None:
+    return None if age_ns is None else round(age_ns / 1e6, 3)

@@ -1,0 +1,182 @@
+"""Set a driver up as the command line and the configuration file of ``skin-driver`` say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry, read_geometry
+from skinware.memory.namespace import Namespace
+from skinware.realtime import Profile, cpus_from_text
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import Bus, kind_of_bus
+from skinware_drivers.bus_names import BusPlace
+from skinware_drivers.cli.capturing import driver_of_recording, only_listened, options_of_recording
+from skinware_drivers.loading import short_name
+from skinware_drivers.options.file import ConfigFile, DriverConfig
+from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
+from skinware_drivers.running.building import PublishMode
+from skinware_drivers.running.guard import hook
+from skinware_drivers.running.runner import Runner
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from skinware_drivers.running.news import PatchChange
+
+
+@dataclass(frozen=True)
+class DriverArguments:
+    """The command line; ``hardware`` has the texts of the driver's own options."""
+
+    hardware: Mapping[str, str]
+    buses: tuple[str, ...] = ()
+    driver_name: str | None = None
+    name: str | None = None
+    config: Path | None = None
+    listen_only: bool = False
+    wait: bool = False
+    publish: PublishMode | None = None
+    slots: int | None = None
+    latency_ms: float | None = None
+    geometry_file: Path | None = None
+    group: str | None = None
+    realtime: str | None = None
+    cpus: str | None = None
+    namespace: str | None = None
+
+
+class DriverSetup:
+    """A driver with its buses and options.
+
+    Attributes:
+        driver_type: name of the driver.
+        name: its name in the namespace.
+        namespace: where it publishes.
+        profile: how it is scheduled; None: as any program.
+
+    Raises:
+        ConfigurationError: the command line or the file has a mistake.
+    """
+
+    def __init__(self, arguments: DriverArguments) -> None:
+        self._arguments = arguments
+        file = self._file = ConfigFile(arguments.config)
+        settings = file.settings
+        buses = list(arguments.buses) or [bus.name for bus in settings.bus]
+        named = arguments.driver_name or settings.driver or driver_of_recording(buses)
+        self._is_named, self._driver_name = bool(named), named or DEFAULT_DRIVER
+        self._driver = load_driver(self._driver_name)
+        self.driver_type = short_name(self._driver_name)
+        self.name = arguments.name or settings.name or self.driver_type
+        self.namespace = Namespace(arguments.namespace)
+        self.profile = _profile(arguments, settings)
+        self._listen_only = arguments.listen_only or settings.listen_only or only_listened(buses)
+        if not buses:
+            raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
+        self._buses = self._named(buses)
+        _check_own_options(arguments.buses, settings)
+
+    def make_runner(self, on_ready: Callable[[], None], on_patches: Callable[[PatchChange], None]) -> Runner:
+        """Return the driver, which does not run yet; see :class:`Runner` for the arguments.
+
+        Raises:
+            ConfigurationError: an option is wrong, or a bus does not fit the driver.
+            DriverError: the driver's own code failed.
+        """
+        arguments, settings = self._arguments, self._file.settings
+        latency_ms = settings.latency_ms if arguments.latency_ms is None else arguments.latency_ms
+        adapters = [self._make_adapter(bus, self._file) for bus in self._buses]
+        lines = [
+            (bus.text, adapter, self._make_bus(bus, adapter, self._file))
+            for bus, adapter in zip(self._buses, adapters, strict=True)
+        ]
+        return Runner(
+            self.driver_type,
+            lines,
+            name=self.name,
+            listen_only=self._listen_only,
+            wait_for_buses=arguments.wait or settings.wait,
+            publish=arguments.publish or settings.publish or None,
+            latency_s=None if latency_ms is None else latency_ms / 1e3,
+            namespace=self.namespace,
+            slots=arguments.slots,
+            group=arguments.group,
+            geometry=self._geometry(settings),
+            on_ready=on_ready,
+            on_patches=on_patches,
+        )
+
+    async def read_again(self, runner: Runner) -> None:
+        """Read the files again, and change the buses and places of a running driver to what they say now.
+
+        Raises:
+            ConfigurationError: a file has a mistake; nothing is changed.
+            DriverError: the driver's own code failed.
+        """
+        file = ConfigFile(self._arguments.config)
+        settings, geometry = file.settings, self._geometry(file.settings)
+        if self._arguments.config is not None and not self._arguments.buses:  # those of the command line stay
+            wanted_driver = settings.driver or DEFAULT_DRIVER
+            if not self._arguments.driver_name and wanted_driver != self._driver_name:
+                raise ConfigurationError(
+                    f"{self._arguments.config}: driver = {wanted_driver!r}, and {self._driver_name!r} is running: stop"
+                    " it and start it again"
+                )
+            buses = {bus.text: bus for bus in self._named([bus.name for bus in settings.bus])}
+            adapters = {name: self._make_adapter(bus, file) for name, bus in buses.items()}
+            await runner.buses.change_to(adapters, lambda name, adapter: self._make_bus(buses[name], adapter, file))
+        await runner.change_geometry(geometry)
+
+    def _named(self, texts: Sequence[str]) -> list[NamedBus]:
+        """Refuse a bus that is named twice: its boards would be set up twice."""
+        buses: dict[BusPlace, NamedBus] = {}
+        for bus in (NamedBus(text, self._driver_name) for text in texts):
+            if (other := buses.setdefault(bus.name.place, bus)) is not bus:
+                also = f", also as {other.text}" if other.text != bus.text else ""
+                raise ConfigurationError(f"bus {bus.text} is named twice{also}; name each bus once")
+        return list(buses.values())
+
+    def _make_adapter(self, bus: NamedBus, file: ConfigFile) -> AnyAdapter:
+        recorded = options_of_recording(bus.text, self.driver_type)
+        options = file.options_of_bus(self._driver.Options, bus.text, self._arguments.hardware, recorded)
+        with file.blamed_for(bus.text):
+            with hook("__init__", bus.text):
+                adapter = bus.choose(self._driver)(options)
+            adapter.check()
+        return adapter
+
+    def _make_bus(self, bus: NamedBus, adapter: AnyAdapter, file: ConfigFile) -> Bus:
+        with file.blamed_for(bus.text):
+            made = bus.make(payload_size=adapter.payload_size, listen_only=self._listen_only)
+            if not self._is_named and not made.fits(adapter.medium):
+                raise ConfigurationError(
+                    f"{made.name} is {kind_of_bus(made.medium)}: give its driver with --driver. Without it, that is"
+                    f" {self._driver_name}, on {kind_of_bus(adapter.medium)}{made.instead(adapter.medium)}"
+                )
+            return made
+
+    def _geometry(self, settings: DriverConfig) -> Geometry | None:
+        path = self._arguments.geometry_file or settings.geometry
+        return read_geometry(path) if path else None
+
+
+def _profile(arguments: DriverArguments, settings: DriverConfig) -> Profile | None:
+    realtime = settings.realtime if arguments.realtime is None else arguments.realtime
+    cpus = settings.cpus if arguments.cpus is None else cpus_from_text(arguments.cpus)
+    if realtime is None and not cpus:
+        return None
+    return Profile.from_text("normal" if realtime is None else realtime, cpus=cpus)
+
+
+def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
+    """Refuse a bus that would silently lack the options that the file has for its own buses."""
+    known = [bus.name for bus in settings.bus]
+    for name in buses:
+        if name not in known and any(bus.options for bus in settings.bus):
+            raise ConfigurationError(
+                f"--bus {name}: the file has options for {', '.join(known)} and none for this bus;"
+                " change the name there"
+            )

@@ -1,0 +1,154 @@
+"""Compile the layouts of all buses to lookup tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import repeat
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.decoding.addresses import Addresses
+from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
+from skinware_drivers.decoding.groups import Carrier, Groups
+from skinware_drivers.decoding.pairing import CompiledCycle
+from skinware_drivers.description import SkinTables
+from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+
+NO_KIND = 255
+"""The number in place of the kind of a frame that is of no kind."""
+
+Bytes = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.bool_]
+
+
+class CompiledLayouts:
+    """The layouts of all buses of a driver, compiled for one set of tables.
+
+    Args:
+        layouts: of each bus; None for a bus whose layout is not known yet.
+        described: what is attached to the buses.
+        periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
+            joined whenever they come (as those of fixed bytes in a test).
+
+    Attributes:
+        layouts, described: as given.
+        tables: what is attached, with the update groups that follow from the layouts.
+        frames: all kinds of frame.
+        kinds: the same, compiled.
+        addresses: whose frames are whose.
+        payload_names: (n_sets,) bool, sets of kinds of which one is named by its payload.
+        alone: by number of its kind, what reads a frame that is an update by itself.
+        cycles: those of all layouts.
+        width: number of values of every update.
+        length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
+        header: a payload byte and a table (256, lengths) of kinds; None if more than one byte tells kinds apart.
+
+    Raises:
+        ConfigurationError: the buses have more kinds of frame than can be told apart.
+    """
+
+    def __init__(
+        self, layouts: Sequence[Layout | None], described: SkinTables, periods_s: Sequence[float] | None = None
+    ) -> None:
+        self.layouts: list[Layout | None] = list(layouts)
+        self.described = described
+        self.frames: list[Frame] = []
+        # different layouts (and periods), and the number of the first kind of each
+        first_of: list[tuple[Layout, float | None, int]] = []
+        kinds_of_bus = []
+        for layout, period_s in zip(layouts, periods_s or repeat(None), strict=False):
+            if layout is None:
+                kinds_of_bus.append(range(0))
+                continue
+            first = next((first for *known, first in first_of if known == [layout, period_s]), None)
+            if first is None:
+                first = len(self.frames)
+                first_of.append((layout, period_s, first))
+                self.frames += layout.frames
+            kinds_of_bus.append(range(first, first + len(layout.frames)))
+        if len(self.frames) > MOST_FRAMES:
+            raise ConfigurationError(
+                f"the buses have {len(self.frames)} kinds of frame, a driver takes {MOST_FRAMES}: run several drivers"
+            )
+        self.addresses = Addresses(self.frames, kinds_of_bus, described)
+        self.kinds = [FrameKind(frame, described) for frame in self.frames]
+        # if it is the identifier that names a module, and names none, the frame is just unknown
+        by_payload = np.array([kind.module_by_byte is not None for kind in self.kinds], bool)
+        self.payload_names: Flags = self.addresses.sets @ by_payload
+        self._compile_assemblies(first_of)
+        longest = max((max(frame.length) for frame in self.frames), default=0)
+        self.length_ok = np.zeros((256, max(256, longest + 2)), bool)
+        for kind, frame in enumerate(self.frames):
+            self.length_ok[[kind, NO_KIND], np.array(frame.length)[:, None]] = True
+        self.header = self._compile_header()
+
+    def columns_of(self, kind: int) -> slice:
+        """Return where the values of a kind of frame are among those of its update."""
+        if kind in self.alone:
+            return self.alone[kind].columns[0]
+        return next(c.assembly.columns[c.members.index(kind)] for c in self.cycles if kind in c.members)
+
+    @property
+    def headroom(self) -> int:
+        """Rows that a batch must keep free in front, for frames that wait for their partners."""
+        longest = max((len(cycle.members) for cycle in self.cycles), default=1)
+        structure = self.tables.structure
+        return max(structure.n_modules, structure.n_patches) * (longest - 1)
+
+    @property
+    def most_groups(self) -> int:
+        """The largest number of update groups that one update belongs to."""
+        assemblies = [*self.alone.values(), *(cycle.assembly for cycle in self.cycles)]
+        return assemblies[0].groups.shape[1] if assemblies else 1
+
+    def _compile_assemblies(self, layouts: Sequence[tuple[Layout, float | None, int]]) -> None:
+        cycles: list[tuple[Cycle, list[int], float | None]] = []
+        for layout, period_s, first in layouts:
+            number_of = {frame.name: first + number for number, frame in enumerate(layout.frames)}
+            cycles += [(cycle, [number_of[name] for name in cycle.members], period_s) for cycle in layout.cycles]
+        in_cycles = {number for _, members, _ in cycles for number in members}
+        alone = [number for number in range(len(self.frames)) if number not in in_cycles]
+        made_of = [[number] for number in alone] + [members for _, members, _ in cycles]
+        width = max((sum(len(self.kinds[number].channels) for number in members) for members in made_of), default=0)
+        period_of: list[float] = [0.0 for _ in alone]
+        period_of += [own_s if (own_s := cycle.period_s or 0.0) > (bus_s or 0.0) else 0.0 for cycle, _, bus_s in cycles]
+        carriers = [self._carrier(members, period_s) for members, period_s in zip(made_of, period_of, strict=True)]
+        groups = Groups(self.described, carriers)
+        self.tables = groups.tables
+        made = [
+            Assembly([self.kinds[n] for n in members], self.tables, width, own)
+            for members, own in zip(made_of, groups.of_carrier, strict=True)
+        ]
+        self.alone = dict(zip(alone, made, strict=False))
+        of_cycles = iter(made[len(alone) :])
+        self.cycles = [
+            CompiledCycle(cycle, self.frames, members, next(of_cycles), self.tables, period_s)
+            for cycle, members, period_s in cycles
+        ]
+        self.width = width
+
+    def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
+        """What an update that is made of some kinds of frame can be of."""
+        modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
+        declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
+        longest_s = max([*declared_s, period_s])
+        channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
+        return Carrier(sorted(modules), channels, longest_s or None)
+
+    def _compile_header(self) -> tuple[int, Bytes] | None:
+        """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
+        conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self.frames]
+        if not conditions or not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
+            return None
+        if len({(c[0].offset) for c in conditions}) > 1 or len({c[0].value for c in conditions}) < len(conditions):
+            return None
+        if not self.addresses.sets[1:].all():
+            return None  # which kinds it can be depends on bus and identifier
+        offset = conditions[0][0].offset
+        table = np.full((256, self.length_ok.shape[1]), NO_KIND, np.uint8)
+        for number, (frame, condition) in enumerate(zip(self.frames, conditions, strict=True)):
+            # what lies behind the end of a payload means nothing
+            table[condition[0].value, [length for length in frame.length if length > offset]] = number
+        return offset, table

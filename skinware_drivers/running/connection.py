@@ -1,0 +1,125 @@
+"""The connection to a bus: opened, closed and opened again, although its interface may hang."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import select
+
+from skinware.errors import BusNotAvailable
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import BusReason
+from skinware_drivers.bus import Bus
+from skinware_drivers.running.guard import Backoff, SlowCall
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_CHECK_PAUSE_NS = NS_PER_S // 2
+_OPENING_S = 10.0
+"""Time in which an interface must open; after it, the log says that the interface hangs."""
+
+
+class Connection:
+    """The connection to one bus.
+
+    Args:
+        name: of the bus, for people.
+        bus: the bus.
+        epoll: where the descriptor of the open bus is registered.
+        pauses: between attempts to open it again.
+
+    Attributes:
+        lost: set while there is none.
+        opened_ns: when the bus was last opened, CLOCK_MONOTONIC ns; 0: never.
+    """
+
+    def __init__(self, name: str, bus: Bus, epoll: select.epoll, pauses: Backoff) -> None:
+        self._name, self._bus, self._epoll, self._pauses = name, bus, epoll, pauses
+        self.lost: asyncio.Event = asyncio.Event()
+        self.opened_ns: int = 0
+        self._noted = ""
+        self._checked_ns = 0
+        self._opening: SlowCall | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the bus has a descriptor."""
+        return self._bus.fileno() >= 0
+
+    @property
+    def is_opening(self) -> bool:
+        """Whether an attempt to open the bus has not returned yet."""
+        return self._opening is not None
+
+    async def open(self) -> None:
+        """Open the bus; raises whatever the bus raises.
+
+        Raises:
+            BusNotAvailable: also if its interface hangs.
+        """
+        if self._bus.opens_slowly:
+            await self._open_slowly()
+        else:
+            self._bus.open()
+        self.opened()
+
+    def begin_attempts(self) -> None:
+        """Begin with the shortest pause if the bus was there for a while, not only for a moment again and again."""
+        if now_ns() - self.opened_ns > self._pauses.longest_s * NS_PER_S:
+            self._pauses.begin_again()
+
+    async def pause(self) -> None:
+        """Let the pause before the next attempt to open the bus pass."""
+        if self._opening is None:
+            await asyncio.sleep(self._pauses.next_s())
+
+    def opened(self) -> None:
+        """Register the open bus."""
+        self._epoll.register(self._bus.fileno(), select.EPOLLIN)
+        self.opened_ns = now_ns()
+        self.lost.clear()
+        if self._bus.note and self._bus.note != self._noted:
+            log.warning("%s", self._bus.note)
+            self._noted = self._bus.note
+
+    def is_check_due(self) -> bool:
+        """Return whether it is time to ask the bus again whether it is still there, and count it as asked."""
+        is_due = now_ns() - self._checked_ns >= _CHECK_PAUSE_NS
+        if is_due:
+            self._checked_ns = now_ns()
+        return is_due
+
+    def drop(self) -> None:
+        """Close the bus, without waiting for anything."""
+        if self.is_open:
+            with contextlib.suppress(OSError):
+                self._epoll.unregister(self._bus.fileno())
+        self._close()
+        self.lost.set()
+
+    async def close(self, patience_s: float) -> None:
+        """Close the bus for good. If its interface hangs, stop waiting after this time, s."""
+        if self._opening is not None:
+            await self._opening.is_over(patience_s)
+        if not self._bus.opens_slowly or self._opening is not None:
+            self._close()
+        elif not await SlowCall(f"bus {self._name}, closing", self._bus.close).is_over(patience_s):
+            log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self._name)
+
+    async def _open_slowly(self) -> None:
+        """Open a bus that may hang; the next attempt then waits for the same call to return."""
+        if self._opening is None:
+            self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
+        if not await self._opening.is_over(_OPENING_S):
+            why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
+            raise BusNotAvailable(why, reason=BusReason.FAILED)
+        opening, self._opening = self._opening, None
+        opening.check()
+
+    def _close(self) -> None:
+        opening, self._opening = self._opening, None
+        if opening is None or not opening.leave(self._bus.close):
+            self._bus.close()
+        else:
+            log.warning("bus %s: its interface is still being opened, and is left to itself", self._name)

@@ -71,7 +71,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "lerobot", "--fps", "0"], 2, "0 is not in the range"),
         (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of frames, nor all"),
         (["walk.mcap", "--to", "lerobot", "--episode", "2..1"], 2, "is not START..END in seconds"),
-        (["walk.mcap", "--to", "lerobot", "--episode", "7..8"], 2, "no time in the episode 7..8 has everything"),
+        (["walk.mcap", "--to", "lerobot", "--episode", "7..8"], 2, "no time in the episode 7..8 has all the data"),
         (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 2, "no.csv: No such file or directory"),
         (["walk.mcap", "--to", "lerobot", "--join", "action=no.csv"], 2, "no.csv: No such file or directory"),
         (["walk.mcap", "--to", "lerobot", "--also", "no.mcap"], 2, "no.mcap: No such file or directory"),

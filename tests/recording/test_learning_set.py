@@ -374,10 +374,10 @@ def joined(tmp_path: Path, text: str, name: str = "joints.csv", feature: str = "
 
 
 def test_times_that_do_not_overlap(made: Made, tmp_path: Path) -> None:
-    words = r"no time in it has everything .* torso from 0\.000 to 1\.990 s, .*joints\.csv from 50\.000 to 51\.000 s"
+    words = r"no time in it has all the data .* torso from 0\.000 to 1\.990 s, .*joints\.csv from 50\.000 to 51\.000 s"
     with pytest.raises(ConfigurationError, match=words):
         learn(made, joined(tmp_path, "time_s,a\n50,1\n51,2\n"))
-    with pytest.raises(ConfigurationError, match=r"no time in the episode 5\.\.6 has everything"):
+    with pytest.raises(ConfigurationError, match=r"no time in the episode 5\.\.6 has all the data"):
         learn(made, LearningSet(intervals=[Interval(5, 6)]))
 
 

@@ -258,7 +258,7 @@ def test_a_file_that_is_disturbed_ends_the_recording(
             disturb(path)
             disturbed = True
 
-    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    monkeypatch.setattr("skinware.recording.recorder._REPORT_NS", NS_PER_S // 50)
     with publishing(FakeSkin("torso")) if comes else nullcontext(), pytest.raises(OSError, match=says) as raised:
         Recorder(target).run(report=tell)
     assert raised.value.filename == str(path)
@@ -271,7 +271,7 @@ def test_a_file_that_is_disturbed_ends_the_recording(
 
 
 def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    monkeypatch.setattr("skinware.recording.recorder._REPORT_NS", NS_PER_S // 50)
     target = Files(path)
 
     def tell() -> None:

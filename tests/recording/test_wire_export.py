@@ -287,7 +287,7 @@ def test_skin_convert_writes_them(
     for arguments, words in {
         ("--to", "pcapng"): "walk.pcapng: exists already",
         ("nobody", "--to", "candump", "-o", "x"): "no wire of 'nobody' in it; there are: hand, torso",
-        ("--type", "pressure", "--to", "candump", "-o", "x"): "frames, not sensors, can be selected",
+        ("--type", "pressure", "--to", "candump", "-o", "x"): "select drivers, not sensors",
     }.items():
         assert exit_status(convert, ["walk.mcap", *arguments]) in (1, 2)
         assert words in capsys.readouterr().err

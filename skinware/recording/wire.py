@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from skinware.candump import candump_line, channel_name
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording.reading import Recording
 from skinware.recording.wire_tracks import WireItem, WireTrack
-from skinware.wire import IS_CUT, IS_FD
+from skinware.wire import IS_CUT, IS_FD, candump_line, channel_name
 
 SOCKETCAN, SERIAL = 227, 147
 """Link types of interfaces in pcapng: LINKTYPE_CAN_SOCKETCAN, and LINKTYPE_USER0 with :data:`SERIAL_HEADER`."""

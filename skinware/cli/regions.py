@@ -157,8 +157,7 @@ class _Painter:
         import numpy as np
 
         from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
-        from skinware.tactile.neighbours import neighbours
-        from skinware.tactile.regions import without_holes
+        from skinware.tactile.neighbours import neighbours, without_holes
         from skinware.views.history import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):

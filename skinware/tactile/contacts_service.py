@@ -101,7 +101,7 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of contacts.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME

@@ -60,7 +60,7 @@ class DerivedService(ABC, Generic[WriterT]):
     """
 
     subject: str
-    """What it is about, for messages."""
+    """Its subject, for messages."""
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         self._name, self._driver = name, driver

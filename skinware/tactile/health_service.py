@@ -87,7 +87,7 @@ class HealthReader(SourceReader[HealthSource, HealthSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of health.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME

@@ -85,7 +85,7 @@ class MotionReader(SourceReader[MotionSource, MotionSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of motion.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME

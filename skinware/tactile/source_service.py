@@ -165,7 +165,7 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
 
     def _describe(self, attached: segments.Segment) -> SourceT:
         if bytes(attached.header["kind"]) != self.kind.encode():
-            raise BadServiceFile(f"service {self.name!r} is none of {self.kind}")
+            raise BadServiceFile(f"service {self.name!r} is not of kind {self.kind!r}")
         columns = attached.schema.columns
         try:
             source = self._source_of(attached.static_columns())

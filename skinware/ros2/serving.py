@@ -17,7 +17,7 @@ from skinware.ros2.messages import Level, Status, diagnostics, trigger_response
 from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service import ServiceReader
-from skinware.service._tap import wake_word_of
+from skinware.service._reader import wake_word_of
 from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, bus_state_name, life_of
 from skinware.status import BusState
 from skinware.views.live import LiveDriver, LiveDrivers

@@ -13,7 +13,7 @@ from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
-from skinware.service._tap import Tap
+from skinware.service._reader import Tap
 from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50

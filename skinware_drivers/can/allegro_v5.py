@@ -39,10 +39,10 @@ from skinware.status import Status
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match, Reply
-from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Watch, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter

@@ -36,8 +36,8 @@ from skinware.sensor_types import SensorType
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
-from skinware_drivers.conditions import Identifier
 from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.fields import Identifier
 from skinware_drivers.hand import FINGERS, Hand
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match

@@ -25,8 +25,8 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.conditions import Bits, Identifier
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import Bits, Identifier
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Expand, Frame, Layout, Packed, Sentinel, Values
 from skinware_drivers.link import Link, Match

@@ -28,8 +28,8 @@ from msgspec import Meta
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.conditions import Byte, Identifier
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import Byte, Identifier
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Frame, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match

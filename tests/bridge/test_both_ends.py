@@ -175,7 +175,7 @@ def test_a_killed_driver_is_dead_here_and_comes_back(ends: Ends) -> None:
         writer = driver(ends.there)
         until_appeared(ends, writer)
         with reader(ends) as there:
-            writer._service.desert()
+            writer.desert()
             wait_until(lambda: not there.alive)
             assert there.read().stale
             with driver(ends.there) as again:

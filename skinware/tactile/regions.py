@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import graphlib
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -123,9 +123,7 @@ class Regions:
         """
         skin_then, found = self._known.get(type_name, (None, RegionIndex()))
         if skin_then is not skin:
-            sensors, flags = _Sensors(skin, type_name), dict[str, Flags]()
-            for region in self._in_turn:
-                flags[region.name] = sensors.of(region, flags)
+            flags = _members(skin, type_name, self._in_turn)
             of_type = [region.name for region in self._regions if region.type in ("", type_name)]
             found = RegionIndex({name: as_index(np.flatnonzero(flags[name])) for name in of_type})
             self._known[type_name] = skin, found
@@ -157,43 +155,35 @@ def _in_turn(regions: Sequence[Region], places: Sequence[str]) -> list[Region]:
         raise ConfigurationError(f"{place_of[circle[-1]]}a region that is in itself: {names}") from None
 
 
-class _Sensors:
-    """The n sensors of one type of a skin, with everything that selectors refer to."""
-
-    def __init__(self, skin: SkinLayout | Structure, type_name: str) -> None:
-        self.layout = SkinLayout(("",), (skin,)) if isinstance(skin, Structure) else skin
-        self.has_drivers = skin is self.layout
-        self.type_name = type_name
-        self.driver = self.layout.driver_of(type_name)
-        self.uid = self.layout.uids(type_name)
-        self.patch = self.layout.patch_of(type_name)
-        self.module = self.layout.module_of(type_name)
-        self.geometry = self.layout.geometry(type_name)
-        structures = self.layout.structures
-        own = [name for each in structures for name in zip(texts(each.patch_name), each.patch_names, strict=True)]
-        self._patch_names = [{*names, name} for names, name in zip(own, self.layout.patches, strict=True)]
-        own_modules = [name for each in structures for name in each.module_names]
-        self._module_names = [set(names) for names in zip(own_modules, self.layout.modules, strict=True)]
-
-    def of(self, region: Region, known: Mapping[str, Flags]) -> Flags:
-        """(n,) bool: the sensors in a region; ``known`` has the regions that it refers to."""
-        layout, geometry = self.layout, self.geometry
-        if region.type not in ("", self.type_name):
-            return np.zeros(len(self.uid), bool)
-        found = np.isin(self.uid, np.array(region.uid, np.uint64))
-        found |= _named(self._patch_names, region.patch)[self.patch]
-        found |= _named(self._module_names, region.module)[self.module]
+def _members(skin: SkinLayout | Structure, type_name: str, regions: Iterable[Region]) -> dict[str, Flags]:
+    """By name, (n,) bool: the sensors of a type in each region, after the regions that it refers to."""
+    layout = SkinLayout(("",), (skin,)) if isinstance(skin, Structure) else skin
+    driver, uid, geometry = layout.driver_of(type_name), layout.uids(type_name), layout.geometry(type_name)
+    patch, module = layout.patch_of(type_name), layout.module_of(type_name)
+    own = [name for each in layout.structures for name in zip(texts(each.patch_name), each.patch_names, strict=True)]
+    patch_names = [{*names, name} for names, name in zip(own, layout.patches, strict=True)]
+    own_modules = [name for each in layout.structures for name in each.module_names]
+    module_names = [set(names) for names in zip(own_modules, layout.modules, strict=True)]
+    members: dict[str, Flags] = {}
+    for region in regions:
+        if region.type not in ("", type_name):
+            members[region.name] = np.zeros(len(uid), bool)
+            continue
+        found = np.isin(uid, np.array(region.uid, np.uint64))
+        found |= _named(patch_names, region.patch)[patch]
+        found |= _named(module_names, region.module)[module]
         found |= np.isin(geometry.frame.astype(str), np.array(region.frame, str)) & geometry.known
         for box in region.box:
             inside = abs(geometry.position_m - box.centre_m) <= np.array(box.size_m) / 2
             found |= inside.all(axis=1) & (geometry.frame == box.frame)
         for name in region.regions:
-            found |= known[name]
-        if region.driver and self.has_drivers:
-            found &= np.isin(np.array(layout.drivers, str), region.driver)[self.driver]
+            found |= members[name]
+        if region.driver and skin is layout:
+            found &= np.isin(np.array(layout.drivers, str), region.driver)[driver]
         for name in region.without:
-            found &= ~known[name]
-        return found
+            found &= ~members[name]
+        members[region.name] = found
+    return members
 
 
 def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:

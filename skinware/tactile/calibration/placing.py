@@ -334,9 +334,9 @@ class PressFinder:
             _, first_load, first_pose = self._window[0]
             first = float(first_load.sum())
             is_steady = abs(total - first) <= settings.steady * max(total, first)
-            if not is_steady or _moved_m(first_pose, pose) > settings.still_m:
+            if not is_steady or np.linalg.norm(_point(pose) - _point(first_pose)) > settings.still_m:
                 self._window.clear()
-        if self.held and _moved_m(self._found_at_m, pose) > 2 * settings.still_m:
+        if self.held and np.linalg.norm(_point(pose) - _point(self._found_at_m)) > 2 * settings.still_m:
             self.held = False
         self._window.append((time_ns, loads, np.array(pose, np.float64)))
         if self.held or time_ns - self._window[0][0] < settings.hold_s * NS_PER_S:
@@ -352,11 +352,7 @@ class PressFinder:
         return Press(at, taxel, mean[taxel])
 
 
-def _moved_m(one: ArrayF, other: ArrayF) -> float:
-    return float(np.linalg.norm(_origin(other) - _origin(one)))
-
-
-def _origin(pose: ArrayF) -> ArrayF:
-    """(3,) the point, or the origin of a frame."""
-    origin: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
-    return origin
+def _point(pose: ArrayF) -> ArrayF:
+    """(3,) the point, or the origin of the pose."""
+    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
+    return point

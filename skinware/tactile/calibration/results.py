@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware.geometry import GeometryGroup, Triple
+from skinware.geometry import GeometryGroup
 from skinware.structure import Structure
 from skinware.tactile.calibration.placing import Placement
 from skinware.tactile.calibration.topology import Topology, unrolled_m
@@ -125,12 +125,8 @@ def _group(
         type=type_name,
         frame=frame,
         uid=tuple(uid.tolist()),
-        position_m=_triples(position_m[rows]),
-        normal=_triples(normal[rows]) if known else None,
+        position_m=tuple((x, y, z) for x, y, z in np.round(position_m[rows], _DIGITS).tolist()),
+        normal=tuple((x, y, z) for x, y, z in np.round(normal[rows], _DIGITS).tolist()) if known else None,
         confidence=confidence,
         name=structure.module_names[module],
     )
-
-
-def _triples(rows: ArrayF) -> tuple[Triple, ...]:
-    return tuple((x, y, z) for x, y, z in np.round(rows, _DIGITS).tolist())

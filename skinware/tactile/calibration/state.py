@@ -71,6 +71,9 @@ class PressSession(Session):
         wanted: presses wanted of each.
         pose_shape: (3,) for points, (4, 4) for poses of the carrier of a finger.
         settings: the conditions of a press.
+
+    Attributes:
+        presses: the presses so far.
     """
 
     def __init__(
@@ -83,34 +86,29 @@ class PressSession(Session):
         self.kind = "points" if pose_shape == (3,) else "poses"
         self._n, self._wanted, self._pose_shape = n, wanted, pose_shape
         self._finder = PressFinder(settings or PressSettings())
-        self._known = Presses.none(n, pose_shape)
-
-    @property
-    def presses(self) -> Presses:
-        """The presses so far."""
-        return self._known
+        self.presses = Presses.none(n, pose_shape)
 
     def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
         press = self._finder.update(time_ns, load, pose)
         if press is not None:
-            self._known = self._known.with_press(press)
+            self.presses = self.presses.with_press(press)
 
     @property
     def coverage(self) -> ArrayF:
-        return np.minimum(self._known.times_pressed / self._wanted, 1.0)
+        return np.minimum(self.presses.times_pressed / self._wanted, 1.0)
 
     @property
     def figures(self) -> dict[str, int]:
-        return {"presses": len(self._known)}
+        return {"presses": len(self.presses)}
 
     def arrays(self) -> Arrays:
-        return {name: getattr(self._known, name) for name in ("pose", "press", "taxel", "load")}
+        return {name: getattr(self.presses, name) for name in ("pose", "press", "taxel", "load")}
 
     def restore(self, arrays: Arrays) -> None:
         known = Presses(self._n, *(arrays[name] for name in ("pose", "press", "taxel", "load")))
         if known.pose.shape[1:] != self._pose_shape:
             raise ConfigurationError(f"it has poses of shape {known.pose.shape[1:]}")
-        self._known = known
+        self.presses = known
 
 
 class StrokeSession(Session):

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
+from skinware_drivers import Link, Module, Patch, Watch, operation
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin_boards import BOARD_TYPES, MTB3_TYPE, BoardOperations, discover, read_version
 from skinware_drivers.can.roboskin_layout import (
@@ -52,11 +53,8 @@ from skinware_drivers.can.roboskin_setup import (
     warn_of_full_bus,
     warn_of_uneven_triangles,
 )
-from skinware_drivers.description import Module, Patch, SkinTables
-from skinware_drivers.layout import Layout
-from skinware_drivers.link import Heard, Link
-from skinware_drivers.operations import operation
-from skinware_drivers.polling import Watch
+from skinware_drivers.description import SkinTables
+from skinware_drivers.link import Heard
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -73,9 +71,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     switched off are not part of the structure.
     """
 
-    options: RoboskinOptions
-    layout: Layout
-    period_s: float
     types: Sequence[SensorType] = SKIN_TYPES
     dtype: npt.DTypeLike = np.uint8
 

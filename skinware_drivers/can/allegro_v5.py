@@ -37,10 +37,9 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Patch, Watch, check_options, taxels
+from skinware_drivers import Link, Match, Module, Patch, check_options, taxels
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.description import SkinTables
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
 from skinware_drivers.link import Reply
@@ -120,14 +119,11 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
         ]
     )
     patches = (Patch("hand", [Module(taxels(N_PADS), kind="pads")]),)
+    watch = ZeroWatch
 
     def __init__(self, options: AllegroV5Options) -> None:
         super().__init__(options)
         self.geometry = _places_of_pads(options.side)
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         return False
@@ -140,6 +136,7 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     payload_size = 8
     period_s = 0.01
     layout = Layout([*_TIP_FRAMES, *_PAD_FRAMES])
+    watch = ZeroWatch
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the hand of the option ``model``, or of the frames that are heard.
@@ -175,10 +172,6 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         return False
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     def _refuse_two(self, link: Link, counted: Counter[int]) -> None:
         """Refuse two hands of different identifiers on one bus, and warn of two alike: their frames have no number."""

@@ -37,7 +37,7 @@ FIRST_NODE, LAST_NODE = 11, 14
 CELLS = 24
 HAND_GROUP = 0x405
 _VERSION, _SET = 0, 0x80
-_REPLY_S, _ANSWERS_S = 0.1, 0.2
+_REPLY_S = 0.1
 _NODE = Bits(shift=5, width=5)
 _PA_PER_N_CM2 = 1e4
 _FULL = tuple(

@@ -32,11 +32,10 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware_drivers import Identifier, Link, Match, Patch, Poll, Watch, check_options, operation
+from skinware_drivers import Identifier, Link, Match, Patch, Poll, check_options, operation
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
-from skinware_drivers.description import SkinTables
 from skinware_drivers.hand import FINGERS, Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
@@ -101,6 +100,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
     payload_size = 8
     dtype = np.uint8
     _round_s: float | None = None  # from one round of another program's questions to the next
+    watch = ZeroWatch
 
     def __init__(self, options: LinkerHandOptions) -> None:
         super().__init__(options)
@@ -166,10 +166,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
                         link.bus_name,
                         _name(frame.identifier),
                     )
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     @operation(looks=True)
     async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:

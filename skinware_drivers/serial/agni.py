@@ -84,6 +84,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
     commands = Unframed(1024)
+    payload_size = _MOST_BYTES + 8
 
     def __init__(self, options: AgniOptions) -> None:
         super().__init__(options)
@@ -94,10 +95,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._n_sensors = 0
         self.types = [PRESSURE.measured(unit="counts")]
         self.dtype = np.dtype(options.values).newbyteorder("=")
-
-    @property
-    def payload_size(self) -> int:
-        return _MOST_BYTES + 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the device for its sensors; it may still be sending for an earlier program.

@@ -70,6 +70,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     """One open patch on a serial line."""
 
     framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    payload_size = MOST_PAYLOAD  # of the protocol: that of the patch is known only after it was asked
 
     def __init__(self, options: OpenPatchOptions) -> None:
         super().__init__(options)
@@ -82,11 +83,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._n_samples: int | None = None  # taken since its reset, as it answered when it was last silent
         self._report: Report | None = None
         self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
-
-    @property
-    def payload_size(self) -> int:
-        """Bytes of the longest payload of the protocol; those of the patch are known only after it was asked."""
-        return MOST_PAYLOAD
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the patch for its description.

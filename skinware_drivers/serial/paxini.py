@@ -20,8 +20,7 @@ import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware_drivers import Link, Match, Notice, Patch, Poll, Watch, check_options, operation
-from skinware_drivers.description import SkinTables
+from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options, operation
 from skinware_drivers.hand import Hand
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import (
@@ -88,8 +87,10 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
     framing = _VERSIONS
     commands = Unframed(64)
     baudrate = 921_600
+    payload_size = -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8  # of the largest module
     types = TYPES
     dtype = np.int16
+    watch = ZeroWatch
 
     def __init__(self, options: PaxiniOptions) -> None:
         super().__init__(options)
@@ -104,11 +105,6 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
         self._board: Board | None = None
         self._is_asking = False
-
-    @property
-    def payload_size(self) -> int:
-        """Bytes of the largest module; the modules are known only after the board was asked."""
-        return -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -170,10 +166,6 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         patches = await self.describe(link)
         await self.start(link)
         return patches
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

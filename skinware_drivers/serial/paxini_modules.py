@@ -70,7 +70,6 @@ _MODELS: Mapping[int, str] = {
 _UID_OF_MODULE = 16
 _PLACES = ("near", "middle", "tip", "nail")
 _FROM_THE_END = ("nail", "tip", "middle", "near")
-_PALMS = 8
 
 
 def model_of(points: int) -> str:

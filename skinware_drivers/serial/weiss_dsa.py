@@ -29,8 +29,7 @@ from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Module, Patch, Watch, check_options, operation, taxels
-from skinware_drivers.description import SkinTables
+from skinware_drivers import Link, Module, Patch, check_options, operation, taxels
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
 from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.polling import ZeroWatch
@@ -94,6 +93,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
     commands = _WHOLE
     types = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL),)
     dtype = np.uint16
+    watch = ZeroWatch
 
     def __init__(self, options: WeissDsaOptions) -> None:
         super().__init__(options)
@@ -154,10 +154,6 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         answer = await self._ask(link, _CONTROLLER, size=7)
         serial_number, hardware, software = struct.unpack_from("<IBH", answer)
         return {"serial_number": serial_number, "hardware": hardware, "software": software}
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     def split(self) -> Split:
         """Return the framing of this controller: a frame for each matrix."""

@@ -58,7 +58,7 @@ def execute(page: Path) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         cwd=ROOT,
-        timeout=PATIENCE_S,
+        timeout=2 * PATIENCE_S,
     )
 
 

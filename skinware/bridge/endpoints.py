@@ -106,14 +106,12 @@ class Endpoints:
         connect: endpoints of others.
         mode: ``peer`` for a session that speaks with those that it is connected to; ``router`` for one that also
             passes messages on.
-        patience_us: how long a frame may wait for a slow receiver before that receiver misses it.
         security: further settings of zenoh, by path.
     """
 
     listen: Sequence[str] = ()
     connect: Sequence[str] = ()
     mode: str = "peer"
-    patience_us: float = 1000.0
     security: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -131,7 +129,6 @@ def endpoints(
     tls: Path | None = None,
     rules: Rules | None = None,
     insecure: bool = False,
-    patience_us: float = 1000.0,
 ) -> Endpoints:
     """Check what a person wrote, and return the settings.
 
@@ -141,7 +138,6 @@ def endpoints(
         tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``; both ends show a certificate of that authority.
         rules: rights of peers; None: this end only joins.
         insecure: listen beyond this machine without TLS.
-        patience_us: as :attr:`Endpoints.patience_us`.
 
     Raises:
         ConfigurationError: an endpoint or certificate is missing or wrong, or an endpoint is open to strangers.
@@ -161,7 +157,7 @@ def endpoints(
             )
     passes_on = rules is not None and (rules.routes or bool(connect))  # routers leave out peers of each other
     mode = "router" if passes_on else "peer"
-    return Endpoints(places, [_checked(text, protocol) for text in connect], mode, patience_us, security)
+    return Endpoints(places, [_checked(text, protocol) for text in connect], mode, security)
 
 
 def _checked(text: str, protocol: str | None) -> str:

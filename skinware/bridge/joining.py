@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -173,12 +174,7 @@ class Joiner:
         )
 
     def _heard_services(self, _key: str, payload: bytes) -> None:
-        def take() -> None:
-            if self._wish is None:
-                self._take_services(payload)
-            else:
-                self._ask_services()
-
+        take = partial(self._take_services, payload) if self._wish is None else self._ask_services
         self._peer.soon("a list of services", take, len(payload))
 
     def _take_services(self, payload: bytes | None) -> None:

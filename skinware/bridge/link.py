@@ -21,6 +21,8 @@ _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_facto
 _FOREVER_MS = -1
 _BATCHES = 4
 """Batches of 64 KiB that may wait to be sent: a frame of 30,848 sensors takes three, and its writer does not wait."""
+_PATIENCE_US = 1000
+"""How long a frame may wait for a slow receiver before that receiver misses it."""
 _LONGEST_MESSAGE = 1 << 26
 """Bytes to which the fragments of a message may add up."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
@@ -71,7 +73,7 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
         "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
         "transport/link/tx/lease": str(LEASE_MS),
         "transport/link/tx/queue/size/data": str(_BATCHES),
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(_PATIENCE_US),
         "adminspace/enabled": "false",
         **endpoints.security,
     }
@@ -86,7 +88,7 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
         raise BridgeError(f"{endpoints}: {reason}") from None
 
 
-def directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
+def directly(call: Callable[[Any], object], over: Callable[[], None] | None = None) -> Any:
     """Return a callback that runs in the receiving thread: handing over to another thread takes 0.1 ms."""
     return zenoh.handlers.Callback(call, over, indirect=False)
 
@@ -142,11 +144,8 @@ class Link:
         Returns:
             A function that ends it.
         """
-
-        def hear(sample: zenoh.Sample) -> None:
-            heard(str(sample.key_expr), sample.payload.to_bytes())
-
-        return self._end_of(self._session.declare_subscriber(key, directly(hear)))
+        hear = directly(lambda sample: heard(str(sample.key_expr), sample.payload.to_bytes()))
+        return self._end_of(self._session.declare_subscriber(key, hear))
 
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
         """Call ``asked`` with questions under keys, in the receiving thread.

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -230,25 +230,21 @@ class Server:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
-    def _there(self) -> dict[str, tuple[Head, Service, Stream]]:
-        """Return all services that are not closed."""
+    def _there(self) -> dict[str, _Served]:
+        """Return copies of all services that are not closed."""
         with self._lock:
-            return {
-                name: (served.head, served.service, served.stream)
-                for name, served in self._services.items()
-                if served.service.state != "closed"
-            }
+            return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
 
     def _summarise(self) -> None:
         there = self._there()
-        self._summaries.count({name: stream.frames for name, (_, _, stream) in there.items()})
+        self._summaries.count({name: served.stream.frames for name, served in there.items()})
         if not self._summaries.is_wanted:
             return
         drivers: dict[str, tuple[State, Structure, Generation, Sample | None]] = {}
-        for name, (head, service, stream) in there.items():
-            driver = head.driver
+        for name, served in there.items():
+            driver = served.head.driver
             if driver is not None and driver.structure is not None:
-                drivers[name] = service.state, driver.structure, driver, stream.newest
+                drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
         self._summaries.send(drivers, len(there) - len(drivers), self.lost)
 
     def _answer_wish(self, question: Question) -> None:
@@ -263,15 +259,15 @@ class Server:
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:
         """Cut a part out of all drivers and add those that have any of it to ``services``; return what is missing."""
         part, structures = self._parts.wanted(wish), []
-        for name, (head, service, stream) in self._there().items():
-            driver = head.driver
+        for name, served in self._there().items():
+            driver = served.head.driver
             if driver is None or driver.structure is None:
                 continue
             structures.append(driver.structure)
             if part.fit(name, driver):
-                services[name] = service
-                if stream.newest is not None:
-                    part.take(name, stream.newest)
+                services[name] = served.service
+                if served.stream.newest is not None:
+                    part.take(name, served.stream.newest)
         if not structures:
             return ""  # drivers may come
         missing = "; ".join(part.choice.unknown(structures))

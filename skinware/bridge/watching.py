@@ -115,7 +115,7 @@ class Seen:
     Attributes:
         instance, version: of the bridge that serves it.
         summary: the last one; None: none so far.
-        told_ns: when that came; 0: never.
+        heard_ns: when that came; 0: never.
         bytes: of all summaries so far.
         guard: counts its messages that cannot be read.
         pinger: asks for its clock; None: not asked yet.
@@ -126,7 +126,7 @@ class Seen:
     version: int = VERSION
     clock: PeerClock = field(default_factory=PeerClock)
     summary: Summary | None = None
-    told_ns: int = 0
+    heard_ns: int = 0
     bytes: int = 0
     guard: Guard = field(default_factory=Guard)
     pinger: Pinger | None = None
@@ -201,7 +201,7 @@ class Watcher:
             seen.guard.refuse("a summary", str(error))
         else:
             with self._lock:
-                seen.summary, seen.told_ns = summary, now_ns()
+                seen.summary, seen.heard_ns = summary, now_ns()
                 seen.bytes += len(payload)
 
     def _ask_clock(self, seen: Seen) -> None:

@@ -84,7 +84,7 @@ def caller_option(command: _Decorated) -> _Decorated:
         "callers",
         multiple=True,
         metavar="NAME",
-        help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
+        help="Only certificates of this name may call operations (tare ...); repeatable.",
     )(command)
 
 

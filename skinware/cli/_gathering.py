@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.cli._command import warn
-from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
 from skinware.cli._heat_map import arrange
 from skinware.cli._terminal import echo, print_json, terminal_width
 from skinware.driver_service import DriverReader
@@ -20,6 +19,7 @@ from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED
 from skinware.tactile.calibration.sources import LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
+from skinware.views.driver_snapshots import after, enter_pressed, frames_until
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Of a sensor: nothing at all; in between; all that is wanted."""

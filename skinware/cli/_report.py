@@ -32,8 +32,8 @@ from skinware.state import (
     untouched,
 )
 from skinware.status import DataPath, load_report
-from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.health_service import KIND as HEALTH_KIND
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.text import age_text, count_text, plural, table, wrapped
 from skinware.views import bridges

@@ -1,4 +1,4 @@
-"""Many robots: where they meet, and how all of them are."""
+"""``skin-bridge route`` and ``skin-bridge list``: a router for many robots, and the state of all of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _PORT = 7447
 _PRESENCE = {0: "gone", 1: "there"}
 _PATIENCE_S = 3
-"""Until robots that are there have told how they are; one that has told nothing for so long is silent."""
+"""How long to wait for the summaries of robots; a robot without one for this long is silent."""
 _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "silent patches", "problems", "clock")
 
 
@@ -41,9 +41,9 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     "route",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            where robots and their users meet",
-        "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   a robot that goes there",
-        "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            one who uses it",
+        "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            the router",
+        "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   on a robot",
+        "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            on another machine",
     ),
 )
 @click.option(
@@ -53,7 +53,7 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     help=f"Where others connect.  [default: tcp/127.0.0.1:{_PORT}]",
 )
 @click.option(
-    "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are to be reached here."
+    "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here, too."
 )
 @tls_option
 @caller_option
@@ -62,10 +62,10 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     "robots",
     multiple=True,
     metavar="R",
-    help="Only who has a certificate of this name may serve, and only robot R; may be repeated.",
+    help="Only certificates of this name may serve, and only robot R; repeatable.",
 )
 @click.option(
-    "--router", "routers", multiple=True, metavar="NAME", help="The certificate of another router; may be repeated."
+    "--router", "routers", multiple=True, metavar="NAME", help="Name in the certificate of another router; repeatable."
 )
 @insecure_option
 @json_option
@@ -79,7 +79,7 @@ def route(
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Be where robots and those who use them meet: one address for all of them. Reads nothing by itself.
+    """Run a router: one address where robots and their users meet. It reads no frames.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -103,7 +103,7 @@ def route(
 
 
 class _Routed:
-    """Tells which robots come and go."""
+    """Prints which robots come and go."""
 
     def __init__(self, watcher: Watcher, as_json: bool) -> None:
         self._watcher, self._as_json = watcher, as_json
@@ -124,7 +124,7 @@ class _Routed:
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-bridge list --connect tcp/192.168.1.10:7448 --connect tcp/192.168.1.11:7448",
-        "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all that are there, every second",
+        "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all robots, every second",
     ),
 )
 @click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT.")
@@ -132,11 +132,11 @@ class _Routed:
 @click.option("--watch", is_flag=True, help="Update every second.")
 @json_option
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
-    """Show all robots that are reached, with their drivers: rate, age, losses, silent patches, problems, clock error.
+    """Show the drivers of all robots that are reached: rate, age, losses, silent patches, problems, clock error.
 
-    Each robot sends one small message a second for this; no frames are read.
+    Each robot sends one small message a second for this, and no frames.
 
-    Exit status: 0 done or interrupted, 1 none is reached, 2 wrong usage.
+    Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """
     from skinware.bridge import Link, Watcher, endpoints
 
@@ -153,7 +153,7 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
 
 
 class _Listed:
-    """Prints each second how all robots are, or once."""
+    """Prints the state of all robots, each second or once."""
 
     def __init__(
         self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
@@ -209,7 +209,7 @@ def _as_text(found: dict[str, Any]) -> list[str]:
 
 
 def _report_of(seen: Seen) -> dict[str, Any]:
-    told_s = (now_ns() - seen.told_ns) / NS_PER_S if seen.told_ns else None
+    told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
     summary, clock = seen.summary, seen.clock
     return {
         "robot": seen.robot,

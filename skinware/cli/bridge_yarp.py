@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="Begin of the names of all ports.")
+@click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="Prefix of all port names.")
 @click.option("--type", "type_name", default="pressure", show_default=True, metavar="TYPE", help="Sensor type.")
 @click.option(
     "--full-scale",

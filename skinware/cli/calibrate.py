@@ -314,11 +314,11 @@ def _opened(
         how: options of all commands that gather.
         poses: service, its namespace, column and shape.
     """
-    from skinware.cli._driver_snapshots import reader_of
     from skinware.cli._gathering import Gathering
     from skinware.memory.namespace import Namespace
     from skinware.service import ServiceReader
     from skinware.tactile.calibration.sources import LoadSource, PoseSource
+    from skinware.views.driver_snapshots import reader_of
 
     with ExitStack() as stack:
         reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))

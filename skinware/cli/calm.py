@@ -109,10 +109,10 @@ def command(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
     from skinware.memory.namespace import Namespace, check_name
-    from skinware.tactile.calm_contacts import WatchedRegions
     from skinware.tactile.calm_service import CalmService
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.chain_state import default_path
+    from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
 
     log_to_stderr(verbose)
@@ -132,7 +132,6 @@ def command(
         contacts=contacts or None,
         watched=WatchedRegions(read_regions(*region_files), motion) if region_files else None,
         health=health or None,
-        on_ready=lambda: _tell_ready(service, as_json),
     )
     services = source.services()
     if name not in services:
@@ -141,7 +140,8 @@ def command(
         there_are = ", ".join(services) or "none"
         warn(f"waiting for driver {name!r} in {source.name!r}{hint} There are: {there_are}")
     with signals_end(service.stop):
-        service.run((lambda: _tell_status(service)) if as_json else lambda: None)
+        report = (lambda: _tell_status(service)) if as_json else lambda: None
+        service.run(report, on_ready=lambda: _tell_ready(service, as_json))
     if as_json:
         with contextlib.suppress(BrokenPipeError):
             print_json({"event": "stopped", "name": service.name, **service.status()})
@@ -179,7 +179,7 @@ def _services_beside(service: CalmService) -> dict[str, str]:
     contacts, health = service.contacts, service.health
     return {
         "contacts": contacts.name if contacts is not None else "",
-        "motion": contacts.motion_name if contacts is not None else "",
+        "motion": contacts.motion.name if contacts is not None and contacts.motion is not None else "",
         "health": health.name if health is not None else "",
     }
 

@@ -105,9 +105,9 @@ def paint(
 
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
-    from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Region, put_region
+    from skinware.views.driver_snapshots import reader_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
@@ -156,9 +156,9 @@ class _Painter:
         """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
         import numpy as np
 
-        from skinware.cli._driver_snapshots import after, enter_pressed, frames_until
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.regions import without_holes
+        from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):
@@ -178,7 +178,7 @@ class _Painter:
 
     def _touched(self, frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
         """(n,) bool: which sensors of the type are far from rest."""
-        from skinware.cli._driver_snapshots import physical_of
+        from skinware.views.driver_snapshots import physical_of
         from skinware.views.history import threshold
 
         physical = physical_of(frame, self.type_name)

@@ -65,8 +65,8 @@ def command(
 
     Exit status: 0 every sensor answered, 1 some never did or the driver failed, 2 wrong usage.
     """
-    from skinware.cli._driver_snapshots import reader_of
     from skinware.memory.namespace import Namespace
+    from skinware.views.driver_snapshots import reader_of
 
     with reader_of(Namespace(namespace), name, "skin-wipe NAME") as reader:
         wipe = _Wipe(reader, type_name, as_json)
@@ -97,7 +97,7 @@ class _Wipe:
         self._is_redrawing = not as_json and sys.stdout.isatty()
 
     def go_on(self, duration_s: float | None) -> None:
-        from skinware.cli._driver_snapshots import after
+        from skinware.views.driver_snapshots import after
         from skinware.views.history import SETTLING_S, threshold
 
         resting = None
@@ -166,7 +166,7 @@ class _Wipe:
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Frames with their physical values, (n_sensors,); 0 for sensors of other types."""
-        from skinware.cli._driver_snapshots import after, frames_until, physical_of
+        from skinware.views.driver_snapshots import after, frames_until, physical_of
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):
             self._status = frame.status

@@ -1,4 +1,4 @@
-"""The skin understood: what touches it, where and how hard, whatever drifts. numpy only.
+"""Understand touch: what touches the skin, where and how hard, whatever drifts. numpy only.
 
 Everything works on arrays, in a notebook or on a recording::
 
@@ -10,7 +10,8 @@ Everything works on arrays, in a notebook or on a recording::
         for contact in contacts.update(calm.value, calm.touched, frame.acquired_ns):
             print(contact.id, contact.load, contact.cop_m, contact.taxels)
 
-Services do the same for other programs (``skin-calm``), and :class:`ContactsReader` reads what they found.
+``skin-calm`` does the same for other programs, and :class:`ContactsReader` reads what it publishes. The modules of this
+package have more: stages, tables of neighbours, calibration, worlds to test in.
 """
 
 from __future__ import annotations
@@ -19,41 +20,30 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skinware.tactile.baseline import Baseline
-    from skinware.tactile.calm import BaselineSettings, Calm
-    from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
+    from skinware.tactile.baseline import Baseline, Calm
+    from skinware.tactile.chain import ChainSettings
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
-    from skinware.tactile.contacts_service import ContactsReader, ContactsSample
-    from skinware.tactile.curves import Curve, CurveTable, fit_curve, read_curves
-    from skinware.tactile.health import Health, HealthSettings
-    from skinware.tactile.health_report import HealthKind, HealthReport
+    from skinware.tactile.contacts_service import ContactsReader
+    from skinware.tactile.curves import fit_curve, read_curves
+    from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
     from skinware.tactile.health_service import HealthReader
-    from skinware.tactile.motion import MotionSet, RegionMotion, motion_of
+    from skinware.tactile.motion import MotionSet, motion_of
     from skinware.tactile.motion_service import MotionReader
-    from skinware.tactile.neighbours import neighbours_of_pairs
     from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions
-    from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Taxels
+    from skinware.tactile.rule import BaselineSettings
     from skinware.tactile.tracking import ContactKind, TrackingSettings
 
 __all__ = [
-    "AmplifierSettings",
     "Baseline",
     "BaselineSettings",
-    "BaselineStageSettings",
     "Box",
     "Calm",
-    "Chain",
     "ChainSettings",
     "Contact",
     "ContactKind",
     "ContactSet",
     "Contacts",
     "ContactsReader",
-    "ContactsSample",
-    "Curve",
-    "CurveSettings",
-    "CurveTable",
-    "FilterSettings",
     "Health",
     "HealthKind",
     "HealthReader",
@@ -62,42 +52,34 @@ __all__ = [
     "MotionReader",
     "MotionSet",
     "Region",
-    "RegionMotion",
     "Regions",
-    "ScalerSettings",
-    "Signal",
-    "Taxels",
     "TrackingSettings",
     "fit_curve",
     "motion_of",
-    "neighbours_of_pairs",
     "put_region",
     "read_curves",
     "read_regions",
 ]
 
 _MODULES = (
-    "calm",
+    "rule",
     "baseline",
     "contacts",
     "tracking",
-    "neighbours",
     "regions",
-    "stages",
     "curves",
     "chain",
-    "health_report",
     "health",
     "motion",
     "contacts_service",
     "health_service",
     "motion_service",
 )
-"""Where the names are, what imports little first."""
+"""The modules that have these names, those that import little first."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, and no more: commands and the world to test in, which are here too, start fast."""
+    """Import a name when it is first used: commands, which import modules of this package, start fast."""
     if name in __all__:
         for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
             if name in vars(module):
@@ -106,5 +88,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names, too, although most are not imported yet: for completion."""
+    """List the public names, imported or not, for completion."""
     return sorted({*globals(), *__all__})

@@ -1,6 +1,6 @@
-"""Chains of stages, from a file: what happens to each sensor type of a driver, in the order in which it stands there.
+"""Run each sensor type of a driver through a chain of stages, which a file lists in their order.
 
-The file is TOML; every key of a stage but ``stage`` may be left out::
+The file is TOML; every key of a stage except ``stage`` is optional::
 
     format = "skinware-chain"
     version = 1
@@ -41,9 +41,9 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE, Baseline
-from skinware.tactile.calm import BaselineSettings, Calm
+from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.curves import CurveTable, read_curves
+from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE, BaselineSettings
 from skinware.tactile.stages import (
     AmplifierSettings,
     FilterSettings,
@@ -62,7 +62,7 @@ _RESTLESS = ("temperature", "acceleration_", "angular_rate_")
 
 
 class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
-    """A baseline as a stage: 0 = no touch; the unit stays.
+    """Settings of a baseline as a stage: 0 = no touch; the unit stays.
 
     Attributes:
         types: the sensor types that it is for; None: all for which it can be made.
@@ -71,7 +71,7 @@ class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_fie
     types: tuple[str, ...] | None = None
 
     def stage(self, taxels: Taxels) -> BaselineStage:
-        """The stage for some taxels.
+        """Make the stage for some taxels.
 
         Raises:
             ConfigurationError: the type has no rest to go back to.
@@ -86,13 +86,13 @@ class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_fie
 
 
 class BaselineStage(Stage):
-    """A baseline.
+    """Takes the baselines of n taxels away.
 
     Attributes:
-        baseline: it.
-        before: the taxels as it gets them.
-        given: (n,) float32, the values that it got with the newest frame.
-        calm: what it made of them; None before the first frame.
+        baseline: the baselines.
+        before: the taxels as they come in.
+        given: (n,) float32, the values of the newest frame as they came in.
+        calm: the same, calmed; None before the first frame.
     """
 
     name = "baseline"
@@ -111,11 +111,10 @@ class BaselineStage(Stage):
 
     @property
     def touched(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool, which taxels are, in the newest frame."""
+        """(n,) bool, which taxels are touched in the newest frame."""
         return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         self.given = signal.values
         self.calm = calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
         signal.values = calm.value
@@ -124,16 +123,16 @@ class BaselineStage(Stage):
 
 
 class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
-    """Curves from values to a unit of force or pressure.
+    """Settings of curves from values to a unit of force or pressure.
 
     Attributes:
-        file: of the curves; from the folder of the chain's file, if it is not absolute.
+        file: file with the curves; a relative path starts at the folder of the chain's file.
     """
 
     file: str
 
     def stage(self, taxels: Taxels) -> CurveStage:
-        """The stage for some taxels.
+        """Make the stage for some taxels.
 
         Raises:
             ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
@@ -145,7 +144,7 @@ class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
 
 
 class CurveStage(Stage):
-    """Curves."""
+    """Applies the curves of n taxels."""
 
     name = "curve"
 
@@ -157,7 +156,6 @@ class CurveStage(Stage):
         self._table = table
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         signal.values = self._table(signal.values)
 
 
@@ -171,10 +169,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ChainSettings:
-    """What a chain's file says.
+    """The settings of a chain.
 
     Args:
-        stages: in their order.
+        stages: settings of its stages, in their order.
         place: file and line of a stage, for messages.
     """
 
@@ -186,12 +184,12 @@ class ChainSettings:
 
     @classmethod
     def calm(cls) -> Self:
-        """A baseline and nothing else."""
+        """Return the settings of a baseline and nothing else."""
         return cls([BaselineStageSettings()])
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Those of a file.
+        """Read the settings from a file.
 
         Raises:
             ConfigurationError: not there, not TOML, not of this format, or a wrong value; the message says where.
@@ -201,16 +199,16 @@ class ChainSettings:
         stages = text.of_format("chain", FORMAT, VERSION, _File).stage
         if not stages:
             raise ConfigurationError(f"{path}: no [[stage]] in it")
-        beside = [
+        found = [
             msgspec.structs.replace(stage, file=str(path.parent / stage.file))
             if isinstance(stage, CurveSettings)
             else stage
             for stage in stages
         ]
-        return cls(beside, lambda number: text.place(("stage", number)))
+        return cls(found, lambda number: text.place(("stage", number)))
 
     def chain(self, structure: Structure) -> Chain:
-        """The chain for a driver.
+        """Make the chain for a driver.
 
         Raises:
             ConfigurationError: a stage cannot be made for a type that it names, or for none; the message says why.
@@ -240,12 +238,12 @@ class ChainSettings:
 
 @dataclass(frozen=True, eq=False)
 class ChainState:
-    """What a chain has learned.
+    """The knowledge that a chain has gained.
 
     Attributes:
-        fingerprint: of what its baselines saw.
-        arrays: by type, what the baseline has learned by name, and ``uid``: arrays of as many taxels as it had.
-        health: likewise, what is known of the health of the taxels.
+        fingerprint: of the values that its baselines saw.
+        arrays: by type, the arrays of :meth:`.Baseline.state`, and ``uid``.
+        health: by type, the arrays of :meth:`.Health.state`, and ``uid``.
     """
 
     fingerprint: str
@@ -257,12 +255,12 @@ class Chain:
     """All stages of a driver.
 
     Args:
-        structure: of the driver.
+        structure: structure of the driver.
         stages: by type, in their order.
         taxels: by type, as they come out.
 
     Attributes:
-        structure: of what comes out: the same sensors, float32, with the units of the last stages.
+        structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
     """
 
@@ -274,7 +272,7 @@ class Chain:
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
     def state(self) -> ChainState:
-        """What its baselines have learned."""
+        """Return what its baselines have learned."""
         found = {
             name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
             for name, baseline in self.baselines.items()
@@ -285,7 +283,7 @@ class Chain:
         """Go on with what the baselines of another chain had learned, taxel by taxel, if they saw the same values.
 
         Returns:
-            How many taxels that are; 0 if there were other stages before the baselines, or other units.
+            The number of those taxels; 0 if there were other stages before the baselines, or other units.
 
         Raises:
             ConfigurationError: that is no such state.
@@ -300,11 +298,11 @@ class Chain:
         return restored
 
     def fits(self, state: ChainState) -> bool:
-        """Whether its baselines see the same values as those of a state did."""
+        """Return whether its baselines see the same values as those of a state did."""
         return state.fingerprint == self._fingerprint
 
     def rows_of(self, type_name: str, uid: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
-        """(n,) where each taxel of a type stands among these uids; -1: nowhere."""
+        """Return (n,) where each taxel of a type stands among some uids; -1: nowhere."""
         row_of = {one: row for row, one in enumerate(uid.tolist())}
         mine = self.structure.sensor_uid[self.structure.index(type_name)]
         return np.array([row_of.get(one, -1) for one in mine.tolist()], np.intp)
@@ -321,23 +319,28 @@ class Chain:
         return repr(before)
 
     @property
-    def baselines(self) -> dict[str, Baseline]:
-        """By type, the first baseline of each."""
-        found: dict[str, Baseline] = {}
+    def baseline_stages(self) -> dict[str, BaselineStage]:
+        """By type, the first stage of each that is a baseline."""
+        found: dict[str, BaselineStage] = {}
         for name, stages in self.stages.items():
             for stage in stages:
                 if isinstance(stage, BaselineStage):
-                    found.setdefault(name, stage.baseline)
+                    found.setdefault(name, stage)
         return found
+
+    @property
+    def baselines(self) -> dict[str, Baseline]:
+        """By type, the first baseline of each."""
+        return {name: stage.baseline for name, stage in self.baseline_stages.items()}
 
     def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
         """Take the next frame through all stages.
 
         Args:
-            frame: of the driver.
-            values: (n_sensors,) float32, filled with what comes out.
+            frame: frame of the driver.
+            values: (n_sensors,) float32, filled with the output.
             status: (n_sensors,) uint8, filled with the frame's, ``SUSPECT`` where a baseline was moved by force, and
-                ``NEVER_SEEN`` where a stage does not know yet what to say.
+                ``NEVER_SEEN`` where a stage has no result yet.
         """
         status[:] = frame.status
         for name, stages in self.stages.items():

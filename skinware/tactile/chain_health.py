@@ -1,4 +1,4 @@
-"""Health of all sensors of a driver, judged by what goes into the baselines of a chain and what comes out of them."""
+"""Judge the health of all sensors of a driver, by the values before and after the baselines of its chain."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.tactile.baseline import SIGNED_TYPES
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
-from skinware.tactile.health import Health
-from skinware.tactile.health_report import HealthReport
+from skinware.tactile.health import Health, HealthReport
+from skinware.tactile.rule import SIGNED_TYPES
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -21,17 +20,26 @@ class ChainHealth:
     """Follows the health of all types of a chain that have a baseline and that a touch only raises.
 
     Args:
-        chain: whose values it judges.
+        chain: the chain whose values it judges.
         driver: name of the driver, for messages.
     """
 
     def __init__(self, chain: Chain, driver: str) -> None:
         self._chain = chain
         self._watched: dict[str, tuple[BaselineStage, Health]] = {}
-        for name, stages in chain.stages.items():
-            stage = next((stage for stage in stages if isinstance(stage, BaselineStage)), None)
-            if stage is not None and not name.startswith(SIGNED_TYPES):
-                self._watched[name] = stage, _health(chain, driver, name, stage)
+        structure = chain.structure
+        for name, stage in chain.baseline_stages.items():
+            if name.startswith(SIGNED_TYPES):
+                continue
+            taxels = stage.before
+            geometry = None if structure.geometry is None else structure.geometry[structure.index(name)]
+            limits = taxels.type.minimum, taxels.type.maximum
+            try:
+                health = Health(taxels.module, geometry, resolution=taxels.resolution, limits=limits)
+            except ConfigurationError as error:  # places without neighbours
+                log.warning("%s of %r: dead and weak sensors are not found: %s", name, driver, error)
+                health = Health(taxels.module, resolution=taxels.resolution, limits=limits)
+            self._watched[name] = stage, health
 
     def __bool__(self) -> bool:
         return bool(self._watched)
@@ -47,11 +55,11 @@ class ChainHealth:
                 health.update(time_ns, stage.given, stage.calm)
 
     def reports(self) -> dict[str, HealthReport]:
-        """What is known now of the sensors of each type, in the order of ``structure.index``."""
+        """Judge the sensors of each type, in the order of ``structure.index``."""
         return {name: health.report() for name, (_, health) in self._watched.items()}
 
     def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        """What is known, by type: arrays by name, and ``uid``."""
+        """Return what is known, by type: arrays by name, and ``uid``."""
         structure = self._chain.structure
         return {
             name: {"uid": structure.sensor_uid[structure.index(name)], **health.state()}
@@ -59,7 +67,7 @@ class ChainHealth:
         }
 
     def restore(self, state: ChainState) -> None:
-        """Go on with what was known of these sensors, if the baselines of then saw the same values.
+        """Go on with what was known of these sensors, if the baselines saw the same values then.
 
         Raises:
             ConfigurationError: that is no such state.
@@ -71,19 +79,8 @@ class ChainHealth:
                     health.restore(known, self._chain.rows_of(name, known["uid"]))
 
     def faulty(self, reports: dict[str, HealthReport]) -> npt.NDArray[np.bool_]:
-        """(n_sensors,) bool: which sensors of the driver have a fault, as ``reports`` said."""
+        """Return (n_sensors,) bool: the sensors of the driver that have a fault in ``reports``."""
         found = np.zeros(self._chain.structure.n_sensors, bool)
         for name, report in reports.items():
             found[self._chain.structure.index(name)] = report.faulty
         return found
-
-
-def _health(chain: Chain, driver: str, type_name: str, stage: BaselineStage) -> Health:
-    structure, taxels = chain.structure, stage.before
-    geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
-    limits = taxels.type.minimum, taxels.type.maximum
-    try:
-        return Health(taxels.module, geometry, resolution=taxels.resolution, limits=limits)
-    except ConfigurationError as error:  # places without neighbours
-        log.warning("%s of %r: dead and weak sensors are not found: %s", type_name, driver, error)
-        return Health(taxels.module, resolution=taxels.resolution, limits=limits)

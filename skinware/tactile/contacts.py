@@ -1,6 +1,6 @@
-"""Contacts: touched taxels that hang together, what they measure, and which they were in the frames before.
+"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame.
 
-From values and a table of neighbours to contacts::
+::
 
     contacts = Contacts(len(geometry), neighbours(geometry), geometry)
     for time_ns, value, touched in ...:
@@ -26,12 +26,12 @@ from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Places, Tracker, TrackingSettings
 
 MOST = 64
-"""Contacts that one frame has at most; of more the ones with the largest loads are kept."""
+"""Most contacts of one frame; of more, those with the largest loads are kept."""
 NO_CONTACT, BEYOND = -1, -2
-"""In ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
+"""Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
 
-_FORCE_UNIT = "Pa"
 _REACH_PITCHES = 2.3
+"""Pitches: default of ``reach_m``, a bit more than the second ring of neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +39,17 @@ class Contact:
     """One contact.
 
     Attributes:
-        id: the same as long as it lasts, and over gaps of 60 ms.
+        id: the same as long as it lasts, gaps of 60 ms included.
         age_s: since it began, s.
         load: sum of the values of its taxels, in the unit of the values.
-        peak: the largest of them.
+        peak: largest value of its taxels.
         n: number of its taxels.
-        area_m2: that they stand for, m2; NaN without places.
+        area_m2: area that they stand for, m2; NaN without places.
         cop_m: (3,) m, its centre: the mean of the places, weighted by the values; NaN without places.
-        normal: (3,) of length 1, outwards, likewise; NaN if it is not known.
+        normal: (3,) of length 1, outwards, weighted in the same way; NaN if it is not known.
         force_n: pressure by area, along the normal, N; NaN unless the values are pressures in Pa at known places.
         frame: name of the coordinate frame, empty if it is not known.
-        velocity_m_s: (3,) m/s, of the centre; NaN without places.
+        velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
         taxels: (n,) int64, positions among the n taxels, ascending.
     """
@@ -80,9 +80,8 @@ class ContactSet:
         cop_m, normal, velocity_m_s: (m, 3) float32.
         frame: (m,) int16, index into ``frames``; -1 if it is not known.
         kind: (m,) uint8, :class:`skinware.tactile.tracking.ContactKind`.
-        contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one of those for which there was no
-            room.
-        beyond: number of contacts for which there was no room.
+        contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one without a row.
+        beyond: number of contacts without a row.
         frames: names of the coordinate frames.
     """
 
@@ -130,7 +129,7 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "frame": ("<i2", ()),
     "kind": ("u1", ()),
 }
-"""Per contact: dtype and shape of each array of a :class:`ContactSet`."""
+"""Dtype and shape, per contact, of each array of a :class:`ContactSet`."""
 
 
 class Contacts:
@@ -138,11 +137,11 @@ class Contacts:
 
     Args:
         n: number of taxels.
-        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows; None: nobody knows.
+        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows; None: not known.
         geometry: places of the n taxels; None, or NaN in it: not known. Contacts then have no centre.
-        module: (n,) int, module of each taxel; touched taxels that have no neighbours are one contact by module.
-        unit: of the values; a force is told where it is ``Pa``.
-        tracking: how contacts are followed; default: by the pitch of the geometry.
+        module: (n,) int, module of each taxel; touched taxels without neighbours are one contact per module.
+        unit: unit of the values; forces are known where it is ``Pa``.
+        tracking: settings of the tracking; default: distances that fit the pitch of the geometry.
 
     Raises:
         ConfigurationError: something is not of n taxels.
@@ -166,7 +165,7 @@ class Contacts:
         geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
         self._position_m, self._normal = np.nan_to_num(geometry.position_m), np.nan_to_num(geometry.normal)
         self._area_m2 = area_m2(geometry)
-        self._is_pressure = unit == _FORCE_UNIT
+        self._is_pressure = unit == "Pa"
         known = np.isfinite(geometry.position_m).all(axis=1)
         names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
         self.frames: tuple[str, ...] = tuple(names.tolist())
@@ -176,10 +175,10 @@ class Contacts:
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, neighbours: npt.NDArray[Any] | None = None) -> Self:
-        """For the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
+        """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
         Args:
-            structure: of the driver.
+            structure: structure of the driver.
             type_name: which sensors.
             neighbours: default: from their places, as far as they are known.
 
@@ -194,10 +193,10 @@ class Contacts:
         return cls(len(module), neighbours, geometry, module=module, unit=structure.type(type_name).unit)
 
     def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
-        """The contacts of the next frame.
+        """Return the contacts of the next frame.
 
         Args:
-            value: (n,) calmed values: 0 = no touch. What is below 0 or not finite counts as 0.
+            value: (n,) calmed values: 0 = no touch. Values below 0 or not finite count as 0.
             touched: (n,) bool, which taxels are touched.
             time_ns: when the frame was acquired, CLOCK_MONOTONIC ns.
 
@@ -209,7 +208,8 @@ class Contacts:
             raise ConfigurationError(f"contacts of {self._n} taxels: {shapes}")
         taxels = np.flatnonzero(touched)
         contact, count = self._components.of(taxels)
-        load = _load(value[taxels])
+        load = value[taxels].astype(np.float64)
+        load = np.where(np.isfinite(load) & (load > 0), load, 0.0)
         contact_of = np.full(self._n, NO_CONTACT, np.int16)
         beyond = max(0, count - MOST)
         if beyond:
@@ -230,14 +230,14 @@ class Contacts:
         self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
     ) -> dict[str, npt.NDArray[Any]]:
         def total(of_taxel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-            return np.bincount(contact, of_taxel, count).astype(np.float64)  # of nothing it is integers
+            return np.bincount(contact, of_taxel, count).astype(np.float64)  # without weights it counts integers
 
         peak = np.zeros(count)
         np.maximum.at(peak, contact, load)
         frame = self._frame_of(taxels, contact, load, count)
         counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0)
         weight = np.where(counts, load, 0.0)
-        weight += counts * (total(weight) == 0)[contact]  # no load at all: each taxel alike
+        weight += counts * (total(weight) == 0)[contact]  # without any load, each taxel weighs the same
         weights = total(weight)
         weights[weights == 0] = np.nan
         cop_m = np.column_stack([total(weight * self._position_m[taxels, axis]) / weights for axis in range(3)])
@@ -271,11 +271,6 @@ class Contacts:
         return frame
 
 
-def _load(value: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    load = value.astype(np.float64)
-    return np.where(np.isfinite(load) & (load > 0), load, 0.0)
-
-
 def _largest(
     taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
@@ -289,7 +284,6 @@ def _largest(
 
 
 def _tracking(geometry: Geometry) -> TrackingSettings:
-    """Distances that fit the skin's pitch."""
     pitch = pitch_m(geometry)
     if np.isnan(pitch).all():
         return TrackingSettings()

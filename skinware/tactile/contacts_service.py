@@ -1,36 +1,43 @@
-"""The service ``contacts``: what touches a skin, frame by frame, for programs in any language.
+"""Publish and read the service ``contacts``: what touches a skin, frame by frame, for programs in any language.
 
 ::
 
     with ContactsReader(namespace="calm", timeout_s=10) as contacts:
-        for frame in contacts:
-            for contact in frame:
+        for sample in contacts:
+            for contact in sample:
                 print(contact.id, contact.load, contact.cop_m, contact.taxels)
 
-Columns of a frame: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
+Columns of a sample: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
 the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``frame`` is -1 and numbers are NaN.
-``beyond`` tells how many contacts found no row, ``contact_of`` of each taxel the row of its contact. Static columns:
-``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_name`` and ``type_unit`` of the values.
+``beyond`` counts the contacts that found no row, ``contact_of`` gives each taxel the row of its contact. Static
+columns: ``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_name`` and ``type_unit`` of the values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import texts
-from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Sample
-from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
-from skinware.tactile.source_reader import SourceReader
+from skinware.tactile.source_service import (
+    Layout,
+    ServiceOptions,
+    SourceReader,
+    SourceSample,
+    SourceWriter,
+    Static,
+    ValueSource,
+    columns_of,
+    value_source,
+    value_static,
+)
 
-KIND = NAME = "contacts"
+NAME = "contacts"
 
 _TEXTS = {
     "id": ("", "the same as long as the contact lasts; 0: this row is empty"),
@@ -49,39 +56,25 @@ _TEXTS = {
     "beyond": ("", "contacts for which there was no row"),
     "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),
 }
-_FLOAT_KIND = "f"
 
 
 @dataclass(frozen=True)
-class ContactsSource:
-    """What contacts are of.
+class ContactsSource(ValueSource):
+    """The values that contacts are found in.
 
     Attributes:
-        driver: name of the driver of the values.
-        type_name: of its sensors.
-        unit: of values, loads and peaks.
         uid: (n,) uint64, of the n taxels.
-        frames: names of the coordinate frames.
     """
 
-    driver: str
-    type_name: str
-    unit: str
     uid: npt.NDArray[np.uint64]
-    frames: tuple[str, ...]
 
 
-class ContactsSample(Sample):
-    """The contacts of one frame; going through it goes through them, the oldest first."""
+class ContactsSample(SourceSample[ContactsSource]):
+    """The contacts of one frame; iterate over it for each of them, the oldest first."""
 
     __slots__ = ("_contacts",)
 
     _contacts: ContactSet
-
-    @property
-    def source(self) -> ContactsSource:
-        """What the contacts are of."""
-        return cast(ContactsSource, self.context)
 
     @property
     def contacts(self) -> ContactSet:
@@ -101,7 +94,7 @@ class ContactsSample(Sample):
 
 
 class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
-    """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose frames are contacts.
+    """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose samples are contacts.
 
     Args:
         name: of the service.
@@ -111,40 +104,37 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
         BadServiceFile: the service is none of contacts.
     """
 
-    kind = KIND
+    kind = NAME
     frame_class = ContactsSample
 
     @staticmethod
-    def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> ContactsSource:
-        return ContactsSource(
-            driver=texts(static["driver"])[0],
-            type_name=texts(static["type_name"])[0],
-            unit=texts(static["type_unit"])[0],
-            uid=static["sensor_uid"].astype(np.uint64),
-            frames=tuple(texts(static["frame_name"])),
-        )
+    def _source_of(static: Static) -> ContactsSource:
+        return ContactsSource(**value_source(static), uid=static["sensor_uid"].astype(np.uint64))
 
     @staticmethod
-    def _layout_of(source: ContactsSource) -> Mapping[str, tuple[str, tuple[int, ...]]]:
-        return _frame_columns(len(source.uid))
+    def _layout_of(source: ContactsSource) -> Layout:
+        return _layout(len(source.uid))
 
 
-class ContactsWriter:
-    """Finds the contacts of a driver's values, and publishes them.
+class ContactsWriter(SourceWriter):
+    """Finds the contacts in a driver's values, and publishes them.
 
     Args:
         structure: of the driver.
         type_name: which sensors.
-        driver: its name, told to readers.
+        driver: its name, for readers.
         neighbours: (n, k) int, as for :class:`skinware.tactile.contacts.Contacts`; default: from the places that the
             structure has.
         name: of the service.
-        namespace, slots, rate_hz, group: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`, which also lists
+            the errors.
 
     Raises:
         StructureError: the driver has no such sensors.
         ConfigurationError: the neighbours are not of these sensors.
     """
+
+    kind = NAME
 
     def __init__(
         self,
@@ -154,29 +144,12 @@ class ContactsWriter:
         driver: str = "",
         neighbours: npt.NDArray[Any] | None = None,
         name: str = NAME,
-        namespace: Namespace | str | None = None,
-        slots: int | None = None,
-        rate_hz: float | None = None,
-        group: str | None = None,
+        **options: Unpack[ServiceOptions],
     ) -> None:
         self._type_name, self._driver = type_name, driver
         self._contacts = Contacts.of(structure, type_name, neighbours)
-        self._service = ServiceWriter(
-            name,
-            self._columns(structure),
-            self._static(structure),
-            namespace=namespace,
-            kind=KIND,
-            slots=slots,
-            rate_hz=rate_hz,
-            group=group,
-            description=f"contacts of {driver or 'a skin'}, {type_name}",
-        )
-
-    @property
-    def name(self) -> str:
-        """Name of the service."""
-        return self._service.name
+        description = f"contacts of {driver or 'a skin'}, {type_name}"
+        super().__init__(name, *self._form(structure), description, **options)
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -200,7 +173,7 @@ class ContactsWriter:
         for name in COLUMNS:
             column = columns[name]
             column[: len(found)] = getattr(found, name)
-            column[len(found) :] = np.nan if column.dtype.kind == _FLOAT_KIND else 0
+            column[len(found) :] = np.nan if column.dtype.kind == "f" else 0
         columns["frame"][len(found) :] = -1
         columns["contact_of"][:] = found.contact_of
         columns["count"][:], columns["beyond"][:] = len(found), found.beyond
@@ -208,48 +181,27 @@ class ContactsWriter:
         return found
 
     def restructure(self, structure: Structure, *, neighbours: npt.NDArray[Any] | None = None) -> None:
-        """Go on with other sensors, as a new generation; readers are told. All contacts begin anew.
+        """Go on with other sensors, as a new generation. All contacts end.
 
         Raises:
             StructureError, ConfigurationError: as for a new writer; the old generation then goes on.
-            NamespaceError: shared memory is full; likewise.
+            NamespaceError: shared memory is full; the old generation then goes on, too.
         """
         before, self._contacts = self._contacts, Contacts.of(structure, self._type_name, neighbours)
         try:
-            self._service.restructure(self._columns(structure), self._static(structure))
+            self._service.restructure(*self._form(structure))
         except BaseException:
             self._contacts = before
             raise
 
-    def close(self) -> None:
-        """Withdraw the service. Idempotent."""
-        self._service.close()
-
-    def _columns(self, structure: Structure) -> dict[str, Column]:
-        of_values = {name: structure.type(self._type_name).unit for name in ("load", "peak")}
-        columns = {}
-        for name, (dtype, shape) in _frame_columns(len(structure.module_of(self._type_name))).items():
-            unit, description = _TEXTS[name]
-            columns[name] = Column(np.dtype(dtype), shape, of_values.get(name, unit), description)
-        return columns
-
-    def _static(self, structure: Structure) -> dict[str, npt.NDArray[Any]]:
+    def _form(self, structure: Structure) -> tuple[dict[str, Any], Static]:
+        """Columns and static columns."""
         sensor_type = structure.type(self._type_name)
-        return {
-            "sensor_uid": structure.sensor_uid[structure.index(self._type_name)],
-            "frame_name": np.array([name.encode() for name in self._contacts.frames], "S64"),
-            "driver": np.array([self._driver.encode()], "S64"),
-            "type_name": np.array([sensor_type.name.encode()], "S32"),
-            "type_unit": np.array([sensor_type.unit.encode()], "S16"),
-        }
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        uid = structure.sensor_uid[structure.index(self._type_name)]
+        columns = columns_of(_layout(len(uid)), _TEXTS, load=sensor_type.unit, peak=sensor_type.unit)
+        return columns, {"sensor_uid": uid, **value_static(self._driver, sensor_type, self._contacts.frames)}
 
 
-def _frame_columns(n: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+def _layout(n: int) -> Layout:
     rows = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
     return rows | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", (n,))}

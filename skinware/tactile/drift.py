@@ -7,34 +7,34 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from skinware.tactile.rule import (
+    COVER_RETURNS_BY,
+    COVER_RETURNS_S,
+    DOUBT,
+    FREE_SHARE,
+    LEAST_FACTOR,
+    LEVEL_EVERY_S,
+    MOST_FACTOR,
+    STRETCH,
+)
+
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
-
-_LEAST_FACTOR, _MOST_FACTOR = 0.2, 3.0
-"""Of a taxel's drift in proportion to that of its patch."""
-_FREE_SHARE = 0.5
-"""Of a patch must be away from contacts, or nothing is known of its common drift."""
-_DOUBT = 0.3
-"""Of a threshold: a common drift of so much says as much about a factor as the guess that it is 1."""
-_STRETCH = 2.0
-"""Of a threshold: after so much common drift, a factor is learned anew, and what was known counts half."""
-_LEVEL_EVERY_S = 1.0
-"""So often the typical factor of a patch is made 1: common drift is measured in factors, and these by common drift."""
 
 
 class Drift:
     """Follows the drift of n taxels.
 
     Args:
-        patch: (n,) int, the patch of each taxel: what drifts together.
+        patch: (n,) int, the patch of each taxel: its taxels drift together.
 
     Attributes:
         factor: (n,) float32, each taxel's drift in proportion to that of its patch.
         own: (n,) float32, how far each has drifted away from contacts since its last stretch began.
-        common: (n,) float32, how far its patch has, meanwhile.
-        product: (n,) float32, sum of own times common drift of the stretches before.
+        common: (n,) float32, how far its patch has drifted meanwhile.
+        product: (n,) float32, sum of own times common drift over the stretches before.
         square: (n,) float32, sum of the squares of common drift.
-        lag: (n,) float32, what each has yet to follow beside the common drift, over some seconds.
+        lag: (n,) float32, how far each has yet to follow, beside the common drift, over some seconds.
         alone: (n,) float32, how far each baseline moved beside the common drift in the last step.
     """
 
@@ -62,20 +62,22 @@ class Drift:
         common_tau_s: float,
         limit: Floats,
     ) -> Floats:
-        """How far the baselines move in this time.
+        """Return (n,) how far the baselines move in this time.
 
         Args:
             deviation: (n,) of the values from the baselines; 0 where not usable.
             usable: (n,) which taxels have values.
             free: (n,) which of them are away from contacts.
-            passed_s: the time.
+            passed_s: since the last step.
             tau_s: time constant of own drift.
-            common_tau_s: of common drift.
+            common_tau_s: time constant of common drift.
             limit: (n,) threshold of touch, above 0: no common drift reaches it within a time constant.
         """
         own_share, common_share = (np.float32(-math.expm1(-passed_s / tau)) for tau in (tau_s, common_tau_s))
-        common = self._common_drift(deviation, usable, free)
-        np.clip(common, -limit, limit, out=common)
+        median, n_free = self._median(deviation / self.factor, free)
+        n_usable = np.bincount(self._patch[usable], minlength=len(n_free))
+        median[(n_free == 0) | (n_free < FREE_SHARE * n_usable)] = 0
+        common = np.clip(median[self._patch], -limit, limit)
         followed = self.factor * common
         change = followed * common_share
         rest = deviation - followed
@@ -88,34 +90,22 @@ class Drift:
         self._learn(free, passed_s, limit)
         return change
 
-    def _common_drift(self, deviation: Floats, usable: Flags, free: Flags) -> Floats:
-        """(n,) the drift of each taxel's patch; 0 where too much of it is in contact to tell."""
-        median, n_free = self._median(deviation / self.factor, free)
-        n_usable = np.bincount(self._patch[usable], minlength=len(n_free))
-        median[(n_free == 0) | (n_free < _FREE_SHARE * n_usable)] = 0
-        return median[self._patch]
-
     def _learn(self, free: Flags, passed_s: float, limit: Floats) -> None:
         own = self.own + self.lag
         product, square = self.product + own * self.common, self.square + self.common * self.common
-        doubt = (_DOUBT * limit) ** 2
+        doubt = (DOUBT * limit) ** 2
         ratio = (product + doubt) / (square + doubt)
         self._unlevelled_s += passed_s
-        if self._unlevelled_s > _LEVEL_EVERY_S:
+        if self._unlevelled_s > LEVEL_EVERY_S:
             self._unlevelled_s = 0.0
             median, found = self._median(ratio, free)
             self._typical = np.where((found > 0) & (median > 0), median, np.float32(1))[self._patch]
-        np.copyto(self.factor, np.clip(ratio / self._typical, _LEAST_FACTOR, _MOST_FACTOR), where=free)
-        over = np.abs(self.common) > _STRETCH * limit
+        np.copyto(self.factor, np.clip(ratio / self._typical, LEAST_FACTOR, MOST_FACTOR), where=free)
+        over = np.abs(self.common) > STRETCH * limit
         if over.any():
             self.product[over], self.square[over] = product[over] / 2, square[over] / 2
             self.own[over], self.common[over] = -self.lag[over], 0
 
-
-_COMES_BACK_S = 0.5
-"""So soon after the end of a contact."""
-_AT_MOST = 1.5
-"""Times what a taxel has sunk, it may come back by, and the threshold beyond."""
 
 Rows = npt.NDArray[np.intp]
 
@@ -123,8 +113,8 @@ Rows = npt.NDArray[np.intp]
 class Sag:
     """Remembers how far the baselines of n taxels went down while their patch was touched.
 
-    A cover that is pressed sinks around the contact, farther than the module that is held. Free taxels there follow it
-    down, and must go up again when the contact is over, or what comes back would be a touch.
+    A cover that is pressed sinks around the contact, farther than the module that is held. The baselines of free taxels
+    there follow it down. They go up again with the cover when the contact is over, or its return would be a touch.
 
     Args:
         module: (n,) int, the module of each taxel.
@@ -141,13 +131,13 @@ class Sag:
         self._sunk: Floats = np.zeros(len(module), np.float32)
 
     def sink(self, by: Floats) -> None:
-        """Baselines went down (n,) so far beside common drift; up, below 0."""
+        """Note how far (n,) baselines went down beside the common drift; below 0, they went up."""
         if self._in_contact.any():
             self._sunk += by * self._in_contact[self._patch]
             np.maximum(self._sunk, 0, out=self._sunk)
 
     def come_back(self, deviation: Floats, touched: Flags, off: Floats, passed_s: float) -> Floats:
-        """Follow the contacts; (n,) how far the baselines of those whose sag is over have to go up.
+        """Follow the contacts, and return (n,) how far the baselines go up where the sag is over.
 
         Args:
             deviation: (n,) of the values from the baselines.
@@ -162,26 +152,22 @@ class Sag:
         self._is_touched = is_touched
         self._in_contact[:] = False
         self._in_contact[self._patch_of_module[is_touched]] = True
-        is_ending = self._since_end_s < _COMES_BACK_S
+        is_ending = self._since_end_s < COVER_RETURNS_S
         if not is_ending.any():
             if not self._in_contact.all():
                 self._sunk *= self._in_contact[self._patch]
             return np.zeros_like(self._sunk)
-        is_back = is_ending[self._patch] & (deviation > off) & (deviation < _AT_MOST * self._sunk + off)
+        is_back = is_ending[self._patch] & (deviation > off) & (deviation < COVER_RETURNS_BY * self._sunk + off)
         up = self._sunk * is_back
         self._sunk -= up
         return up
 
 
-_WIDEST_WASTE = 2
-"""Groups share a table as long as its rows are at most so many times as wide as the smallest of them."""
-
-
 class GroupMedian:
-    """Medians of n values by group, of those that count.
+    """Computes the medians of n values by group.
 
-    Groups of similar size are rows of one table, which is sorted at once: one huge group beside a thousand small ones
-    costs no more than their members.
+    Groups of similar size are rows of one table, which is sorted at once. A table is at most twice as wide as its
+    smallest group: one huge group beside a thousand small ones costs no more than their members.
 
     Args:
         group: (n,) int, the group of each value, 0 or more.
@@ -195,7 +181,7 @@ class GroupMedian:
         self._tables: list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]] = []
         by_size = [int(number) for number in np.argsort(sizes, kind="stable") if sizes[number]]
         while by_size:
-            widest = _WIDEST_WASTE * sizes[by_size[0]]
+            widest = 2 * sizes[by_size[0]]
             rows = [number for number in by_size if sizes[number] <= widest]
             by_size = by_size[len(rows) :]
             table = np.full((len(rows), sizes[rows[-1]]), len(group), np.intp)  # beyond the values stands infinity
@@ -207,14 +193,14 @@ class GroupMedian:
     def __call__(
         self, values: npt.NDArray[np.float32], counts: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.intp]]:
-        """The medians.
+        """Compute the medians of the values that count.
 
         Args:
             values: (n,) finite where they count.
             counts: (n,) which of them count.
 
         Returns:
-            (n_groups,) medians, NaN where none counts; (n_groups,) how many do.
+            (n_groups,) medians, NaN where no value counts; and (n_groups,) how many count.
         """
         medians = np.full(self.n_groups, np.nan, np.float32)
         found = np.bincount(self._group[counts], minlength=self.n_groups)

@@ -1,4 +1,4 @@
-"""The service ``health``: once a second, what is known of each sensor of a calmed driver, and why.
+"""Publish and read the service ``health``: once a second, the health of each sensor of a calmed driver, and why.
 
 ::
 
@@ -7,29 +7,34 @@
         for position in np.flatnonzero(report.faulty):
             print(health.source.uid[position], report.evidence(position))
 
-Columns of a frame: those of :data:`skinware.tactile.health_report.COLUMNS`, of all sensors of the driver in the order
-of its frames. Of types without a rest nothing is known: ``kind`` is 0 and numbers are NaN. Static columns:
-``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
+Columns of a sample: those of :data:`skinware.tactile.health.COLUMNS`, of all sensors of the driver in the order of its
+frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns: ``sensor_uid``,
+``sensor_type``, and the name of the ``driver``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
-from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Sample
-from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
-from skinware.tactile.health_report import COLUMNS, HealthReport
-from skinware.tactile.source_reader import SourceReader
+from skinware.tactile.health import COLUMNS, HealthReport
+from skinware.tactile.source_service import (
+    Layout,
+    ServiceOptions,
+    SourceReader,
+    SourceSample,
+    SourceWriter,
+    Static,
+    columns_of,
+)
 
-KIND = NAME = "health"
+NAME = "health"
 RATE_HZ = 1.0
 """How often it is published."""
 
@@ -39,18 +44,18 @@ _TEXTS = {
     "still_s": ("s", "for how long it has not changed"),
     "peak": ("", "the most that a touch showed, in the unit of the type"),
     "noise": ("", "standard deviation, in the unit of the type"),
-    "noise_times": ("", "the same in those of the typical sensor"),
+    "noise_times": ("", "the same in multiples of the typical sensor's"),
     "clipped": ("", "share of the time at an end of the range"),
     "touches": ("", "separate touches of both its sides"),
-    "shown": ("", "what it showed of its due in them"),
-    "shown_around": ("", "what its neighbours did; only where that is much more"),
+    "shown": ("", "share of its due that it showed in them"),
+    "shown_around": ("", "share that its neighbours showed; only where that is much more"),
 }
 _SLOTS = 4
 
 
 @dataclass(frozen=True)
 class HealthSource:
-    """What health is told of.
+    """The sensors whose health is reported.
 
     Attributes:
         driver: name of the driver.
@@ -63,24 +68,19 @@ class HealthSource:
     type_id: npt.NDArray[np.uint32]
 
 
-class HealthSample(Sample):
-    """What is known at one time."""
+class HealthSample(SourceSample[HealthSource]):
+    """The health of all sensors at one time."""
 
     __slots__ = ()
 
     @property
-    def source(self) -> HealthSource:
-        """What it is told of."""
-        return cast(HealthSource, self.context)
-
-    @property
     def report(self) -> HealthReport:
-        """As arrays of all sensors of the driver."""
+        """It as arrays of all sensors of the driver."""
         return HealthReport(**{name: self.column(name) for name in COLUMNS})
 
 
 class HealthReader(SourceReader[HealthSource, HealthSample]):
-    """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose frames are reports.
+    """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose samples are reports.
 
     Args:
         name: of the service.
@@ -90,63 +90,45 @@ class HealthReader(SourceReader[HealthSource, HealthSample]):
         BadServiceFile: the service is none of health.
     """
 
-    kind = KIND
+    kind = NAME
     frame_class = HealthSample
 
     @staticmethod
-    def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> HealthSource:
+    def _source_of(static: Static) -> HealthSource:
         uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
         if uid.shape != type_id.shape:
             raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
         return HealthSource(texts(static["driver"])[0], uid, type_id)
 
     @staticmethod
-    def _layout_of(source: HealthSource) -> Mapping[str, tuple[str, tuple[int, ...]]]:
-        return {name: (dtype, source.uid.shape) for name, (dtype, _) in COLUMNS.items()}
+    def _layout_of(source: HealthSource) -> Layout:
+        return _layout(len(source.uid))
 
 
-class HealthWriter:
-    """Publishes what is known of the sensors of a driver.
+class HealthWriter(SourceWriter):
+    """Publishes the health of the sensors of a driver.
 
     Args:
         structure: of the driver.
         driver: its name.
         name: of the service.
-        namespace, group: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+        options: namespace and group, as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
     """
 
+    kind = NAME
+
     def __init__(
-        self,
-        structure: Structure,
-        driver: str,
-        *,
-        name: str = NAME,
-        namespace: Namespace | str | None = None,
-        group: str | None = None,
+        self, structure: Structure, driver: str, *, name: str = NAME, **options: Unpack[ServiceOptions]
     ) -> None:
         self._structure, self._driver = structure, driver
-        self._service = ServiceWriter(
-            name,
-            _columns(structure),
-            self._static(structure),
-            namespace=namespace,
-            kind=KIND,
-            slots=_SLOTS,
-            rate_hz=RATE_HZ,
-            group=group,
-            description=f"health of the sensors of {driver}",
-        )
-
-    @property
-    def name(self) -> str:
-        """Name of the service."""
-        return self._service.name
+        given: ServiceOptions = {"slots": _SLOTS, "rate_hz": RATE_HZ, **options}
+        super().__init__(name, *self._form(structure), f"health of the sensors of {driver}", **given)
 
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
-        """Publish what is known now.
+        """Publish the present reports.
 
         Args:
-            reports: by type of sensors; of the others nothing is known.
+            reports: by type of sensors; nothing is known of the others.
             acquired_ns: of the newest frame, CLOCK_MONOTONIC ns.
 
         Raises:
@@ -161,33 +143,23 @@ class HealthWriter:
         self._service.commit(acquired_ns)
 
     def restructure(self, structure: Structure) -> None:
-        """Go on with other sensors, as a new generation; readers are told.
+        """Go on with other sensors, as a new generation.
 
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        self._service.restructure(_columns(structure), self._static(structure))
+        self._service.restructure(*self._form(structure))
         self._structure = structure
 
-    def close(self) -> None:
-        """Withdraw the service. Idempotent."""
-        self._service.close()
-
-    def _static(self, structure: Structure) -> dict[str, npt.NDArray[Any]]:
-        return {
+    def _form(self, structure: Structure) -> tuple[dict[str, Any], Static]:
+        """Columns and static columns."""
+        static: dict[str, npt.NDArray[Any]] = {
             "sensor_uid": structure.sensor_uid,
             "sensor_type": structure.sensor_type,
             "driver": np.array([self._driver.encode()], "S64"),
         }
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return columns_of(_layout(structure.n_sensors), _TEXTS), static
 
 
-def _columns(structure: Structure) -> dict[str, Column]:
-    return {
-        name: Column(np.dtype(dtype), (structure.n_sensors,), *_TEXTS[name]) for name, (dtype, _) in COLUMNS.items()
-    }
+def _layout(n: int) -> Layout:
+    return {name: (dtype, (n,)) for name, (dtype, _) in COLUMNS.items()}

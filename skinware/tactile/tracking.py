@@ -16,10 +16,10 @@ Gains = npt.NDArray[np.float64]
 
 
 def assign(gain: Gains) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Pairs of a row and a column, none of them twice, whose gains have the largest sum.
+    """Assign rows to columns, each at most once, so that the sum of gains is the largest.
 
     Args:
-        gain: (r, c) of each pair; 0 or less: these never go together.
+        gain: (r, c) gain of each pair; 0 or less: the pair is impossible.
 
     Returns:
         (p,) int64 rows, in ascending order, and (p,) int64, the column of each.
@@ -45,8 +45,8 @@ def assign(gain: Gains) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
 def _cheapest(cost: Gains) -> npt.NDArray[np.int64]:
     """(r,) int64: a column for each of r rows (at most as many as columns), for the smallest sum.
 
-    By shortest augmenting paths: row after row is let in, along the path of exchanges that costs least. ``of_row`` and
-    ``of_column`` are the dual prices, ``row_at`` the row that has a column; column 0 stands for the row to be let in.
+    By shortest augmenting paths: each row joins along the path of exchanges that costs least. ``of_row`` and
+    ``of_column`` are the dual prices, ``row_at`` is the row of each column; column 0 stands for the row that joins.
     """
     rows, columns = cost.shape
     of_row, of_column = np.zeros(rows + 1), np.zeros(columns + 1)
@@ -81,29 +81,29 @@ Floats = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
 
 _STRONG, _WEAK, _NEAR = 5.0, 1.5, 0.1
-"""What a pair gains for sharing half of the smaller one's taxels, for sharing any, and for being near: so that one of a
-higher kind outweighs two of the next."""
+"""Gains of a pair that shares half of the smaller one's taxels, any, or is near: one outweighs two of the next."""
 _PREFERENCE = 0.2
-"""For the oldest track and for the largest contact. As they go to all pairs alike, they only decide who is left out:
-where contacts merge the younger identity, where one splits the smaller part."""
+"""Gain of the oldest track, and of the largest contact. All pairs of a track have it, so it only decides which is left
+out: the younger identity where contacts merge, the smaller part where one splits."""
 _CLOSENESS = 0.001
-"""For sharing all taxels: decides between pairs of the same kind, never against a preference."""
+"""Gain of a pair that shares all taxels: it decides between pairs of the same kind, never against a preference."""
 _NEARNESS, _PRESENCE = 0.4, 0.2
-"""For being just where a contact was expected, and for one that was there in the last frame: where no taxels are
-shared, or the contact is so fast that they tell nothing."""
+"""Gains of a contact just where it was expected, and of one that was there in the last frame. They count where no
+taxels are shared, or the contact is so fast that shared taxels mean nothing."""
 _DOUBT = 0.5
-"""So much of the way that a contact should have gone it may be off."""
+"""Share of its expected way by which a contact may miss the expected place."""
 _LONGEST_GUESS_S = 0.1
+"""Seconds for which a velocity is extrapolated."""
 _CALM = 3.0
-"""Time constant of the motion that is called sliding, in those of the velocity."""
+"""Time constant of the motion that is judged as sliding, in multiples of ``velocity_s``."""
 _LAST_ID = (1 << 32) - 1
 
 
 class ContactKind(enum.IntEnum):
-    """What a contact is doing."""
+    """The behaviour of a contact."""
 
     TOUCH = 0
-    """It began just now: a tap, if it ends now."""
+    """It has just begun: a tap, if it ends now."""
     HOLD = 1
     """It rests, or its load changes."""
     SLIDING = 2
@@ -112,16 +112,16 @@ class ContactKind(enum.IntEnum):
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """How contacts are followed.
+    """Settings of the tracking of contacts.
 
     Attributes:
-        patience_s: so long an identity is kept while its contact is gone, s.
-        reach_m: so far a contact may jump from where it was expected without sharing a taxel, m.
-        fast_m: one that is expected to move farther in a frame is judged by its expected place first, m.
-        velocity_s: time constant of its velocity, and of the load that is taken for steady, s.
-        touch_s: so long a contact is a touch, s.
-        sliding_m_s: from this speed on it is sliding, down to half of it, m/s.
-        steady: its load differs by at most this share from what it was.
+        patience_s: how long an identity is kept while its contact is gone, s.
+        reach_m: how far a contact may be from its expected place without sharing a taxel, m.
+        fast_m: a contact expected to move farther in a frame is judged by its place first, m.
+        velocity_s: time constant of the velocity, and of the steady load, s.
+        touch_s: how long a contact is a touch, s.
+        sliding_m_s: speed from which it is sliding, until it falls below half of it, m/s.
+        steady: share by which the load of a sliding contact may differ from its steady load.
     """
 
     patience_s: float = 0.06
@@ -135,12 +135,12 @@ class TrackingSettings:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the m contacts of a frame are.
+    """The places of the m contacts of a frame.
 
     Attributes:
         taxels: (a,) int64, the taxels of all of them.
-        contact: (a,) int64, which contact each belongs to.
-        load: (m,) of each contact.
+        contact: (a,) int64, the contact of each.
+        load: (m,) load of each contact.
         frame: (m,) int64, number of its coordinate frame, -1 for none.
         cop_m: (m, 3) m, its centre; NaN if it is not known.
     """
@@ -154,12 +154,12 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """All identities, one row each: those of the newest frame in its order, then those whose contacts are gone."""
+    """All identities: those of the newest frame in its order, then those whose contacts are gone."""
 
     id: Whole
     born_ns: Whole
     gone_ns: Whole
-    """Since when the contact is gone; 0 if it is there."""
+    """When the contact went; 0 while it is there."""
     seen_ns: Whole
     size: Whole
     frame: Whole
@@ -170,7 +170,7 @@ class _Tracks:
     load: Floats
     """Smoothed."""
     motion_m_s: Floats
-    """The velocity, smoothed once more: noise is not to look like sliding."""
+    """The velocity, smoothed once more, so that noise does not look like sliding."""
     kind: Whole
 
     def __getitem__(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> _Tracks:
@@ -181,11 +181,11 @@ class _Tracks:
         return _Tracks(*(np.concatenate(pair) for pair in pairs))
 
 
-class Followed(NamedTuple):
-    """What is known of the m contacts of a frame from those before it.
+class Tracked(NamedTuple):
+    """The history of the m contacts of a frame.
 
     Attributes:
-        id: (m,) int64, from 1 on, never given again until 2**32 were.
+        id: (m,) int64, from 1 on; numbers repeat only after 2**32.
         age_s: (m,) s.
         velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
         kind: (m,) int64, :class:`ContactKind`.
@@ -202,7 +202,7 @@ class Tracker:
 
     Args:
         n: number of taxels.
-        settings: how.
+        settings: default: those of the class.
     """
 
     def __init__(self, n: int, settings: TrackingSettings | None = None) -> None:
@@ -213,8 +213,8 @@ class Tracker:
         self._last_id = 0
         self._time_ns: int | None = None
 
-    def follow(self, places: Places, time_ns: int) -> Followed:
-        """Identities of the contacts of the next frame, and how they move."""
+    def follow(self, places: Places, time_ns: int) -> Tracked:
+        """Return the identities of the contacts of the next frame, and how they move."""
         self._forget(time_ns)
         tracks, size = self._tracks, np.bincount(places.contact, minlength=len(places.load))
         shared = self._shared(places)
@@ -236,20 +236,22 @@ class Tracker:
             kind=np.full(len(size), int(ContactKind.TOUCH)),
         )
         now.id[found], now.born_ns[found] = tracks.id[known], tracks.born_ns[known]
-        self._name(now.id)
+        for row in np.flatnonzero(now.id == 0).tolist():
+            self._last_id = self._last_id % _LAST_ID + 1
+            now.id[row] = self._last_id
         is_joined = overlap >= 0.5
         is_whole = (is_joined.sum(axis=1)[known] <= 1) & (is_joined.sum(axis=0)[found] <= 1)
         self._move(now, found, known, is_whole)
         self._judge(now, found, known, places.load, time_ns)
         self._keep(now, places, known, time_ns)
-        return Followed(now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s, now.kind)
+        return Tracked(now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s, now.kind)
 
     def _forget(self, time_ns: int) -> None:
-        """Let go of the identities whose contacts have been gone for too long."""
+        """Drop the identities whose contacts have been gone for too long."""
         tracks = self._tracks
         period_ns = 0 if self._time_ns is None else max(0, time_ns - self._time_ns)
         self._time_ns = time_ns
-        # half a period more: the frames of 60 ms at 50 Hz are three, whatever they vary in time
+        # half a period more: at 50 Hz, 60 ms are three frames, also with jitter
         patience_ns = self._settings.patience_s * NS_PER_S + period_ns / 2
         keep = (tracks.gone_ns == 0) | (time_ns - tracks.gone_ns <= patience_ns)
         if not keep.all():
@@ -257,7 +259,7 @@ class Tracker:
             self._tracks, self._track_of = tracks[keep], number[self._track_of]
 
     def _shared(self, places: Places) -> Whole:
-        """(tracks, m): how many taxels each contact has of those that each track had last."""
+        """(tracks, m): number of taxels that each track and contact share."""
         count = len(places.load)
         track = self._track_of[places.taxels]
         is_known = track >= 0
@@ -265,12 +267,12 @@ class Tracker:
         return np.bincount(pair, minlength=len(self._tracks.id) * count).reshape(len(self._tracks.id), count)
 
     def _expected_m(self, time_ns: int) -> Floats:
-        """(tracks, 3) m: how far each track has moved on since it was seen, if it went on as it did."""
+        """(tracks, 3) m: how far each track has moved since it was seen, at its last velocity."""
         passed_s = np.minimum((time_ns - self._tracks.seen_ns) / NS_PER_S, _LONGEST_GUESS_S)
         return self._tracks.velocity_m_s * passed_s[:, None]
 
     def _gains(self, overlap: Floats, expected_m: Floats, places: Places) -> Gains:
-        """(tracks, m): what each pair gains; 0: they cannot be the same."""
+        """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks, settings = self._tracks, self._settings
         away_m = np.linalg.norm((tracks.cop_m + expected_m)[:, None] - places.cop_m, axis=2)
         way_m = np.nan_to_num(np.linalg.norm(expected_m, axis=1))[:, None]
@@ -284,14 +286,8 @@ class Tracker:
         near = _NEAR + _NEARNESS * nearness + _PRESENCE * (tracks.gone_ns == 0)[:, None]
         return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
 
-    def _name(self, identity: Whole) -> None:
-        """Give those that have the number 0 new ones."""
-        for row in np.flatnonzero(identity == 0).tolist():
-            self._last_id = self._last_id % _LAST_ID + 1
-            identity[row] = self._last_id
-
     def _move(self, now: _Tracks, found: Whole, known: Whole, is_whole: npt.NDArray[np.bool_]) -> None:
-        """Velocities of contacts that go on. Where they merge or split, their centres jump: the velocity is kept."""
+        """Update velocities; they stay where contacts merge or split, as their centres jump."""
         tracks = self._tracks
         now.velocity_m_s[found], now.steps[found] = tracks.velocity_m_s[known], tracks.steps[known]
         passed_s = (now.seen_ns[found] - tracks.seen_ns[known]) / NS_PER_S
@@ -318,7 +314,7 @@ class Tracker:
         now.kind[is_old] = np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD)[is_old]
 
     def _keep(self, now: _Tracks, places: Places, known: Whole, time_ns: int) -> None:
-        """Remember this frame, and those whose contacts are gone."""
+        """Remember this frame, and the identities whose contacts are gone."""
         tracks = self._tracks
         is_gone = np.ones(len(tracks.id), bool)
         is_gone[known] = False
@@ -331,7 +327,7 @@ class Tracker:
 
 
 def _rank(numbers: Floats | Whole) -> Floats:
-    """From 0 for the smallest to 1 for the largest."""
+    """0 for the smallest to 1 for the largest."""
     rank = np.zeros(len(numbers))
     rank[np.argsort(numbers, kind="stable")] = np.linspace(0, 1, len(numbers)) if len(numbers) else 0.0
     return rank

@@ -22,7 +22,7 @@ from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.motion_service import MotionReader, MotionSample
-from skinware.tactile.source_reader import SourceReader
+from skinware.tactile.source_service import SourceReader
 
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _COUNT_EVERY_NS = NS_PER_S // 10

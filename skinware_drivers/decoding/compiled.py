@@ -43,10 +43,10 @@ class CompiledLayouts:
         cycles: those of all layouts.
         width: number of values of every update.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
-        header: a payload byte and a table (256, lengths) of kinds; None if more than one byte tells kinds apart.
+        header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.
 
     Raises:
-        ConfigurationError: the buses have more kinds of frame than can be told apart.
+        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(
@@ -130,7 +130,6 @@ class CompiledLayouts:
         self.width = width
 
     def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
-        """What an update that is made of some kinds of frame can be of."""
         modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
         declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
         longest_s = max([*declared_s, period_s])
@@ -138,7 +137,7 @@ class CompiledLayouts:
         return Carrier(sorted(modules), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
-        """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
+        """Return a payload byte and a table over it and the length, if they determine the kind (a fast case)."""
         conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self.frames]
         if not conditions or not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
             return None
@@ -149,6 +148,6 @@ class CompiledLayouts:
         offset = conditions[0][0].offset
         table = np.full((256, self.length_ok.shape[1]), NO_KIND, np.uint8)
         for number, (frame, condition) in enumerate(zip(self.frames, conditions, strict=True)):
-            # what lies behind the end of a payload means nothing
+            # bytes behind the end of a payload have no meaning
             table[condition[0].value, [length for length in frame.length if length > offset]] = number
         return offset, table

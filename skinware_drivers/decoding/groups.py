@@ -20,11 +20,11 @@ Indices = npt.NDArray[np.int64]
 
 
 class Carrier(NamedTuple):
-    """What makes one update: a kind of frame by itself, or a cycle.
+    """A kind of frame by itself, or a cycle: it makes one update.
 
     Attributes:
-        modules: that it can be of.
-        channels: of which it has values.
+        modules: that it can fill.
+        channels: for which it has values.
         period_s: nominal time between two of them; None: the driver's.
     """
 
@@ -37,11 +37,11 @@ class Groups:
     """The update groups of a skin.
 
     Args:
-        tables: the skin; groups that it has are replaced.
-        carriers: all that make updates.
+        tables: the skin; its groups are replaced.
+        carriers: all kinds and cycles that make updates.
 
     Attributes:
-        tables: the same skin with its groups.
+        tables: the same skin with the groups.
         of_carrier: for each carrier (n_modules + 1, most) int64, groups that an update of a module belongs to;
             ``n_groups``: none.
     """
@@ -81,7 +81,7 @@ class Groups:
             self.of_carrier.append(table)
 
     def _divide(self, module: int, carriers: Sequence[Carrier]) -> list[tuple[tuple[int, ...], Indices]]:
-        """The groups of a module: which carriers update each, and its sensors."""
+        """Return the groups of a module: the carriers that update each, and its sensors."""
         mine = self._carriers_of[module]
         sensors = np.arange(self._tables.structure.n_sensors)[self._tables.structure.module_index(module)]
         if len(mine) < 2:
@@ -91,7 +91,7 @@ class Groups:
         for sensor in sensors.tolist():
             carried_by = tuple(number for number in mine if channel_of[sensor] in carriers[number].channels)
             found.setdefault(carried_by, []).append(sensor)
-        never = found.pop((), [])  # of no frame: they stay "never seen" in any group
+        never = found.pop((), [])  # no frame has them: they stay "never seen" in any group
         for number in mine:
             if not any(number in carried_by for carried_by in found):
                 found[(number,)] = []  # it has values of no sensor

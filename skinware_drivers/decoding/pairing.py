@@ -1,4 +1,4 @@
-"""Join the frames of a cycle to updates, in order or by a counter."""
+"""Join the frames of a cycle into updates, in order or by a counter."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.decoding.punctuality import Punctuality
-from skinware_drivers.decoding.sequences import read_numbers
 from skinware_drivers.description import SkinTables
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.layout import Cycle, Frame
-from skinware_drivers.numbering import SequenceNumber
 
 Indices = npt.NDArray[np.int64]
 Places = npt.NDArray[np.uint8]
@@ -25,15 +25,15 @@ Groups = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """What became of the members of a cycle in one batch.
+    """The members of a cycle in one batch: whole cycles, orphans, and frames that wait.
 
     Attributes:
         rows: (n, members) rows of whole cycles, in the order of the members; or all the same row, of an orphan: a
             frame that will never be part of a cycle. In order of arrival of the last row of each.
         whole: (n,) bool, which of them are whole.
-        late: first rows of cycles that took too long, or came out of the device's rhythm (their rows are orphans too).
+        late: first rows of cycles that took too long, or broke the device's rhythm (their rows are orphans too).
         waiting: rows that may become a cycle with what comes next, ascending.
-        soon: rows that came too soon after those before them to be told from them (orphans too).
+        soon: rows that came too soon after those before them to be distinguished (orphans too).
     """
 
     rows: Indices
@@ -47,9 +47,9 @@ class Pairing:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: what makes one.
+        cycle: its declaration.
         places: (256,) place in the cycle of each kind of frame; ``n`` = not a member.
-        punctuality: for cycles without a counter, what tells them apart; None: nothing does but order and age.
+        punctuality: separates cycles without a counter; None: only order and age do.
     """
 
     def __init__(self, cycle: Cycle, places: Places, punctuality: Punctuality | None = None) -> None:
@@ -65,9 +65,9 @@ class Pairing:
         """Find the members of cycles that follow each other without another frame of their group in between.
 
         Args:
-            shared: (m,) what the members of a cycle have in common, where ``is_module``: the module; with a counter,
-                the module and its number together.
-            group: (m,) what frames must follow each other in: the patch, or the module.
+            shared: (m,) equal for the members of a cycle, where ``is_module``: the module; with a counter, the module
+                and its number together.
+            group: (m,) the patch, or the module, in which frames must follow each other.
             kind: (m,) kind of each frame.
             time_ns: (m,) stamps.
             is_module: (m,) bool: the frame is one of a known module.
@@ -122,7 +122,7 @@ class Pairing:
         return Pairs(rows, by_arrival < len(last), order[late], np.sort(order[waiting]), order[soon & is_orphan])
 
     def _find_begun(self, shared: Indices, place: Places) -> Flags:
-        """(m,) bool: right before a member stand all those that come before it in the given order."""
+        """Return (m,) bool: all members that precede this one in the given order stand right before it."""
         at = np.arange(len(place))
         follows = np.zeros(len(place), bool)
         follows[1:] = (place[1:] == place[:-1] + 1) & (shared[1:] == shared[:-1])
@@ -130,7 +130,7 @@ class Pairing:
         return (place < self._n) & (at - place >= chain)
 
     def _trust(self, starts: Indices, out_of_time: Flags, doubtful: Flags) -> tuple[Indices, Indices]:
-        """Of the cycles that begin there, those that can be trusted; and those whose frames came out of time."""
+        """Divide cycles, given by their first rows, into trusted ones and those whose frames came out of time."""
         out, doubts = (np.append(0, np.cumsum(flags)) for flags in (out_of_time, doubtful))
         untrusted = out[starts + self._n] > out[starts]
         untrusted |= doubts[starts + self._n] - doubts[starts] == self._n
@@ -139,10 +139,10 @@ class Pairing:
     def _find_cycles(
         self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags
     ) -> tuple[Indices, Indices]:
-        """First rows of runs of n frames that are a whole cycle, in an order that is not given; they can overlap.
+        """Return first rows of runs of n frames that are a whole cycle, if the order is not given; they can overlap.
 
         Returns:
-            Those that can be trusted; and those whose frames came out of time.
+            Trusted ones, and those whose frames came out of time.
         """
         n = self._n
         m = max(0, len(shared) - n + 1)
@@ -166,7 +166,7 @@ class Pairing:
         return np.array(chosen, np.int64)
 
     def _still_hoping(self, shared: Indices, place: Places, ends: Indices, used: npt.NDArray[np.bool_]) -> Indices:
-        """Rows at the end of each group that may become a cycle with what comes next, in an order that is not given."""
+        """Return rows at the end of each group that may become a cycle with the next frames, in any order."""
         n = self._n
         ends = ends[(place[ends] < n) & ~used[ends]]
         if not len(ends):
@@ -198,7 +198,7 @@ class CompiledCycle:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: what makes one.
+        cycle: its declaration.
         frames: all kinds of frame.
         members: the numbers of its members among them, in order.
         assembly: reads them.
@@ -208,7 +208,7 @@ class CompiledCycle:
     Attributes:
         members: as given.
         assembly: as given.
-        sequence: of which member the sequence numbers are compared, and where they are; None: none has one.
+        sequence: the member whose sequence numbers are compared, and their place; None: there are none.
     """
 
     def __init__(
@@ -263,6 +263,6 @@ class CompiledCycle:
         return self.pairing.find(shared, self.group_of_entry[entry], kind, time_ns, is_module, severed)
 
     def forget(self, modules: Indices) -> None:
-        """These modules have restarted: their rhythm begins anew."""
+        """Forget the rhythm of modules that have restarted."""
         if self.punctuality is not None:
             self.punctuality.forget(modules)

@@ -1,15 +1,15 @@
-"""Whether frames come when they should: what tells cycles apart where no counter does.
+"""Judge whether frames come in time, to separate cycles that have no counter.
 
-Two halves of different cycles come within the maximum age of each other only if the first was held up, by a period less
-that age or longer. So it matters how long after the frame of its kind before each frame of a cycle comes:
+Two halves of different cycles come within the maximum age of each other only if the first was held up by at least a
+period minus that age. So each frame is judged by the time since the frame of its kind before:
 
 * within the maximum age: the sender catches up, and two of its cycles fit into that age;
-* about a period: as it should be, as long as it is less than that half would need;
-* about two periods, or three, and so on: those before were lost, or this one was held up;
-* anything else: it was held up.
+* about a period: in time, up to the delay that such a half would need;
+* about two or more periods: frames before were lost, or this one was held up;
+* otherwise: this one was held up.
 
-A cycle is one if none of its frames comes soon or was held up, and at least one comes as it should. (In an order that
-is not given, all of them must: there, the end of a cycle and the beginning of the next look like one.)
+Frames are a cycle if none comes soon or was held up, and at least one comes in time. (If the order is not given, all
+must come in time: there, the end of a cycle and the beginning of the next look like one.)
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Flags = npt.NDArray[np.bool_]
 
 _NEVER_NS = -(1 << 62)
 _MARGIN = 8
-"""Of the time by which a frame may be early or late, this part is left for what lies between two frames of a cycle."""
+"""One part in so many of the time by which a frame may be early or late is left for the spacing inside a cycle."""
 
 
 class Judgement(NamedTuple):
-    """How frames come.
+    """How frames come, compared with those of their kind before.
 
     Attributes:
         soon: (m,) bool: within the maximum age of the one before.
@@ -50,8 +50,8 @@ class Punctuality:
     """When each kind of frame of each module came last, and how long after the one before.
 
     Args:
-        cycle: what the frames are members of.
-        period_s: nominal time from one cycle of a module to the next; modules that are slower all the time may be.
+        cycle: of the frames.
+        period_s: nominal time from one cycle of a module to the next; a module may always be slower.
         n_modules: number of modules.
     """
 
@@ -66,7 +66,7 @@ class Punctuality:
         self.spacings_ns = np.full(n_modules * self._n, self.period_ns, np.int64)
 
     def judge(self, kind: Indices, time_ns: Indices) -> Judgement:
-        """Tell how frames come.
+        """Judge frames.
 
         Args:
             kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
@@ -91,7 +91,7 @@ class Punctuality:
         return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
 
     def remember(self, kind: Indices, time_ns: Indices, spacing_ns: Indices) -> None:
-        """These frames have come, in this order, and will not be judged again."""
+        """Remember frames that came in this order and are not judged again."""
         self.spacings_ns[kind] = spacing_ns
         self.last_ns[kind] = time_ns
 

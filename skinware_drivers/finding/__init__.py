@@ -1,1 +1,1 @@
-"""What is plugged in, what is heard on it, and who has it: the knowledge behind ``skin-find`` and ``skin-config``."""
+"""Find devices, their traffic and the programs that use them, for ``skin-find`` and ``skin-config``."""

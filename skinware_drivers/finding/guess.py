@@ -1,4 +1,4 @@
-"""Count what is heard on a CAN bus, and guess whose frames these are by the layouts of all drivers."""
+"""Count the frames on a CAN bus, and find the drivers whose layouts know them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ _CLASS_BITS = 8
 
 @dataclass(frozen=True)
 class IdentifierClass:
-    """Identifiers that begin alike.
+    """Identifiers with the same first digit.
 
     Attributes:
         name: ``4xx``: 11-bit identifiers 400 to 4FF; ``29-bit``: all of those.
-        first: lowest one that was heard.
-        last: highest one that was heard.
-        identifiers: how many different ones.
-        frames: how many frames.
+        first, last: the lowest and the highest that was heard.
+        identifiers: number of different identifiers.
+        frames: number of frames.
     """
 
     name: str
@@ -45,10 +44,10 @@ class IdentifierClass:
 
 
 class Traffic:
-    """Frames as they come; give :meth:`take` to whoever reads the bus.
+    """The frames of a bus; give :meth:`take` to the reader of the bus.
 
     Attributes:
-        frames: how many there were.
+        frames: number of frames.
     """
 
     def __init__(self) -> None:
@@ -64,7 +63,7 @@ class Traffic:
             self._kept += len(wire)
 
     def wire(self) -> npt.NDArray[Any]:
-        """(n,) rows of ``wire_dtype``: the frames, the first 131072 or so of very many."""
+        """Return (n,) rows of ``wire_dtype``: the frames, at most about the first 131072."""
         return np.concatenate(self._wire) if self._wire else FrameBatch(0).wire
 
     def classes(self) -> list[IdentifierClass]:
@@ -79,7 +78,7 @@ class Traffic:
         return found
 
     def heard(self) -> dict[Heard, int]:
-        """What drivers tell frames apart by when they listen, and how often it was heard."""
+        """Return identifier, first byte and length of the frames, by which listening drivers know them, with counts."""
         wire = self.wire()
         rows = zip(wire["identifier"].tolist(), wire["payload"][:, 0].tolist(), wire["length"].tolist(), strict=True)
         counts: dict[Heard, int] = {}
@@ -97,10 +96,10 @@ class Guess:
 
     Attributes:
         driver: its name.
-        frames: how many of them.
+        frames: number of frames that it knows.
         share: of all frames, 0 to 1.
-        patches: what they would be, as the driver calls them.
-        likely: no driver that explains these frames better; False: a possibility.
+        patches: names of their patches.
+        likely: no other driver explains these frames better; False: a possibility.
     """
 
     driver: str
@@ -120,14 +119,14 @@ class _Match:
 
 
 def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[AnyAdapter]]:
-    """Drivers for a kind of bus, by name.
+    """Return drivers for a kind of bus, by name.
 
     Args:
         medium: kind of bus, ``can``.
-        only: those in question, as ``load_driver`` takes them; none: all that are registered and can be loaded.
+        only: drivers, as ``load_driver`` takes them; none: all that are registered and can be loaded.
 
     Raises:
-        ConfigurationError: one of ``only`` is not there, or cannot be loaded.
+        ConfigurationError: one of ``only`` does not exist, or cannot be loaded.
     """
     found = {short_name(name): load_driver(name) for name in only}
     for name in () if only else sorted(registered(DRIVERS)):
@@ -137,15 +136,15 @@ def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[Any
 
 
 async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]) -> list[Guess]:
-    """Which drivers know what was heard, the most likely first.
+    """Return the drivers that know the frames, the most likely first.
 
-    A driver knows a frame if identifier, length and constant bytes are right, and of those that only count together
-    all have come. Where several know the same frames, the one that asks for more wins.
+    A driver knows a frame if identifier, length and constant bytes are right, and all frames of its cycle were heard.
+    If several know the same frames, the one with more constant bits wins.
 
     Args:
-        traffic: what was heard.
-        bus: on which bus; only its name is used.
-        drivers: those in question.
+        traffic: the frames.
+        bus: the bus; only its name is used.
+        drivers: to choose from.
     """
     wire = traffic.wire()
     adapters = {
@@ -164,12 +163,12 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
 
 
 async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list[Patch]:
-    """The patches of one driver that were heard, as it describes them; nothing is sent.
+    """Return the patches of one driver that were heard, as it describes them; nothing is sent.
 
     Args:
-        traffic: what was heard.
-        bus: on which bus; only its name is used.
-        adapter: the driver's object.
+        traffic: the frames.
+        bus: the bus; only its name is used.
+        adapter: the driver's adapter.
     """
     match = _match(type(adapter).__name__, adapter, traffic.wire())
     if match is None:
@@ -178,7 +177,7 @@ async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list
 
 
 def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """(n,) bool: which frames are of a kind."""
+    """Return (n,) bool: the frames of a kind."""
     identifier, payload, length = wire["identifier"], wire["payload"], wire["length"]
     match = np.isin(length, list(frame.length))
     match &= ((identifier & EXTENDED_FLAG) != 0) == frame.extended
@@ -194,7 +193,7 @@ def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]
 
 
 def with_default_options(driver: type[AnyAdapter]) -> AnyAdapter | None:
-    """A driver's object with default options; None if it has options that must be given."""
+    """Return a driver's adapter with default options; None if it has options without a default."""
     try:
         return driver(driver.Options())
     except (TypeError, ConfigurationError):
@@ -202,7 +201,7 @@ def with_default_options(driver: type[AnyAdapter]) -> AnyAdapter | None:
 
 
 def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | None:
-    """How much a driver knows; None if nothing, or if it only learns from the hardware what frames mean."""
+    """Return the frames that a driver knows; None if there is none, or if its layout depends on the hardware."""
     layout: Layout | None = getattr(adapter, "layout", None)
     if layout is None or not len(wire):
         return None
@@ -229,7 +228,7 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
 
 
 def _has_no_values(frame: Frame) -> bool:
-    """Whether it says nothing of a skin: such frames are known only beside those that do."""
+    """Return whether a frame has no values of sensors: alone, it does not make a patch."""
     return not isinstance(frame.values, Expand) and not any(values.count for values in frame.runs)
 
 
@@ -241,12 +240,12 @@ def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray
 
 
 def _constant_bits(frame: Frame) -> int:
-    """How much a kind of frame asks for."""
+    """Return the number of bits that a kind of frame requires."""
     return sum((condition.mask & 0x1FFF_FFFF).bit_count() for condition in frame.when)
 
 
 class _Replay(Link):
-    """A driver's link to what was heard already: it listens without waiting, and cannot send."""
+    """A driver's link to recorded frames: it listens without waiting, and cannot send."""
 
     def __init__(self, bus: Bus, heard: dict[Heard, int]) -> None:
         super().__init__(bus)
@@ -257,7 +256,7 @@ class _Replay(Link):
         return True
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = 0.0) -> None:  # noqa: ARG002
-        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: this bus only replays a recording")
+        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: recorded frames cannot be answered")
 
     async def listen(self, duration_s: float) -> Counter[Heard]:
         del duration_s
@@ -269,13 +268,13 @@ class _Replay(Link):
 
 
 async def _names(match: _Match, bus: Bus, heard: dict[Heard, int]) -> tuple[str, ...]:
-    """What the driver itself would call the patches that were heard."""
+    """Return the driver's names of the patches that were heard."""
     names = {patch.key: patch.name for patch in await _describe(match.adapter, bus, heard)}
     return tuple(names.get(key, f"patch {key}") for key in sorted(match.keys))
 
 
 async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
-    """What a driver that only listens would make of what was heard."""
+    """Return the patches that a listening driver would describe."""
     try:
         return await asyncio.wait_for(adapter.describe(_Replay(bus, heard)), _NAMING_S)
     except (BusError, TimeoutError):

@@ -34,23 +34,23 @@ NO_INTERFACE = (
 
 @dataclass(frozen=True)
 class CanInterface:
-    """One interface.
+    """A CAN interface of the kernel.
 
     Attributes:
         name: ``can0``.
-        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` where iproute2 is missing.
-        driver: kernel driver of the hardware, empty without.
+        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` without iproute2.
+        driver: kernel driver of the hardware; empty: none.
         up: it is set up.
-        carrier: what the kernel calls its operational state: ``up``, ``down``, ``unknown``.
-        bit_rate: bit/s of the arbitration phase; None: not set, has none, or not known.
+        carrier: operational state of the kernel: ``up``, ``down``, ``unknown``.
+        bit_rate: bit/s of the arbitration phase; None: not set, or unknown.
         data_bit_rate: of the data phase of CAN FD.
         sample_point: 0 to 1.
-        state: of the controller: ``ERROR-ACTIVE``, ``ERROR-PASSIVE``, ``BUS-OFF``, ``STOPPED`` ...; empty: not known.
-        restart_ms: pause before it comes back from bus-off by itself; 0: it does not; None: not known.
-        is_fd: frames of CAN FD can pass.
-        queue_length: frames that wait for the wire at most, in the kernel.
-        statistics: what went through, as the kernel counts it.
-        controller_errors: ``bus_error``, ``arbitration_lost``, ``error_passive``, ``bus_off`` ...; of controllers.
+        state: of the controller: ``ERROR-ACTIVE``, ``ERROR-PASSIVE``, ``BUS-OFF``, ``STOPPED`` ...; empty: unknown.
+        restart_ms: pause before it restarts after bus-off; 0: it does not; None: unknown.
+        is_fd: it passes frames of CAN FD.
+        queue_length: most frames that wait for the wire in the kernel.
+        statistics: counters of the kernel.
+        controller_errors: counters of the controller: ``bus_error``, ``arbitration_lost``, ``bus_off`` ...
     """
 
     name: str
@@ -69,24 +69,26 @@ class CanInterface:
     controller_errors: dict[str, int] = field(default_factory=dict)
 
     def advice(self) -> list[str]:
-        """What to do so that it works, a line each; empty if it does."""
-        name, told = self.name, []
+        """Return what to do so that it works, a line each; empty if it works."""
+        name, lines = self.name, []
         if not self.up and self.kind == "can" and self.bit_rate is None:
-            told.append(
+            lines.append(
                 f"down: sudo ip link set {name} type can bitrate 1000000 restart-ms 100; sudo ip link set {name} up"
             )
         elif not self.up:
-            told.append(f"down: sudo ip link set {name} up")
+            lines.append(f"down: sudo ip link set {name} up")
         if self.state == "BUS-OFF":
-            told.append("off the bus after too many errors in sending: check wires, termination and bit rate")
+            lines.append("off the bus after too many errors while sending: check wires, termination and bit rate")
             if not self.restart_ms:
-                told.append(
+                lines.append(
                     f"it stays off until: sudo ip link set {name} down; sudo ip link set {name} type can"
                     f" restart-ms 100; sudo ip link set {name} up"
                 )
         elif self.state in ("ERROR-PASSIVE", "ERROR-WARNING"):
-            told.append("many errors on the wire: check wires, termination, bit rate, and that another device is there")
-        return told
+            lines.append(
+                "many errors on the wire: check wires, termination, bit rate, and that another device is on it"
+            )
+        return lines
 
 
 def kernel_has_can() -> bool:
@@ -102,21 +104,21 @@ def can_interfaces(
     links: dict[str, dict[str, Any]] | None = None,
     controller: Callable[[str], Controller | None] = read_controller,
 ) -> list[CanInterface]:
-    """All CAN interfaces, by name.
+    """Return all CAN interfaces, by name.
 
     Args:
-        root: where sysfs is.
-        links: what iproute2 says of each interface; default: it is asked.
-        controller: tells bit rate and state where iproute2 does not.
+        root: of sysfs.
+        links: output of iproute2 for each interface; default: run it.
+        controller: reads bit rate and state without iproute2.
     """
-    told = ask_iproute2() if links is None else links
+    known = ask_iproute2() if links is None else links
     folders = sorted((root / "class/net").glob("*"))
-    found = [_interface(folder, told.get(folder.name, {})) for folder in folders if _is_can(folder)]
-    return [one if told else _with_controller(one, controller(one.name)) for one in found]
+    found = [_interface(folder, known.get(folder.name, {})) for folder in folders if _is_can(folder)]
+    return [one if known else _with_controller(one, controller(one.name)) for one in found]
 
 
 def ask_iproute2() -> dict[str, dict[str, Any]]:
-    """What ``ip`` says of all interfaces; empty if it is missing or too old for JSON."""
+    """Return the output of ``ip`` for all interfaces; empty if it is missing or too old for JSON."""
     command = shutil.which("ip") or shutil.which("ip", path=_SYSTEM_PATH)
     if command is None:
         return {}
@@ -132,7 +134,6 @@ def _is_can(folder: Path) -> bool:
 
 
 def _with_controller(one: CanInterface, controller: Controller | None) -> CanInterface:
-    """What our own question to the kernel told added."""
     if controller is None:
         return one
     known = controller.state is not None and controller.state < len(_STATES)
@@ -172,7 +173,7 @@ def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
 def _text(path: Path) -> str:
     try:
         return path.read_text().strip()
-    except OSError:  # gone meanwhile, or not told
+    except OSError:  # gone meanwhile, or unknown
         return ""
 
 
@@ -184,7 +185,7 @@ def _number(path: Path, base: int = 10) -> int | None:
 
 
 _NOT_ASKED = ("socketcan", "serial", "virtual", "udp_multicast", "socketcand")
-"""Looked at otherwise, no adapters, or (socketcand) waits four seconds for who may announce himself in the network."""
+"""Found in other ways, not adapters, or (socketcand) a search of four seconds in the network."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ class CanAdapterFound:
 
     Attributes:
         bus: its name for ``--bus``: ``kvaser:0``.
-        details: what else the library told.
+        details: other facts from its library.
     """
 
     bus: str
@@ -202,11 +203,11 @@ class CanAdapterFound:
 
 @dataclass(frozen=True)
 class Detection:
-    """What python-can found.
+    """The adapters that python-can found.
 
     Attributes:
         found: adapters.
-        problem: what went wrong, empty if nothing did.
+        problem: an error, else empty.
     """
 
     found: list[CanAdapterFound] = field(default_factory=list)
@@ -214,7 +215,7 @@ class Detection:
 
 
 def detect_adapters(timeout_s: float, command: list[str] | None = None) -> Detection:
-    """Ask all interfaces of python-can that can tell.
+    """Search with all interfaces of python-can that can.
 
     Args:
         timeout_s: longest time for all of them.
@@ -242,13 +243,13 @@ def detect_adapters(timeout_s: float, command: list[str] | None = None) -> Detec
 
 
 def _read(output: str) -> tuple[list[CanAdapterFound], str, bool]:
-    """Adapters, the interface that was asked last, and whether all were asked. Libraries may print what they like."""
+    """Return the adapters, the interface that searched last, and whether the search ended; skip other output."""
     found: list[CanAdapterFound] = []
     asked = ""
     for line in output.splitlines():
         try:
-            told = json.loads(line)
-            asked, configs = told["asked"], told["configs"]
+            report = json.loads(line)
+            asked, configs = report["asked"], report["configs"]
         except (ValueError, TypeError, KeyError):
             continue
         if asked is None:
@@ -259,20 +260,20 @@ def _read(output: str) -> tuple[list[CanAdapterFound], str, bool]:
     return found, asked, False
 
 
-def _tell(asked: str | None, configs: list[dict[str, Any]]) -> None:
+def _report(asked: str | None, configs: list[dict[str, Any]]) -> None:
     sys.stdout.write(json.dumps({"asked": asked, "configs": configs}, default=str) + "\n")
     sys.stdout.flush()
 
 
 def main() -> None:
-    """Ask one interface after the other; tell which is asked before and what it found afterwards."""
+    """Search with one interface after the other; report each before it searches, and what it found."""
     import can
 
     for name in sorted(set(can.VALID_INTERFACES) - set(_NOT_ASKED)):
-        _tell(name, [])
-        _tell(name, [dict(config) for config in can.detect_available_configs(interfaces=[name])])
-    _tell(None, [])
-    os._exit(0)  # whatever threads and exit handlers the libraries have
+        _report(name, [])
+        _report(name, [dict(config) for config in can.detect_available_configs(interfaces=[name])])
+    _report(None, [])
+    os._exit(0)  # without the threads and exit handlers of the libraries
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Looks at the buses of this machine, and on request asks who is there."""
+"""Listen to buses, and ask which devices are on them."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _IDENTIFY_S = 5.0
 
 @dataclass(frozen=True)
 class HeardOnBus:
-    """What was heard on a CAN bus.
+    """The traffic of a CAN bus.
 
     Attributes:
         bus: its name.
-        problem: why it could not be listened to; empty if it could.
-        duration_s: how long.
-        frames: how many frames.
-        rate_hz: how many a second.
-        load: how much of the bus' time they took, 0 to 1; None where the bit rate is not known.
-        error_frames: what the controller told of errors.
-        trouble: what is wrong with the bus, as far as its controller tells: ``error-passive``; empty if nothing is.
-        lost: frames that were not taken in time.
-        classes: identifiers.
-        guesses: which drivers know them.
+        problem: the reason why it cannot be read; else empty.
+        duration_s: time of listening.
+        frames: number of frames.
+        rate_hz: frames per second.
+        load: share of the bus' time, 0 to 1; None: the bit rate is unknown.
+        error_frames: number of error frames.
+        trouble: state of the controller if something is wrong: ``error-passive``.
+        lost: number of frames that were read too late.
+        classes: of the identifiers.
+        guesses: drivers that know the frames.
     """
 
     bus: str
@@ -54,14 +54,14 @@ class HeardOnBus:
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back when a bus was asked.
+    """The answers on a bus.
 
     Attributes:
         bus: its name.
         asked: drivers that asked.
-        answers: what they made of it, by driver.
-        problems: what went wrong in asking, by driver.
-        refused: why nobody was asked; empty if somebody was.
+        answers: devices in words, by driver.
+        problems: errors, by driver.
+        refused: the reason why no driver asked; else empty.
     """
 
     bus: str
@@ -76,24 +76,24 @@ async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[An
 
     Args:
         bus_name: as for ``--bus``.
-        duration_s: how long.
-        drivers: those that may know the frames.
+        duration_s: time of listening.
+        drivers: that may know the frames.
 
     Raises:
-        ConfigurationError: that cannot be the name of a bus.
+        ConfigurationError: this is not the name of a bus.
     """
     bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     return await listen_on(bus, bus_name, duration_s, drivers)
 
 
 async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
-    """As :func:`listen`, on a bus that is made already."""
+    """Listen as :func:`listen` does, to a bus that is made already."""
     traffic, bits_before = Traffic(), bus.wire_bits
     try:
         async with attended(bus, traffic.take):
             begun_ns = now_ns()
             await asyncio.sleep(duration_s)
-            passed_ns = now_ns() - begun_ns  # on a busy machine, more than was asked for
+            passed_ns = now_ns() - begun_ns  # more than the duration on a busy machine
             reason = bus.reason(now_ns())
     except BusNotAvailable as error:
         return HeardOnBus(bus_name, str(error))
@@ -114,16 +114,16 @@ async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping
 async def ask(
     heard: HeardOnBus, drivers: Mapping[str, type[AnyAdapter]], *, force: bool = False, owner: str = ""
 ) -> Answer:
-    """Ask who is on a CAN bus, as far as that disturbs nobody.
+    """Ask which devices are on a CAN bus, without disturbing any.
 
-    On a silent bus all drivers ask. Where something sends, only those that know it, and only what harms no device
-    that is sending. A bus that a running driver has, and one with frames that nobody knows, are left alone.
+    On a silent bus all drivers ask. If frames are heard, only the drivers that know them ask, and only questions that
+    are harmless for devices that send. A bus of a running driver, and one with unknown frames, are left alone.
 
     Args:
-        heard: what was heard on the bus just now.
-        drivers: those that may ask.
-        force: ask in spite of all that, and as if nobody were sending.
-        owner: who has the bus, if somebody has.
+        heard: the traffic just now.
+        drivers: that may ask.
+        force: ask all questions in any case.
+        owner: the running driver of the bus, in words; empty: none.
     """
     if heard.problem:
         return Answer(heard.bus, refused=heard.problem)
@@ -132,7 +132,7 @@ async def ask(
     meant = {name: driver for name, driver in drivers.items() if idle or name in known}
     asking = {name: driver for name, driver in meant.items() if can_ask(driver)}
     if not force and owner:
-        return Answer(heard.bus, refused=f"{owner} has it; ask that: skin-config")
+        return Answer(heard.bus, refused=f"{owner} has it; use skin-config to ask through that driver")
     if not meant:
         return Answer(
             heard.bus, refused="no driver knows what is sending there, so a request could mean anything to it"
@@ -143,11 +143,11 @@ async def ask(
 
 
 async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer:
-    """Ask who is on a serial port, one driver after the other; opening it resets some microcontrollers.
+    """Ask which device is on a serial port, one driver after the other; opening it resets some microcontrollers.
 
     Args:
         path: of the port; or the name of a bus over a network, or of Modbus.
-        drivers: those that may ask, of serial devices or of Modbus.
+        drivers: that may ask, for serial devices or for Modbus.
     """
     asked: list[str] = []
     answers: dict[str, str] = {}
@@ -164,21 +164,21 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
             bus_name = path if BusName.of(path).is_only_asked else f"{kind}:{path}"
             bus = make_bus(bus_name, payload_size=adapter.payload_size)
             adapter.fit(bus)
-            told = await _ask_all(bus, path, {name: driver}, idle=False)
-        except ConfigurationError as error:  # say, a baud rate that the port cannot do
+            answer = await _ask_all(bus, path, {name: driver}, idle=False)
+        except ConfigurationError as error:  # such as a baud rate that the port does not have
             problems[name] = str(error)
             continue
-        if told.refused:
-            return told
+        if answer.refused:
+            return answer
         asked.append(name)
-        answers.update(told.answers)
-        problems.update(told.problems)
-    nobody = "no installed driver has a harmless question for serial devices"
-    return Answer(path, asked, answers, problems, "" if asked or problems else nobody)
+        answers.update(answer.answers)
+        problems.update(answer.problems)
+    none = "no installed driver has a harmless question for serial devices"
+    return Answer(path, asked, answers, problems, "" if asked or problems else none)
 
 
 def can_ask(driver: type[AnyAdapter]) -> bool:
-    """Whether a driver knows a question that harms nobody."""
+    """Return whether a driver has a harmless question."""
     return inspect.getattr_static(driver, "identify") is not inspect.getattr_static(Adapter, "identify")
 
 
@@ -188,16 +188,16 @@ async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapte
         async with attended(bus) as link:
             for name, driver in drivers.items():
                 try:
-                    told = await asyncio.wait_for(driver.identify(link, idle=idle), _IDENTIFY_S)
+                    answer = await asyncio.wait_for(driver.identify(link, idle=idle), _IDENTIFY_S)
                 except HandshakeTimeout:
                     continue
                 except BusError as error:
                     problems[name] = str(error)
                 except TimeoutError:
-                    problems[name] = f"did not come to an end within {_IDENTIFY_S:g} s"
+                    problems[name] = f"did not end within {_IDENTIFY_S:g} s"
                 else:
-                    if told:
-                        answers[name] = told
+                    if answer:
+                        answers[name] = answer
     except BusNotAvailable as error:
         return Answer(bus_name, refused=str(error))
     return Answer(bus_name, list(drivers), answers, problems)

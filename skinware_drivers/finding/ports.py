@@ -1,4 +1,4 @@
-"""Find serial ports, who may open them and who has, and write udev rules for them."""
+"""Find serial ports, their permissions and users, and write udev rules for them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pathlib import Path
 from skinware_drivers.serial.opening import group_that_may
 
 SLOW_LATENCY_MS = 1
-"""A latency timer above this holds back what a device has sent: FTDI's default is 16 ms."""
+"""A latency timer above this holds data back: FTDI's default is 16 ms."""
 _UNKNOWN_UART = "0"
 _NO_HARDWARE = "serial-base"
-"""Subsystem of devices that the kernel has put between a port and its hardware since 6.5."""
+"""Subsystem of the devices between a port and its hardware, since kernel 6.5."""
 
 
 @dataclass(frozen=True)
 class UsbIdentity:
-    """What a USB device says of itself.
+    """The identity of a USB device.
 
     Attributes:
         vendor_id: ``0403``.
@@ -29,8 +29,8 @@ class UsbIdentity:
         serial_number: empty if it has none.
         manufacturer: in words.
         product: in words.
-        place: where it is plugged in: ``1-1.2``.
-        interface: number of its interface that the port is: ``00``.
+        place: USB socket: ``1-1.2``.
+        interface: number of the port's interface: ``00``.
     """
 
     vendor_id: str
@@ -52,19 +52,19 @@ class User:
 
 @dataclass(frozen=True)
 class SerialPort:
-    """One port.
+    """A serial port.
 
     Attributes:
         path: ``/dev/ttyUSB0``.
         driver: of the kernel: ``ftdi_sio``, ``cdc_acm``.
-        usb: None for a port that is not on USB.
-        links: other names that stay the same when ports are numbered anew.
+        usb: None: the port is not on USB.
+        links: other names, which do not change with the order of plugging in.
         may_open: this user may read and write.
-        group: whose members may, empty if none is.
-        in_group: this user is a member of it, if perhaps not yet in this session.
-        users: who has it open.
-        users_known: all processes could be looked at; False: there may be other users.
-        latency_ms: how long the adapter holds data back, of FTDI; None: it has no such thing.
+        group: its members may open it; empty: none.
+        in_group: this user is a member, perhaps not yet in this session.
+        users: processes that have it open.
+        users_known: all processes could be examined; False: there may be other users.
+        latency_ms: latency timer of FTDI; None: it has none.
     """
 
     path: str
@@ -85,25 +85,25 @@ class SerialPort:
         return " ".join(part for part in (self.usb.manufacturer, self.usb.product) if part) or "USB serial device"
 
     def advice(self) -> list[str]:
-        """What to do so that it works well, a line each; empty if it does."""
-        told = []
+        """Return what to do so that it works well, a line each; empty if it does."""
+        lines = []
         if not self.may_open and self.in_group:
-            told.append(f"you may not open it yet: log out and in again, you are in group {self.group} since then")
+            lines.append(f"you may not open it yet: log out and in again, you are in group {self.group} since then")
         elif not self.may_open and self.group:
-            told.append(f"you may not open it: sudo usermod -aG {self.group} $USER, then log out and in again")
+            lines.append(f"you may not open it: sudo usermod -aG {self.group} $USER, then log out and in again")
         elif not self.may_open:
-            told.append("you may not open it: give it a group or uaccess by a udev rule (skin-find --udev)")
+            lines.append("you may not open it: give it a group or uaccess by a udev rule (skin-find --udev)")
         if self.latency_ms is not None and self.latency_ms > SLOW_LATENCY_MS:
-            told.append(
+            lines.append(
                 f"holds data back for up to {self.latency_ms} ms, unless a program asks it not to, as skin-driver does;"
                 " for all programs, a udev rule: skin-find --udev"
             )
-        return told
+        return lines
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where to look, so that tests can look elsewhere.
+    """The roots of the file systems to read, which tests replace.
 
     Attributes:
         sys: sysfs.
@@ -117,7 +117,7 @@ class Machine:
 
 
 def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
-    """All serial ports that have hardware, in the order of their numbers."""
+    """Return all serial ports with hardware, in the order of their numbers."""
     machine = machine or Machine()
     devices = {
         folder.name: (folder / "device").resolve()
@@ -134,7 +134,7 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
 
 
 def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | None:
-    """The port behind a path that is no hardware, as ``skin-emulate --bus pty:port`` makes it; None if it is none."""
+    """Return the pseudo terminal of a path, as ``skin-emulate --bus pty:port`` makes it; None if it is not one."""
     machine = machine or Machine()
     real = Path(path).resolve()
     if real.parent != machine.dev / "pts" or not real.is_char_device():
@@ -163,14 +163,14 @@ def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, .
 
 
 def _driver(device: Path) -> str:
-    """The kernel's driver of a port. Above built-in ones are two devices (port, ctrl) that say nothing of hardware."""
+    """Return the kernel's driver of a port; above built-in ones are two devices (port, ctrl) without hardware."""
     while (device / "subsystem").resolve().name == _NO_HARDWARE:
         device = device.parent
     return (device / "driver").resolve().name if (device / "driver").exists() else ""
 
 
 def _usb_identity(device: Path) -> UsbIdentity | None:
-    """The USB device that a port's device in sysfs is part of: port, interface, device."""
+    """Return the USB device above a port's device in sysfs: port, interface, device."""
     for folder in (device, *device.parents):
         if (folder / "idVendor").exists():
             return UsbIdentity(
@@ -202,7 +202,7 @@ def _user_name() -> str:
 
 
 def _links(machine: Machine, paths: set[Path]) -> dict[Path, tuple[str, ...]]:
-    """Links of the kinds that stay: by identity, by place, and our own."""
+    """Return the links by identity, by place, and from our rules, which do not change."""
     found: dict[Path, list[str]] = {}
     for folder in ("skin", "serial/by-id", "serial/by-path"):
         for link in sorted((machine.dev / folder).glob("*")):
@@ -212,7 +212,7 @@ def _links(machine: Machine, paths: set[Path]) -> dict[Path, tuple[str, ...]]:
 
 
 def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, ...]], bool]:
-    """Who uses the paths, and whether every process could be looked at."""
+    """Return the users of the paths, and whether every process could be examined."""
     found: dict[Path, list[User]] = {}
     all_seen = True
     for process in machine.proc.glob("[0-9]*"):
@@ -230,7 +230,7 @@ def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, .
 
 
 def _is_other_end(process: Path, path: Path) -> bool:
-    """Whether a process has made a pseudo terminal: it keeps it open for programs that come and go."""
+    """Return whether a process made a pseudo terminal, which it keeps open for other programs."""
     if path.parent.name != "pts":
         return False
     return any(f"tty-index:\t{path.name}" in _text(info).splitlines() for info in (process / "fdinfo").glob("*"))
@@ -259,12 +259,12 @@ _NO_LETTER = re.compile(r"[^A-Za-z0-9_.:-]")
 
 
 def shipped_rules() -> str:
-    """The rules for adapters that skins are usually connected by, as they come with this package."""
+    """Return the shipped rules for the usual adapters of skins."""
     return (files("skinware_drivers") / "data" / RULES_FILE).read_text()
 
 
 def rules_for(ports: Iterable[SerialPort]) -> str:
-    """A rules file for exactly these ports; ports that are not on USB keep their names anyway."""
+    """Return a rules file for these ports on USB; other ports always keep their names."""
     lines = []
     for port in ports:
         if port.usb is not None:
@@ -275,12 +275,12 @@ def rules_for(ports: Iterable[SerialPort]) -> str:
             ]
     if not lines:
         return ""
-    head = [f"# {PLACE}: serial skin hardware, names that stay", f"# then: {'; '.join(RELOAD)}"]
+    head = [f"# {PLACE}: fixed names of serial skin hardware", f"# then: {'; '.join(RELOAD)}"]
     return "\n".join([*head, *lines, ""])
 
 
 def link_of(usb: UsbIdentity) -> str:
-    """The name below /dev that a rule gives: by serial number, or where there is none by the USB socket."""
+    """Return the name below /dev that a rule gives: by serial number, or without one by the USB socket."""
     name = _NO_LETTER.sub("_", usb.serial_number or f"usb-{usb.place}")
     return f"skin/{name}" if usb.interface in ("", "00") else f"skin/{name}-if{usb.interface}"
 

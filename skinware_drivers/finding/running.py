@@ -1,4 +1,4 @@
-"""Which drivers run on this machine, and on which buses: nobody may send behind a driver's back."""
+"""Find the drivers that run on this machine, and their buses, so that no other program sends on these."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ class RunningDriver:
     """A driver whose process lives.
 
     Attributes:
-        name: under which programs find it.
-        namespace: where.
+        name, namespace: of the driver.
         driver_type: ``roboskin``.
         pid: of its process.
-        buses: as it was told them.
+        buses: as given to the driver.
     """
 
     name: str
@@ -44,7 +43,7 @@ class RunningDriver:
 
 
 def running_drivers() -> list[RunningDriver]:
-    """All living drivers in namespaces that this user may read."""
+    """Return all living drivers in namespaces that this user may read."""
     found = []
     for folder in sorted(ROOT.glob(f"{_PREFIX}*")):
         with contextlib.suppress(ConfigurationError, NamespaceError):

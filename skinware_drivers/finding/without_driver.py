@@ -1,4 +1,4 @@
-"""Look at and ask a bus that no driver has, and leave it as it was found."""
+"""Read and ask a bus without a running driver, and leave its devices as they were."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from skinware_drivers.options import nearest_name
 async def attended(bus: Bus, take: Callable[[FrameBatch], object] = lambda _batch: None) -> AsyncIterator[Link]:
     """Open a bus, read it until the end of the block, and close it.
 
-    A bus that goes away meanwhile is read no more: what is asked on it then gets no answer.
+    If the bus goes away meanwhile, requests on it get no answer.
 
     Args:
-        bus: not open yet.
-        take: called with everything that was read at once; the batch is used again afterwards.
+        bus: not opened yet.
+        take: called with each batch of frames, which is used again afterwards.
 
     Raises:
         BusNotAvailable: it cannot be opened.
@@ -73,27 +73,27 @@ async def carry_out(
     agree: Agree = lambda _patches: None,
     force: bool = False,
 ) -> Any:
-    """Do what an adapter declares, without a running driver.
+    """Carry out an operation of an adapter, without a running driver.
 
-    Where something is sending, another program is at work: only operations that change nothing are then carried out.
-    Nobody is asked to describe himself there: they get the patch that is meant if it was heard, else none. Devices
-    that were silent are silent again afterwards.
+    If frames are heard, another program is at work: then only operations that change nothing are carried out, and no
+    device is asked to describe itself; the operation gets the named patch if it was heard. Devices that were silent are
+    silent again afterwards.
 
     Args:
-        bus: not open.
+        bus: not opened yet.
         bus_name: for messages.
-        adapter: the driver's object for it.
-        operation: name.
-        arguments: of it; ``patch``: the only patch that is meant.
-        agree: called with the patches that are meant before anything is changed; may raise.
-        force: change things also where something is sending.
+        adapter: of the bus.
+        operation: its name.
+        arguments: of the operation; ``patch``: name of the only patch.
+        agree: called with the patches before anything is changed; may raise.
+        force: make changes even if frames are heard.
 
     Returns:
-        What the operation returns.
+        The result of the operation.
 
     Raises:
-        ConfigurationError: no such operation, patch or argument; the bus is in use, or another kind of bus.
-        BusError: it cannot be opened, nobody answers, or what the operation raises.
+        ConfigurationError: there is no such operation, patch or argument; the bus is in use, or of another kind.
+        BusError: the bus cannot be opened, no device answers, or the operation raises it.
     """
     declared = operations_of(type(adapter), alone=True)
     if operation not in declared:
@@ -124,7 +124,7 @@ async def carry_out(
             agree(patches)
         try:
             return await wanted.method(adapter, link, patches, **arguments)
-        except (TypeError, ValueError) as error:  # an argument of another type than it wants
+        except (TypeError, ValueError) as error:  # an argument of another type
             raise ConfigurationError(f"{operation}: {error}") from error
         finally:
             if wanted.sets_up and not is_live:

@@ -1,1 +1,1 @@
-"""An iCub's own files: what they say of its skin, in our terms."""
+"""Translate an iCub's own files on its skin."""

@@ -1,4 +1,4 @@
-"""Say what a part's ports, position files and drawings (skinGui) make of its boards."""
+"""Read position files and drawings of skinGui, and find the places and kinds of a part's triangles."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skinware_drivers.icub.xml_tree import number as whole_number
 
 _SENSORS = "[SENSORS]"
 Shape = tuple[str, tuple[int, ...]]
-"""Kind of a module, and its channels that feel no touch."""
+"""Kind of a module, and its channels that do not feel touch."""
 
 _KINDS: dict[str, Shape] = {
     "triangle": ("triangle", ()),
@@ -37,12 +37,12 @@ _NOT_USED = ("cardid", "CanDeviceName", "CanDeviceNum", "width", "height", "xpos
 
 @dataclass
 class Drawing:
-    """One file.
+    """A drawing of skinGui.
 
     Attributes:
-        path: of it.
+        path: of the file.
         part: the body part.
-        shapes: by triangle (16 per board, in the body part's own count), what it is; None where nobody here knows.
+        shapes: kinds of triangles, by number (16 per board, in the count of the body part); None: unknown.
     """
 
     path: Path
@@ -51,15 +51,15 @@ class Drawing:
 
 
 def is_drawing(text: str) -> bool:
-    """Whether a text looks like a drawing of skinGui."""
+    """Return whether a text looks like a drawing of skinGui."""
     return _SENSORS in text and "robotPart" in text
 
 
 def read_drawing(path: Path, notes: Notes) -> Drawing:
-    """Read a file; what is not understood is noted.
+    """Read a drawing; note lines that are not understood.
 
     Raises:
-        ConfigurationError: it is no drawing.
+        ConfigurationError: the file is not a drawing.
     """
     text = read_text(path)
     if not is_drawing(text):
@@ -91,7 +91,7 @@ def read_drawing(path: Path, notes: Notes) -> Drawing:
 
 
 def _take_sensor(drawing: Drawing, words: list[str]) -> str:
-    """Take one module; returns why not, if so."""
+    """Add a module; return why it cannot be used, or an empty text."""
     try:
         triangle = whole_number(words[1])
     except (IndexError, ValueError):
@@ -115,12 +115,12 @@ Place = tuple[int, int, int]
 
 @dataclass
 class Body:
-    """What is known of a part's triangles beside how they are set up.
+    """The kinds and places of a part's triangles.
 
     Attributes:
-        shapes: what triangles are; those of which it is not known are left out.
-        bare: triangles that are known to have no taxel.
-        drawn: triangles that a drawing shows, by name of the body part; only of parts without positions.
+        shapes: known kinds of triangles.
+        bare: triangles without a taxel.
+        drawn: triangles in a drawing, by name of the body part; only for parts without positions.
         groups: places of sensors, by triangle; their uid lack the bus.
     """
 
@@ -130,7 +130,7 @@ class Body:
     groups: dict[Place, list[GeometryGroup]] = field(default_factory=dict)
 
     def groups_of(self, patches: Sequence[int]) -> list[GeometryGroup]:
-        """The places on some patches, keyed as a driver does whose buses these are, in this order."""
+        """Return the places on some patches, with the keys of a driver that has these buses in this order."""
         return [
             msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
             for bus, patch in enumerate(patches)
@@ -212,7 +212,7 @@ def _group(port: Port, place: Place, type_name: str, frame: str, known: Mapping[
 
 
 def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
-    """What a triangle is by its channels that are no taxels; None: it has no taxel at all."""
+    """Return the kind of a triangle by its channels that are not taxels; None: it has no taxel."""
     if len(non_tactile) == CHANNELS:
         return None
     for kind, usual in NON_TACTILE.items():
@@ -241,13 +241,13 @@ def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Plac
 
 
 def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:
-    """Name what is drawn but off, and what is on but not drawn.
+    """Note triangles that are drawn but off, or on but not drawn.
 
     Args:
         body: of the part.
-        triangles: all places of each body part.
-        enabled: places that are switched on.
-        notes: takes it.
+        triangles: all triangles of each body part.
+        enabled: triangles that are switched on.
+        notes: takes the remarks.
     """
     for name, drawn in body.drawn.items():
         on = triangles.get(name, set()) & enabled
@@ -271,7 +271,7 @@ def places_text(places: Sequence[Place] | set[Place]) -> str:
 def regions_of(
     driver: str, places: Mapping[str, set[Place]], enabled: set[Place], patches: Sequence[int]
 ) -> list[Region]:
-    """A region for each body part of which something is switched on.
+    """Return a region for each body part with a triangle that is switched on.
 
     Args:
         driver: name of the driver of the device.
@@ -288,7 +288,7 @@ def regions_of(
             of_board = {place for place in enabled if place[:2] == (patch, board)}
             if boards[board] == 1 and of_board <= on:
                 by_name.add(board)
-            else:  # the name is not the board's alone, or the board not the part's
+            else:  # several boards have this name, or the part has not this board
                 first = patches.index(patch) << 32 | board << 16 | triangle << 8
                 by_uid += range(first, first + CHANNELS)
         if on:

@@ -1,4 +1,4 @@
-"""Read devices and port maps of skins in a robot's XML, with everything that they include."""
+"""Read devices and port maps of skins in a robot's XML, with all included files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LONGEST_CHAIN = 8
 _HIGHEST_FOLDER = 6
 _CONTAINERS = ("devices", "params", "robot")
 _FILES_OF_THE_ROBOT = ("general.xml", "pc104.xml", "-eln.xml")
-"""What the devices of all robots include, and what says nothing about skin."""
+"""Parameters of all robots' devices that are not about skin."""
 
 
 @dataclass
@@ -23,12 +23,12 @@ class Group:
     """Named parameters, groups and lists.
 
     Attributes:
-        element: where it stands.
+        element: of the group.
         params: by name.
         groups: by name.
         lists: by name, the elements ``elem`` of each.
         actions: elements ``action``.
-        others: elements that have no place in a device.
+        others: elements that do not belong in a device.
     """
 
     element: Element
@@ -40,10 +40,10 @@ class Group:
 
 
 class DeviceReader:
-    """Finds the devices of files, each file and device once.
+    """Find the devices of files, each file and device once.
 
     Args:
-        notes: takes what is odd.
+        notes: takes the remarks.
     """
 
     def __init__(self, notes: Notes) -> None:
@@ -52,13 +52,13 @@ class DeviceReader:
         self._seen: set[int] = set()
 
     def devices(self, path: Path) -> Iterator[Element]:
-        """The elements ``device`` of a file and of those that it includes, without those found before.
+        """Return the elements ``device`` of a file and its included files, without those found before.
 
         Raises:
-            ConfigurationError: the file itself is no XML.
+            ConfigurationError: the file itself is not XML.
         """
         root = self._read(path)
-        if root.tag != "params":  # parameters are of whoever includes them
+        if root.tag != "params":  # parameters belong to the including element
             yield from self._devices(root, [path.resolve()])
 
     def group_of(self, device: Element) -> Group:
@@ -126,7 +126,7 @@ class DeviceReader:
             self._notes.add("odd", param.file, text, line=param.line, element=param.label)
 
     def _include(self, element: Element, target: str, trail: list[Path], *, is_needed: bool) -> Element | None:
-        """The root of an included file; None where there is none (which is noted)."""
+        """Return the root of an included file; None if there is none, which is noted."""
         path = _find(target, element.file)
         if path is None:
             self._note(element, "missing" if is_needed else "info", f"{target!r} is not there")
@@ -160,7 +160,7 @@ class DeviceReader:
 
 
 def _target(element: Element) -> str | None:
-    """What an element includes; None if it does not include."""
+    """Return the name that an element includes; None if it includes nothing."""
     if element.tag.rpartition(":")[2] == "include":
         return element.attributes.get("href", "")
     if element.tag in ("params", "devices"):
@@ -169,7 +169,7 @@ def _target(element: Element) -> str | None:
 
 
 def _find(target: str, near: Path) -> Path | None:
-    """A file by its name: from the folder of another file, or (older robots) from a folder above it."""
+    """Return a file by its name: in the folder of another file, or (older robots) in a folder above it."""
     if "://" in target or not target.strip():
         return None
     folders = [near.parent, *near.resolve().parent.parents][:_HIGHEST_FOLDER]
@@ -178,7 +178,7 @@ def _find(target: str, near: Path) -> Path | None:
         try:
             if path.is_file():
                 return path
-        except (OSError, ValueError):  # a name that no file can have
+        except (OSError, ValueError):  # an impossible name
             return None
     return None
 
@@ -198,9 +198,8 @@ class Port:
 
     Attributes:
         name: of the body part.
-        element: where it stands.
-        first: index of its first value in the device.
-        last: of its last.
+        element: of the port.
+        first, last: indices of its first and last value in the device.
         local_first: index of its first value in the body part, as position files count.
     """
 
@@ -225,7 +224,7 @@ class Wrapper:
 
 
 def read_wrapper(group: Group, notes: Notes) -> Wrapper:
-    """Make sense of a wrapper; what makes none is noted."""
+    """Read a wrapper; note values that make no sense."""
     return _WrapperReader(notes).read(group)
 
 

@@ -1,4 +1,4 @@
-"""From files and folders to configurations: finds skin devices, what belongs to them, and translates them."""
+"""Find skin devices and their other files in folders, and translate them to configurations."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class ImportedPart:
 
     Attributes:
         name: of the skin; a name that a service can have.
-        part: what the files say.
+        part: as the files describe it.
         ports: body parts in its index.
         buses: in the order of the configuration.
         yarp: its ports.
-        groups: places of its sensors, also of those that are switched off.
+        groups: places of its sensors, with those that are switched off.
         regions: its body parts.
         triangles: number of triangles that are switched on.
         placed: number of sensors that are switched on and have a place.
@@ -68,7 +68,7 @@ class ImportedPart:
     placed: int
 
     def configuration(self, geometry: str = "") -> str:
-        """The text of its configuration file; ``geometry`` is the file beside it with the places of the sensors."""
+        """Return its configuration file; ``geometry`` is the name of the file with the places of the sensors."""
         where = shown(self.part.element.file.name)
         lines = [f"{shown(self.part.name)} ({self.part.device_type}), made by skin-import from {where}."]
         if self.ports:
@@ -85,11 +85,11 @@ class ImportedPart:
         return geometry_to_toml(self.groups, lines)
 
     def yarp_configuration(self, root: str, geometry: str = "") -> str:
-        """The text of a configuration file that reads its compensated ports.
+        """Return a configuration file that reads its compensated ports.
 
         Args:
-            root: what the names of the ports' buses begin with, as ``yarp:///icub/skin``.
-            geometry: the file beside it with the places of the sensors.
+            root: beginning of the names of the ports' buses, as ``yarp:///icub/skin``.
+            geometry: name of the file with the places of the sensors.
         """
         where = shown(self.part.element.file.name)
         lines = f"The ports of {shown(self.part.name)}, made by skin-import from {where}.\nFor what its boards send, "
@@ -107,7 +107,7 @@ class ImportedPart:
         return geometry_to_toml(groups, lines) if groups else ""
 
     def yarp_regions_text(self) -> str:
-        """The text of a file of regions for that: each port is one."""
+        """Return a file of regions for it: each port is one."""
         regions = [
             Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
             for bus, port in enumerate(self.yarp)
@@ -133,10 +133,10 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """What came of an import.
+    """The result of an import.
 
     Attributes:
-        parts: skin devices that could be translated.
+        parts: translated skin devices.
         files: files that were read.
     """
 
@@ -165,14 +165,14 @@ def import_files(
 
     Args:
         paths: XML of robots-configuration, position files and drawings of skinGui, and folders of them.
-        notes: takes what there is to say of them, also if this raises.
+        notes: takes the remarks, also if this raises.
         only: devices to translate, by name; all if empty.
-        positions: position file of a body part, where the names of the files leave it open.
+        positions: position file of a body part, if the names of the files are ambiguous.
         bus_names: bus of each patch; only for one device.
-        wants_buses: whether their buses are to be connected to this computer.
+        wants_buses: their buses will be connected to this computer.
 
     Raises:
-        ConfigurationError: a file cannot be read, there is no skin device, or one that was named is not there.
+        ConfigurationError: a file cannot be read, or there is no skin device, or none with a given name.
     """
     reader = DeviceReader(notes)
     sources = _Sources()
@@ -254,7 +254,7 @@ def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
 
 
 class _Wrappers:
-    """The skinWrappers, and the ports that they give to skin devices."""
+    """The skinWrappers, and their ports of skin devices."""
 
     def __init__(self, reader: DeviceReader, devices: Sequence[Element]) -> None:
         self._wrappers: list[tuple[Element, Wrapper, Notes]] = []
@@ -269,7 +269,7 @@ class _Wrappers:
         self._used: set[int] = set()
 
     def ports_of(self, part: Part, notes: Notes) -> Sequence[Port]:
-        """The ports of a device; of several robots, those of the wrapper in the nearest folder."""
+        """Return the ports of a device; with several robots, those of the wrapper in the nearest folder."""
         where = part.element.file.resolve().parts
         of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
         if not of_part:
@@ -295,12 +295,12 @@ class _Wrappers:
 
 
 def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    """Number of folders that two paths share."""
+    """Return the number of folders that two paths share."""
     return next((n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
 
 
 class _BodyFiles:
-    """Position files and drawings, by the body part that they are of."""
+    """Position files and drawings, by body part."""
 
     def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
         self._chosen, self._notes = chosen, notes
@@ -324,10 +324,10 @@ class _BodyFiles:
         return positions, drawings
 
     def name_unused(self, ports: set[str]) -> None:
-        """Name the files of no part that was imported.
+        """Note the files of body parts that are not imported.
 
         Raises:
-            ConfigurationError: the user chose a file for a body part that there is not.
+            ConfigurationError: the user chose a file for an unknown body part.
         """
         for name in self._chosen:
             if name not in ports:
@@ -337,7 +337,7 @@ class _BodyFiles:
                 self._notes.add("info", path, "no body part of this name is imported")
 
     def _positions_of(self, port: Port) -> Path | None:
-        """By the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
+        """Find it by the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
         exact = [path for path in self._positions if path.stem == port.name]
         similar = [path for path in self._positions if path.stem.startswith(f"{port.name}_")]
         candidates = exact if len(exact) == 1 else [*exact, *similar]

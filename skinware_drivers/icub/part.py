@@ -1,4 +1,4 @@
-"""A skin part as a robot's files describe it: buses, boards, and the sets of boards and triangles that differ.
+"""Read a skin part of a robot's files: buses, boards, and the sets of boards and triangles that differ.
 
 Sources: robotology/icub-main SkinConfigReader.cpp (the groups), embObjSkin.cpp and CanBusSkin.cpp (the devices; the
 latter also the parameters ``4C_*`` and ``4E_*`` of the old set-up and their defaults).
@@ -14,7 +14,7 @@ from skinware_drivers.icub.xml_tree import Element, Notes, Reader, words
 
 ETHERNET, CAN = "embObjSkin", "canBusSkin"
 _ONLY_PATCH = 1
-"""What the one bus of a canBusSkin is called here; its sets name it by canDeviceNum."""
+"""The patch of the one bus of a canBusSkin; its sets name it by canDeviceNum."""
 DEVICE_TYPES = (ETHERNET, CAN)
 """Devices with skin: boards behind an Ethernet board, and boards on a CAN bus of the robot's computer."""
 
@@ -22,15 +22,15 @@ _PATCH_PARAMETER = "skinCanAddrsPatch"
 _HOST_DEFAULTS = "the default of the robot's software"
 _LARGEST = {"period": 255, "skinType": 15, "noLoad": 255, "shift": 255, "cdcOffset": 0xFFFF}
 _GROUPS_OF_THE_ROBOT = {"GENERAL", "PC104", "ETH", "ETH_BOARD", "SERVICE", "TRANSCEIVER", "PROTOCOL"}
-"""What the devices of all robots include, and what says nothing about skin."""
+"""Parameters of all robots' devices that are not about skin."""
 _MOST_TRIANGLE_SETS = 20
-"""What the robot's software reads; files of legs and arms have up to twice as many."""
+"""Number of sets that the robot's software reads; files of legs and arms have up to twice as many."""
 _SKIN_TYPES = (0, 1, 2, 3, 7, 8)
 
 
 @dataclass(frozen=True)
 class BoardSet:
-    """One ``boardSetCfg``."""
+    """A ``boardSetCfg``."""
 
     element: Element
     patch: int
@@ -42,7 +42,7 @@ class BoardSet:
 
 @dataclass(frozen=True)
 class TriangleSet:
-    """One ``triangleSetCfg``."""
+    """A ``triangleSetCfg``."""
 
     element: Element
     patch: int
@@ -66,14 +66,14 @@ class Part:
 
     Attributes:
         name: of the device.
-        element: where it is.
+        element: of the device.
         device_type: one of ``DEVICE_TYPES``.
         boards: addresses by patch, in the files' order; a patch is what we call a bus.
-        bus_name: of the CAN bus, where the files tell.
-        period_ms, skin_type, no_load, enabled, shift, cdc_offset: of boards and triangles that do not differ.
+        bus_name: of the CAN bus, if the files name it.
+        period_ms, skin_type, no_load, enabled, shift, cdc_offset: of boards and triangles without a set of their own.
         board_sets: boards that differ.
         triangle_sets: triangles that differ.
-        old: the old set-up of each board, where the files have no other.
+        old: the old set-up of each board, if the files have no other.
     """
 
     name: str
@@ -93,12 +93,12 @@ class Part:
 
     @property
     def host_order(self) -> list[tuple[int, int]]:
-        """(patch, board) in the order of the host's index: the boards of the higher patch come first."""
+        """Return (patch, board) in the order of the host's index: the boards of the higher patch come first."""
         return [(patch, board) for patch in sorted(self.boards, reverse=True) for board in self.boards[patch]]
 
 
 def read_part(name: str, device_type: str, group: Group, notes: Notes) -> Part:
-    """Make sense of a skin device; what makes none is noted."""
+    """Read a skin device; note values that make no sense."""
     return _PartReader(name, device_type, group, notes).read()
 
 
@@ -301,7 +301,7 @@ class _PartReader(Reader):
                 else:
                     self.refuse(element, f"{value} is not a byte")
 
-    # What is left
+    # Other elements
 
     def _unused(self, element: Element, why: str) -> None:
         element.understood = True

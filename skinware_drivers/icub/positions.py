@@ -1,11 +1,11 @@
-"""Position files of skinGui: where the taxels of a body part are, and which of its channels are none.
+"""Read position files of skinGui: the places of a body part's taxels, and its channels that are not taxels.
 
 Source: robotology/icub-main app/skinGui/conf/positions. Lines ``name FRAME``, ``spatial_sampling taxel|triangle``,
 ``taxel2Repr (...)``, then ``[calibration]`` and per channel ``x y z nx ny nz``, in metres in the frame of the link. In
-``taxel2Repr``, -1 stands for a channel that is no taxel, -2 for a thermal pad (some files write -1 for both).
+``taxel2Repr``, -1 stands for a channel that is not a taxel, -2 for a thermal pad (some files write -1 for both).
 
 In some files ``taxel2Repr`` is shorter than the list of places: beyond its end, a channel with a place is a taxel. Some
-have no normals (0 0 0), or normals of another length than 1: their places are as good as any.
+have no normals (0 0 0), or normals of another length than 1; their places are used.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Pose = tuple[Triple, Triple | None]
 
 @dataclass(frozen=True)
 class Positions:
-    """One file.
+    """A position file.
 
     Attributes:
-        path: of it.
-        frame: the link in whose frame the numbers are.
+        path: of the file.
+        frame: the link with the coordinate frame of the numbers.
         tactile: by channel, whether it is a taxel.
-        poses: by channel, in metres; None where the file has no place.
+        poses: by channel, in metres; None: the file has no place.
     """
 
     path: Path
@@ -47,29 +47,29 @@ class Positions:
     poses: tuple[Pose | None, ...]
 
     def non_tactile(self, first: int) -> tuple[int, ...]:
-        """Channels that are no taxels, of the triangle whose channels begin at ``first``."""
+        """Return the channels that are not taxels, of the triangle that begins at channel ``first``."""
         return tuple(k for k, tactile in enumerate(self.tactile[first : first + CHANNELS]) if not tactile)
 
 
 def is_positions(text: str) -> bool:
-    """Whether a text looks like a position file."""
+    """Return whether a text looks like a position file."""
     return _CALIBRATION in text and "taxel2Repr" in text
 
 
 def read_text(path: Path) -> str:
-    """A text file; bytes that are no UTF-8 are kept as signs.
+    """Read a text file; bytes that are not UTF-8 are kept as signs.
 
     Raises:
-        ConfigurationError: it cannot be read.
+        ConfigurationError: the file cannot be read.
     """
     return read_bytes(path).decode("utf-8", "replace")
 
 
 def read_positions(path: Path, notes: Notes) -> Positions:
-    """Read a file; what is odd about it is noted.
+    """Read a position file; note oddities.
 
     Raises:
-        ConfigurationError: it is no position file.
+        ConfigurationError: the file is not a position file.
     """
     text = read_text(path)
     head, mark, body = text.partition(_CALIBRATION)
@@ -88,7 +88,7 @@ def read_positions(path: Path, notes: Notes) -> Positions:
         text = "the file asks for one place per triangle; its places, one per channel, are kept"
         notes.add("info", path, text, element=f"spatial_sampling {fields['spatial_sampling']}")
     if not fields.get("name"):
-        notes.add("missing", path, "no frame is named, so nobody can tell whose axes these are", element="name")
+        notes.add("missing", path, "no frame is named, so the axes of these numbers are unknown", element="name")
     poses = _poses(body, head.count("\n"), path, notes)
     return _fit(path, fields.get("name", ""), representatives, poses, notes)
 

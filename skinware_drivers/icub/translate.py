@@ -1,4 +1,4 @@
-"""Translate a part to a configuration of a driver, checked by the driver, and write it as text."""
+"""Translate a part to a configuration, which the driver checks, and write it as text."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from skinware_drivers.streams.yarp import YarpOptions
 
 _HEXADECIMAL = ("cdc_offset", "no_load")
 _ALWAYS = ("boards", "period_ms", "skin_type", "no_load", "shift", "cdc_offset", "enabled", "values")
-"""Options that are written although they are the default."""
+"""Options that are written even if they have their defaults."""
 _TABLES = ("special_boards", "modules", "triangles")
 
 
 def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, geometry: str = "") -> str:
-    """What ``skin-driver --config`` reads.
+    """Return the text of a file for ``skin-driver --config``.
 
     Args:
         name: of the skin.
         buses: of the part.
         comment: lines for its head.
-        geometry: file beside it with the places of the sensors.
+        geometry: name of the file with the places of the sensors.
     """
     each = [(bus.name, bus.comment, bus.options) for bus in buses]
     return _text("roboskin", name, each, comment, geometry)
@@ -49,13 +49,13 @@ def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, 
 def yarp_configuration_text(
     name: str, buses: Sequence[tuple[str, YarpOptions]], comment: str, geometry: str = ""
 ) -> str:
-    """The same for the driver ``yarp``.
+    """Return the text of a file for ``skin-driver --config`` with the driver ``yarp``.
 
     Args:
         name: of the skin.
         buses: name and options of each port.
         comment: lines for its head.
-        geometry: file beside it with the places of the sensors.
+        geometry: name of the file with the places of the sensors.
     """
     return _text("yarp", name, [(bus, "", options) for bus, options in buses], comment, geometry)
 
@@ -118,8 +118,8 @@ class TranslatedBus:
     """One bus of a part.
 
     Attributes:
-        patch: what the files call it.
-        name: as ``skin-driver`` takes it; empty: to be filled in.
+        patch: its number in the files.
+        name: for ``--bus``; empty: to fill in.
         comment: what to fill in.
         options: for this bus.
     """
@@ -133,21 +133,21 @@ class TranslatedBus:
 def translate(
     part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes, *, wants_names: bool = True
 ) -> list[TranslatedBus]:
-    """The buses of a part, in order of their patches; those on which nothing is switched on are left out.
+    """Return the buses of a part with triangles that are switched on, in the order of their patches.
 
     Args:
         part: the part.
-        body: what is known of its triangles.
-        bus_names: names of buses that the user gave, by patch.
-        notes: takes what is odd.
-        wants_names: whether a bus without a name is to be filled in.
+        body: kinds and places of its triangles.
+        bus_names: names of buses from the user, by patch.
+        notes: takes the remarks.
+        wants_names: note buses without a name, which the user must fill in.
     """
     buses = []
     for patch in sorted(part.boards):
         try:
             options = _old_options(part, patch, notes) if part.old else _options(part, patch)
             options = _with_kinds(options, patch, body)
-            RoboskinDriver(options)  # refuses what it could not do
+            RoboskinDriver(options)  # refuses impossible options
         except ConfigurationError as error:
             _note(notes, "odd", part, f"patch {patch} is left out: {error}")
             continue
@@ -184,7 +184,7 @@ def enabled_places(buses: list[TranslatedBus]) -> set[Place]:
 
 
 def service_name(name: str, taken: set[str]) -> str:
-    """A name that a service can have, made of a device's."""
+    """Return the name of a device as the name of a service."""
     safe = re.sub(r"[^A-Za-z0-9_-]", "_", name).lstrip("_-")[:40] or "skin"
     found, number = safe, 2
     while found in taken:
@@ -209,7 +209,7 @@ def _options(part: Part, patch: int) -> RoboskinOptions:
 
 
 def _old_options(part: Part, patch: int, notes: Notes) -> RoboskinOptions:
-    """The old set-up: one shift and offset for a bus; the rest can differ from board to board."""
+    """Return options of the old set-up: one shift and offset for a bus; the rest can differ from board to board."""
     boards = part.boards[patch]
     each = {board: _OldSettings(part, board, notes) for board in boards}
     first = each[boards[0]]
@@ -264,7 +264,7 @@ class _OldSettings:
 
 
 def _with_kinds(options: RoboskinOptions, patch: int, body: Body) -> RoboskinOptions:
-    """Options that also say what the triangles are, where the type of skin alone would say another thing."""
+    """Return options with the kinds of triangles that differ from the type of skin."""
     kinds: dict[tuple[int, str, tuple[int, ...]], list[int]] = {}
     for board in options.boards:
         set_up = BoardSetUp(options, board)

@@ -1,4 +1,4 @@
-"""Read a robot's files: XML with line numbers, values, and notes on everything that is left out."""
+"""Read XML with line numbers, read values, and keep remarks on everything that is left out."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from skinware.errors import ConfigurationError
 from skinware.text import printable
 
 Level = Literal["todo", "odd", "unknown", "missing", "info"]
-"""``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not
-understood; ``missing``: named, but not there; ``info``: nothing to do."""
+"""``todo``: the user must fill in or decide; ``odd``: understood, but probably a mistake; ``unknown``: not understood;
+``missing``: named, but does not exist; ``info``: nothing to do."""
 
 
 class Note(msgspec.Struct, frozen=True, order=True):
-    """One remark.
+    """A remark.
 
     Attributes:
-        level: what kind.
-        file: where it is about.
-        line: counted from 1; 0: the file as a whole.
-        element: what is meant there.
+        level: its kind.
+        file: its file.
+        line: counted from 1; 0: the whole file.
+        element: its subject.
         text: the remark.
     """
 
@@ -44,13 +44,13 @@ _LONGEST = 400
 
 
 def shown(text: object) -> str:
-    """A text from a foreign file as a terminal or a comment can show it: without control characters, not too long."""
+    """Return a text of a foreign file for a terminal or a comment: without control characters, not too long."""
     visible = printable(str(text))
     return visible if len(visible) <= _LONGEST else f"{visible[:_LONGEST]} ..."
 
 
 class Notes:
-    """Remarks in the order in which they came, each once."""
+    """Remarks in order, each once."""
 
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
@@ -69,15 +69,15 @@ _LONGEST_NUMBER = 12
 
 
 def words(text: str) -> list[str]:
-    """The words of a value; quotes and the brackets of a list fall away."""
+    """Return the words of a value, without quotes and brackets."""
     return text.translate(str.maketrans('()"', "   ")).split()
 
 
 def number(text: str) -> int:
-    """A whole number as these files write it.
+    """Return a whole number as these files write it.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a whole number.
     """
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
         raise ValueError(f"{text[:20]!r} is not a whole number")
@@ -89,17 +89,17 @@ def number(text: str) -> int:
 
 
 class Reader:
-    """Reads values of elements; what it cannot read is noted, and counts as not given.
+    """Read values of elements; note those that cannot be read, which count as not given.
 
     Args:
-        notes: takes what was not understood.
+        notes: takes the remarks.
     """
 
     def __init__(self, notes: Notes) -> None:
         self.notes = notes
 
     def numbers(self, element: Element | None) -> list[int] | None:
-        """All words of an element as numbers; None if there is no element, or one is none."""
+        """Return all words of an element as numbers; None if there is no element, or a word is not a number."""
         if element is None:
             return None
         element.understood = True
@@ -110,7 +110,7 @@ class Reader:
             return None
 
     def number(self, element: Element | None, first: int, last: int) -> int | None:
-        """The one number of an element, within limits."""
+        """Return the one number of an element, within limits."""
         found = self.numbers(element)
         if element is None or found is None:
             return None
@@ -123,7 +123,7 @@ class Reader:
         return None
 
     def truth(self, element: Element | None) -> bool | None:
-        """Yes or no as YARP reads it: the first word is ``true`` or a number that is not 0; anything else means no."""
+        """Return a truth as YARP reads it: the first word is ``true`` or a number other than 0; else False."""
         if element is None:
             return None
         element.understood = True
@@ -156,13 +156,13 @@ class Element:
     """An element.
 
     Attributes:
-        tag: with its prefix, if it has one.
+        tag: with its prefix, if any.
         attributes: by name.
-        file: where it was read.
+        file: of the element.
         line: counted from 1.
         children: in order.
-        text: all text directly within, without what is around it.
-        understood: somebody took it into account.
+        text: all text directly within, stripped.
+        understood: a reader has used it.
     """
 
     tag: str
@@ -179,7 +179,7 @@ class Element:
 
     @property
     def label(self) -> str:
-        """For messages: ``param "period"``."""
+        """Return it for messages: ``param "period"``."""
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:
@@ -193,10 +193,10 @@ class Element:
 
 
 def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
-    """A whole file, if it is an ordinary one and not too large.
+    """Read an ordinary file that is not too large.
 
     Raises:
-        ConfigurationError: it is not.
+        ConfigurationError: the file is not one.
     """
     try:
         if not path.is_file():
@@ -213,10 +213,10 @@ def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
 
 
 def read_xml(path: Path, notes: Notes) -> Element:
-    """The root element of a file.
+    """Return the root element of a file.
 
     Raises:
-        ConfigurationError: not there, not XML, or it defines entities; the message says where.
+        ConfigurationError: the file does not exist, is not XML, or defines entities; the message says where.
     """
     return _Reader(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
 
@@ -266,7 +266,7 @@ class _Reader:
         except expat.ExpatError as error:
             why = expat.errors.messages.get(error.code, str(error))
             raise self._refusal(f"not XML: {why}", error.lineno) from None
-        except (LookupError, ValueError) as error:  # an encoding that nobody has
+        except (LookupError, ValueError) as error:  # an unknown encoding
             if isinstance(error, ConfigurationError):
                 raise
             raise self._refusal(f"not XML: {error}") from None

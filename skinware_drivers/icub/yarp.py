@@ -1,4 +1,4 @@
-"""A part's ports of YARP: what each value of their vectors is, as options of the driver ``yarp``, and where it is."""
+"""Translate a part's ports of YARP to options of the driver ``yarp``, with the places of their values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class YarpPort:
     """One port of a part.
 
     Attributes:
-        name: of the body part, which the port's name ends with.
+        name: of the body part, the end of the port's name.
         options: of the driver ``yarp``.
         groups: places of its sensors; their uid lack the bus.
     """
@@ -39,7 +39,7 @@ class YarpPort:
 
     @property
     def uids(self) -> list[int]:
-        """Of its sensors that feel touch, without the bus."""
+        """Return the uids of its sensors that feel touch, without the bus."""
         return [
             first + channel
             for run in self.options.triangles
@@ -52,14 +52,14 @@ class YarpPort:
 def yarp_ports(
     part: Part, ports: Sequence[Port], buses: Sequence[TranslatedBus], body: Body, notes: Notes
 ) -> list[YarpPort]:
-    """The ports of a part on which a triangle is switched on, in the order of the port map.
+    """Return the ports of a part with a triangle that is switched on, in the order of the port map.
 
     Args:
         part: the part.
         ports: as its wrapper maps them; several ranges may have one name.
-        buses: of the part, which tell what its triangles are.
-        body: where they are.
-        notes: takes what the driver could not do.
+        buses: of the part, with the kinds of its triangles.
+        body: their places.
+        notes: takes the remarks.
     """
     modules = _modules(buses)
     found = []
@@ -105,7 +105,7 @@ def _runs(on: Mapping[int, Place], modules: Mapping[Place, Module]) -> list[Tria
 
 
 def _groups(on: Mapping[int, Place], body: Body) -> list[GeometryGroup]:
-    """The places of sensors that feel touch, by their place in the vector."""
+    """Return the places of sensors that feel touch, by their position in the vector."""
     return [
         msgspec.structs.replace(group, uid=tuple(CHANNELS * number + (uid & _CHANNEL) for uid in group.uid))
         for number, place in sorted(on.items())

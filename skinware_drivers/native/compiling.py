@@ -1,4 +1,4 @@
-"""A decoder's layouts and tables, told to C."""
+"""Write the layouts and tables of a decoder into structs for C."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
 from skinware_drivers.decoding.pairing import CompiledCycle
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
 from skinware_drivers.native import structs
-from skinware_drivers.numbering import SequenceNumber
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _PACKED = len(_TYPES)
@@ -27,7 +27,7 @@ def check_values(frame: Frame) -> None:
     """Refuse values that the data path cannot read together.
 
     Raises:
-        ConfigurationError: the message says what to do.
+        ConfigurationError: the message has a remedy.
     """
     dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
     kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
@@ -44,7 +44,7 @@ def check_values(frame: Frame) -> None:
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
-    """Fill in what a plan says of frames and updates.
+    """Fill in the part of a plan that is about frames and updates.
 
     Raises:
         ConfigurationError: a frame has values that C does not read.
@@ -58,7 +58,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.value_type, plan.value_bytes = _type(structure.dtype)[0], structure.dtype.itemsize
     plan.width = compiled.width
 
-    plan.nobody = addresses.nobody
+    plan.nobody = addresses.foreign
     plan.entry, plan.candidates = arrays.at(addresses.entry), arrays.at(addresses.candidates)
     plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(compiled.payload_names)
     plan.n_forms, plan.forms = arrays.structs(structs.Form, (_form(form, arrays) for form in addresses.forms))
@@ -113,7 +113,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
 
 
 def compile_batch(batch: FrameBatch, arrays: structs.Arrays) -> structs.Batch:
-    """A batch as it is now, whose memory ``arrays`` keep."""
+    """Return a batch as it is now; ``arrays`` keep its memory."""
     return structs.Batch(
         wire=arrays.at(batch.wire),
         time_ns=arrays.at(batch.time_ns),
@@ -129,7 +129,7 @@ def compile_batch(batch: FrameBatch, arrays: structs.Arrays) -> structs.Batch:
 
 
 def _type(dtype: Any) -> tuple[int, int]:
-    """Number of a dtype, and whether its bytes come in the other order."""
+    """Return the number of a dtype, and whether its bytes are swapped."""
     found = np.dtype(dtype)
     return _TYPES.index(found.str[1:]), found.str[0] == ">"
 
@@ -193,7 +193,7 @@ def _runs(frame: Frame) -> list[structs.Run]:
 
 
 def _place_runs(kind: structs.Kind, column: int) -> None:
-    """Columns of runs count from the beginning of the update, not of their frame."""
+    # columns of runs count from the beginning of the update, not of their frame
     runs = (structs.Run * kind.n_runs).from_address(kind.runs)
     for run in runs:
         run.column += column

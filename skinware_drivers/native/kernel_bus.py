@@ -1,4 +1,4 @@
-"""Buses from whose descriptors C code can receive."""
+"""Buses whose descriptors C can read."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ class KernelBus(Bus):
     @property
     @abstractmethod
     def reads_natively(self) -> bool:
-        """Whether C code can receive in place of ``receive`` while it is open."""
+        """Whether C can read the open bus in place of ``receive``."""
 
     @abstractmethod
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Tell C code how to receive in place of ``receive``.
+        """Describe the bus to C, which then reads it in place of ``receive``.
 
         Args:
-            batch: into whose rows.
-            source: told: the descriptor, and the stream of a line; of a socket, where ancillary data goes, what is
-                known of the clocks and counted so far.
+            batch: gets the frames.
+            source: filled in: the descriptor, and the stream of a line; for a socket, the memory of ancillary data, the
+                clocks and the counts so far.
 
         Returns:
-            Whether it can, now.
+            Whether C can read it now.
         """
 
     @abstractmethod
     def take_back(self, source: Source) -> None:
-        """Go on with what C code did since ``hand_over``; called before anything else is."""
+        """Take over what C counted since ``hand_over``; called before any other method."""
 
     def sort_out(self, batch: FrameBatch, new: slice) -> int:  # noqa: ARG002
-        """Take what is no data frame of this layout out of new rows of a batch; returns how many are left."""
+        """Remove rows that are no data frames from new rows of a batch; return the number of rows that are left."""
         return len(range(new.start, new.stop))
 
     @abstractmethod
     def nothing_received(self, number: int) -> int:
-        """What an error of the kernel means in the place of frames; 0: it gave nothing though there was something.
+        """Handle an error of the kernel in place of frames; 0: there were none although the socket was readable.
 
         Raises:
             skinware.errors.BusNotAvailable: the interface went down or away.
@@ -47,5 +47,5 @@ class KernelBus(Bus):
 
 
 def is_read_natively(bus: Bus) -> bool:
-    """Whether C code can receive from a bus, as far as it is known."""
+    """Return whether C can read a bus, as far as it is known."""
     return isinstance(bus, KernelBus) and bus.reads_natively

@@ -1,4 +1,4 @@
-"""Options that a class declares: which class it is, and what commands print of it.
+"""Find the class of options that a driver or emulator declares, and describe its options for commands.
 
 An options class is a ``msgspec.Struct`` whose fields carry a description::
 
@@ -29,15 +29,15 @@ class Option(NamedTuple):
 
     name: str
     kind: str
-    """What to write: ``INTEGER``, ``NUMBER``, ``TEXT``, ``INTEGER,...``, ``a|b|c`` or ``yes/no``."""
+    """The form of its text: ``INTEGER``, ``NUMBER``, ``TEXT``, ``INTEGER,...``, ``a|b|c`` or ``yes/no``."""
     required: bool
     default: str
-    """The default as a person would write it; empty where nothing stands for it."""
+    """The default as a person would write it; empty if there is no text for it."""
     description: str
 
 
 class HasOptions(Generic[OptionsT]):
-    """What is made from options, whose class the base has in brackets: ``class Thumb(CanAdapter[ThumbOptions])``.
+    """An object that is made from options; the base names their class: ``class Thumb(CanAdapter[ThumbOptions])``.
 
     Args:
         options: an object of that class.
@@ -48,13 +48,13 @@ class HasOptions(Generic[OptionsT]):
         period_s: nominal time between two sets of data, s; options with a field ``period_ms`` set it.
 
     Raises:
-        ConfigurationError: when a subclass is made: what stands in its brackets is no class of options, or the command
-            that takes them has an option of the same name.
+        ConfigurationError: when a subclass is defined: its brackets have no class of options, or the command that takes
+            the options has one of the same name.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
     least_options: ClassVar[type[msgspec.Struct]] = msgspec.Struct
-    """What the class of the options must be derived from."""
+    """The base class of the options' class."""
     options_command: ClassVar[str] = ""
     """The command that takes the options as flags, beside its own."""
     reserved_options: ClassVar[Set[str]] = frozenset()
@@ -89,7 +89,7 @@ class HasOptions(Generic[OptionsT]):
 
 
 def _in_brackets(cls: Any) -> Any:
-    """The options' class that a subclass of HasOptions names, or has from its base; a TypeVar if neither does yet."""
+    """Return the options' class that a subclass of HasOptions names or inherits; a TypeVar if it has none yet."""
     for base in vars(cls).get("__orig_bases__", cls.__bases__):
         origin: Any = get_origin(base) or base
         if origin is HasOptions:
@@ -107,10 +107,10 @@ def check_names(options_class: type[msgspec.Struct], reserved: Set[str], command
         options_class: the options.
         reserved: names of the command's own options.
         command: the command that takes both.
-        owner: whose options they are, for the message.
+        owner: the owner of the options, for the message.
 
     Raises:
-        ConfigurationError: an option has the name of one of the command's.
+        ConfigurationError: an option has the name of one of the command's own.
     """
     for name in options_class.__struct_encode_fields__:
         if name.replace("-", "_") in reserved:
@@ -121,7 +121,7 @@ def check_names(options_class: type[msgspec.Struct], reserved: Set[str], command
 
 
 def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
-    """The options of a class that can be written as text, in the order in which it declares them."""
+    """Return the options of a class that can be written as text, in the order of their declaration."""
     hints = get_type_hints(options_class, include_extras=True)
     return [
         Option(
@@ -137,7 +137,7 @@ def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
 
 
 def _is_table(plain: Any) -> bool:
-    """Whether a type is a struct or a list of them, which only a configuration file can hold."""
+    """Return whether a type is a struct or a list of them, which only a configuration file can hold."""
     if get_origin(plain) in (list, tuple):
         return _is_table(plain_type(get_args(plain)[0]))
     return isinstance(plain, type) and issubclass(plain, msgspec.Struct)

@@ -17,7 +17,7 @@ SOURCE_SUFFIX = ".py"
 
 
 def nearest_name(wrong: str, right: Iterable[str]) -> str:
-    """The end of an error message about an unknown name: the nearest right one, and all there are."""
+    """Return the end of an error message about an unknown name: the nearest known one, and all known ones."""
     names = sorted(right)
     nearest = difflib.get_close_matches(wrong, names, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
@@ -25,7 +25,7 @@ def nearest_name(wrong: str, right: Iterable[str]) -> str:
 
 
 def is_file(name: str) -> bool:
-    """Whether a name is that of a file, not of something that is registered."""
+    """Return whether a name is that of a file, not of something that is registered."""
     return name.endswith(SOURCE_SUFFIX)
 
 
@@ -40,16 +40,15 @@ _ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "st
 def options_from_strings(
     options_class: type[OptionsT], strings: Mapping[str, str], beside: Collection[str] = ()
 ) -> OptionsT:
-    """Make options from ``key=value`` texts.
+    """Return options made from texts.
 
     Args:
         options_class: the struct to make.
-        strings: texts by option name. A yes/no option with an empty text is on.
-        beside: names of options that others take, for the message.
+        strings: texts by name of option. A yes/no option with an empty text is on.
+        beside: further names of options, for the message.
 
     Raises:
-        ConfigurationError: an option is unknown (the message gives the nearest right name), missing, or its
-            text is not what the option takes.
+        ConfigurationError: an option is unknown (the message suggests the nearest name), missing, or has a wrong text.
     """
     fields = {field.encode_name: field for field in msgspec.structs.fields(options_class)}
     hints = get_type_hints(options_class, include_extras=True)
@@ -69,7 +68,7 @@ def options_from_strings(
 
 
 def check_options(options: msgspec.Struct) -> None:
-    """Hold every field against its type and limits; for ``__post_init__``, which msgspec's limits do not reach.
+    """Check every field against its type and limits; call it in ``__post_init__``: msgspec checks no constructor.
 
     Raises:
         ConfigurationError: a field has a value that its annotation does not allow.
@@ -85,7 +84,7 @@ def check_options(options: msgspec.Struct) -> None:
 
 
 def option_text(value: Any) -> str:
-    """A value as a person would write it in a bus query: ``7,8``, ``yes``, ``0.01``."""
+    """Return a value as a person would write it in the name of a bus: ``7,8``, ``yes``, ``0.01``."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None:
@@ -105,7 +104,7 @@ def plain_type(hint: Any) -> Any:
 
 
 def _split(text: str, plain: Any) -> Any:
-    """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
+    """Return a text in a form that msgspec can convert: lists are split, ranges of numbers expanded, yes is True."""
     if plain is bool:
         word = text.strip().lower()
         return {"": True, "yes": True, "on": True, "no": False, "off": False}.get(word, word)
@@ -130,12 +129,12 @@ def _split(text: str, plain: Any) -> Any:
 
 
 def _number(text: str) -> str | int:
-    """A whole number that is written as 0x710 too."""
+    """Return a whole number, which may be written as 0x710."""
     return int(text, 16) if _HEXADECIMAL.fullmatch(text) else text
 
 
 def _reason(error: Exception, hint: Any) -> str:
-    """What msgspec says, in words for people, without its path to a value that the message already names."""
+    """Return an error of msgspec in words for people, without the path to a value that the message names."""
     text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
     text = re.sub(r" \| null(?=`)", "", text)
     plain = plain_type(hint)

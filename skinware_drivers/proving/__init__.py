@@ -1,1 +1,1 @@
-"""What an owner does to prove the driver of a device: press, let go and stroke, while somebody watches the values."""
+"""Prove the driver of a device: a person presses, lets go and strokes, and the values are judged (``skin-prove``)."""

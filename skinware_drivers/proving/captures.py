@@ -1,6 +1,6 @@
-"""A capture, decoded again: by the driver of now, in a time of its own, and by that of then, as it was recorded.
+"""Decode a capture again with the present driver, and compare with the values that were decoded and recorded then.
 
-Nothing waits for a clock: minutes of a capture take seconds, and a busy machine makes no difference.
+The driver runs in the time of a test clock: minutes of a capture take seconds, and a busy machine makes no difference.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ _NAME = "captured"
 _SLOTS = 64
 _LOOK_S = 0.1
 _SETTLED_NS = NS_PER_S
-"""So long after the end, all of it was published."""
+"""Time after the end within which everything is published."""
 _LATEST_NS = 60 * NS_PER_S
-"""A driver that asks for other things than then has lost so much time at most, beside twice that of the recording."""
+"""Time that a driver which sends other requests than then may lose, beside twice the length of the recording."""
 
 
 def expected_of(capture: Path) -> Path:
-    """The file beside a capture with the values that are expected of it, where they are not those of then."""
+    """Return the file beside a capture with the expected values, if they are not those that were recorded."""
     return capture.with_suffix(".npz")
 
 
 def check_capture(
     capture: Path, driver: type[AnyAdapter] | None = None, options: Mapping[str, Any] | None = None
 ) -> tuple[Comparison, Decoding]:
-    """Compare what a driver makes of a capture now with what is expected.
+    """Compare the values that a driver decodes from a capture now with the expected ones.
 
     Expected are the values in the file beside it (:func:`expected_of`), or else those that were decoded and recorded
     then.
 
     Args:
         capture: a recording of one driver, with its wires.
-        driver: default: the one of then.
-        options: of the driver, beside those that it had then.
+        driver: default: the recorded driver.
+        options: of the driver, in place of recorded ones.
 
     Returns:
-        The comparison, and what is made of it now.
+        The comparison, and the values that are decoded now.
 
     Raises:
-        BadRecording: it is no recording.
-        ConfigurationError: it has no wire, or those of several drivers; or the options are wrong.
+        BadRecording: the file is not a recording.
+        ConfigurationError: it has no wire, or wires of several drivers; or the options are wrong.
         DriverError: the driver failed.
         OSError: a file cannot be read.
     """
@@ -75,7 +75,7 @@ def check_capture(
 
 
 def decoded_then(capture: Path) -> Decoding:
-    """What the driver published while it was captured.
+    """Return the values that the driver published during the capture.
 
     Raises:
         BadRecording, ConfigurationError, OSError: as for :func:`check_capture`.
@@ -93,7 +93,7 @@ def decoded_then(capture: Path) -> Decoding:
 def decoded_now(
     capture: Path, driver: type[AnyAdapter] | None = None, options: Mapping[str, Any] | None = None
 ) -> Decoding:
-    """What a driver makes of a capture now; see :func:`check_capture`."""
+    """Return the values that a driver decodes from a capture now; see :func:`check_capture`."""
     with skinware.recording.open(capture) as recording:
         wires = _wires(recording)
         about = recording.about(wires[0].driver)
@@ -116,10 +116,10 @@ def decoded_now(
 
 
 def driver_type_of(capture: Path) -> str:
-    """The driver of then, as ``--driver`` takes it.
+    """Return the recorded driver, for ``--driver``.
 
     Raises:
-        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`; or the file does not tell it.
+        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`; or the file does not name it.
     """
     with skinware.recording.open(capture) as recording:
         return _driver_type(recording, recording.about(_wires(recording)[0].driver))
@@ -127,15 +127,15 @@ def driver_type_of(capture: Path) -> str:
 
 def _driver_type(recording: Recording, about: Mapping[str, Any]) -> str:
     if "driver_type" not in about:
-        raise ConfigurationError(f"{recording.path}: an earlier version has recorded it: name its driver")
+        raise ConfigurationError(f"{recording.path}: it was recorded by an earlier version: name its driver")
     return str(about["driver_type"])
 
 
 def _wires(recording: Recording) -> Sequence[WireTrack]:
     if len({wire.driver for wire in recording.wires}) > 1:
         names = ", ".join(sorted({wire.driver for wire in recording.wires}))
-        raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}): a capture has those of one")
-    return recording.wires or [wire_of(recording)]  # which says that there is none
+        raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}); a capture has one driver")
+    return recording.wires or [wire_of(recording)]  # raises an error that names the reason
 
 
 def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
@@ -144,13 +144,13 @@ def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
 
 
 class _Replay:
-    """One wire, and the adapter of the driver that is on it now.
+    """A recorded wire, and the adapter of the present driver on it.
 
     Args:
-        recording: in which it is.
-        wire: it.
-        listens: the driver is to send nothing.
-        clock: in whose time.
+        recording: that holds the wire.
+        wire: the wire.
+        listens: the driver sends nothing.
+        clock: the time.
     """
 
     def __init__(self, recording: Recording, wire: WireTrack, listens: bool, clock: HandClock) -> None:
@@ -162,7 +162,7 @@ class _Replay:
         self.line: tuple[str, AnyAdapter, Bus] | None = None
 
     def prepare(self, driver: type[AnyAdapter], options: Mapping[str, Any]) -> None:
-        """Make the adapter, and its bus.
+        """Make the adapter and its bus.
 
         Raises:
             ConfigurationError: the driver has no such options, or is for another kind of bus.
@@ -192,7 +192,7 @@ class _Replay:
         return self._times[-1] - self._times[0] if self._times else 0
 
     def _is_given(self, item: WireItem) -> bool:
-        """Whether the replayed bus gives it to the driver."""
+        """Return whether the replayed bus delivers it to the driver."""
         if item.is_sent:
             return self._medium == "modbus"
         return not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG)
@@ -202,7 +202,7 @@ class _Replay:
         self._then_ns.append(then_ns)
 
     def then_ns(self, time_ns: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, np.dtype[np.int64]]:
-        """When it was then what has these times now; 0 stays 0."""
+        """Return the recorded times of present times; 0 stays 0."""
         stamps_ns = np.frombuffer(self._stamps_ns, np.int64)
         if not len(stamps_ns):
             return time_ns
@@ -212,7 +212,7 @@ class _Replay:
 
 
 class _Published:
-    """Every frame that a driver publishes."""
+    """Every snapshot that a driver publishes."""
 
     def __init__(self) -> None:
         self._reader: DriverReader | None = None
@@ -255,7 +255,7 @@ class _Published:
 async def _run(
     clock: HandClock, replays: Sequence[_Replay], found: _Published, namespace: Namespace, listens: bool
 ) -> None:
-    """Run the driver until all was given, and published."""
+    """Run the driver until every frame is delivered, and the values are published."""
     lines = [replay.line for replay in replays if replay.line is not None]
     runner = Runner(_NAME, lines, name=_NAME, listen_only=listens, namespace=namespace, slots=_SLOTS, publish="cycle")
     running = asyncio.create_task(runner.run())

@@ -1,4 +1,4 @@
-"""Hold the verdicts of a proof, and write its report and capture."""
+"""The verdicts of a proof, and its files."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from skinware_drivers.doctor.report import Secrets, scrubbed
 
 
 class Verdict(enum.StrEnum):
-    """How a check went."""
+    """The result of a check."""
 
     PASSED = "passed"
     FAILED = "failed"
     SKIPPED = "skipped"
-    """The person wanted so."""
+    """The person left it out."""
     UNKNOWN = "not judged"
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """A check.
 
     Attributes:
-        what: it.
-        where: module, or bus; empty: all of it.
-        verdict: how it went.
+        what: its subject.
+        where: module or bus; empty: the whole device.
+        verdict: the result.
         seen: the evidence, in words.
     """
 
@@ -46,13 +46,12 @@ class Check:
 
 @dataclass
 class Proof:
-    """All of it.
+    """All checks of a device.
 
     Attributes:
-        driver: name of the driver.
-        driver_type: of it.
-        about: facts: what is told of the device, the driver and this machine's programs.
-        checks: in the order in which they were made.
+        driver, driver_type: of the driver.
+        about: facts on the device, the driver and this machine's programs.
+        checks: in order.
     """
 
     driver: str
@@ -73,12 +72,12 @@ class Proof:
 
     @property
     def is_proven(self) -> bool:
-        """Whether nothing failed and something passed that a person did."""
+        """Return whether no check failed, and a press of a person passed."""
         touched = any(check.verdict is Verdict.PASSED and check.what == "right module" for check in self.checks)
         return touched and not self.counts["failed"]
 
     def as_data(self) -> dict[str, Any]:
-        """For JSON; texts without secrets."""
+        """Return the data for JSON, without secrets."""
         secrets = Secrets.of_this_machine()
         checks = [
             {"what": one.what, "where": one.where, "verdict": one.verdict.value, "seen": scrubbed(one.seen, secrets)}
@@ -112,14 +111,14 @@ class Proof:
 
 
 class ProofFiles:
-    """Report, the same as JSON, and the capture.
+    """The files of a proof: a report, the same as JSON, and a capture.
 
     Args:
-        stem: what their names have in common.
+        stem: the common part of their names.
 
     Attributes:
-        report, data, capture: their paths; the capture is written by others.
-        captured: what came of the capture; empty as long as it is not known.
+        report, data, capture: paths; a recorder writes the capture.
+        captured: result of the capture; empty before its end.
     """
 
     def __init__(self, stem: Path) -> None:
@@ -133,10 +132,10 @@ class ProofFiles:
         return [str(path) for path in self._all if path.exists()]
 
     def refuse_old(self) -> None:
-        """Before somebody walks for ten minutes.
+        """Check before the walk that the files can be written.
 
         Raises:
-            ConfigurationError: there is no such folder, or a file is there already.
+            ConfigurationError: the folder is missing, or a file exists already.
         """
         if not self.capture.parent.is_dir():
             raise ConfigurationError(f"-o {self.capture.with_suffix('')}: there is no folder {self.capture.parent}")
@@ -144,14 +143,14 @@ class ProofFiles:
             raise ConfigurationError(f"{self.written[0]}: exists already: give another name (-o), or remove it")
 
     def capture_text(self, *, is_whole: bool) -> str:
-        beginning = "from the first byte on" if is_whole else "without what was said before skin-prove began"
+        beginning = "from the first byte on" if is_whole else "without the frames before skin-prove began"
         text = f"{self.capture.name}, {beginning}"
         if self.captured.get("lost"):
             text += f"; {self.captured['lost']} frames lost"
         return text + (f"; ended early: {self.captured['problem']}" if self.captured.get("problem") else "")
 
     def write(self, proof: Proof) -> OSError | None:
-        """Write the report and the same as JSON; what went wrong is no reason not to show the proof."""
+        """Write the report and the same as JSON; return an error, so that the proof can be shown first."""
         data = msgspec.json.format(msgspec.json.encode(proof.as_data()))
         wrong = None
         for path, content in ((self.report, proof.as_markdown().encode()), (self.data, data + b"\n")):
@@ -159,6 +158,6 @@ class ProofFiles:
                 path.write_bytes(content)
             except OSError as error:
                 with contextlib.suppress(OSError):
-                    path.unlink()  # half of it
+                    path.unlink()  # an incomplete file
                 wrong = wrong or OSError(error.errno, error.strerror, str(path))
         return wrong

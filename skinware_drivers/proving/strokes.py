@@ -1,7 +1,7 @@
-"""Whether the taxels of a matrix are where the driver says, by two strokes of a finger over all of it.
+"""Check the order of a matrix' taxels by two strokes of a finger over all of it.
 
-The first stroke goes down, from the first row to the last, the second across, from the first column to the last. A
-taxel tells where it is by when it answers; how fast the finger goes does not matter. Arrays, and no service.
+The first stroke goes down, from the first row to the last, the second across, from the first column to the last. The
+moment at which a taxel answers shows its place; the speed of the finger does not matter. Arrays only, no service.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ Places = npt.NDArray[np.int64]
 """(n, 2): row and column of each taxel."""
 
 _SURE = 0.5
-"""Agreement from which on an order is one: three of four pairs of taxels have it."""
+"""Least agreement of an order: three of four pairs of taxels have it."""
 
 
 class Matrix(NamedTuple):
     """Taxels in rows and columns, row by row.
 
     Attributes:
-        rows, columns: how many there are.
+        rows, columns: their numbers.
     """
 
     rows: int
@@ -35,26 +35,26 @@ class Matrix(NamedTuple):
 
     @classmethod
     def of_kind(cls, kind: str, count: int) -> Matrix | None:
-        """The matrix of a module's kind (``4x6``), if so many taxels fill it."""
+        """Return the matrix of a module's kind (``4x6``) if ``count`` taxels fill it."""
         shape = filled_by(kind, count)
         return cls(*shape) if shape is not None and count > 1 else None
 
     @property
     def places(self) -> Places:
-        """(n, 2) int64: row and column of each taxel."""
+        """Return (n, 2) int64: row and column of each taxel."""
         numbers = np.arange(self.rows * self.columns)
         return np.stack(np.divmod(numbers, self.columns), axis=1)
 
 
 @dataclass(frozen=True)
 class Order:
-    """What two strokes tell of a matrix.
+    """The order of a matrix by two strokes.
 
     Attributes:
-        wrong: in words, what is wrong with all of it: mirrored rows, say; empty: nothing.
-        misplaced: in words, which taxels answer at the places of others.
+        wrong: faults of the whole matrix in words, such as mirrored rows.
+        misplaced: taxels that answer at the places of others, in words.
         silent: numbers of taxels that answered to neither stroke.
-        judged: taxels that answered to both.
+        judged: number of taxels that answered to both.
     """
 
     wrong: Sequence[str]
@@ -64,13 +64,13 @@ class Order:
 
 
 def judge(matrix: Matrix, down: Floats, across: Floats, threshold: float) -> Order:
-    """Compare when taxels answered with where they are said to be.
+    """Compare the moments at which taxels answered with their declared places.
 
     Args:
-        matrix: what the driver says.
-        down: (frames, n) how far each taxel was from its rest while a finger went over the rows.
-        across: likewise, over the columns.
-        threshold: from which on a taxel has answered.
+        matrix: as the driver declares it.
+        down: (frames, n) distance of each taxel from its rest while a finger went over the rows.
+        across: the same while it went over the columns.
+        threshold: least distance of an answer.
     """
     heard = (_peak(down) > threshold) & (_peak(across) > threshold)
     silent = np.flatnonzero((_peak(down) <= threshold) & (_peak(across) <= threshold))
@@ -85,7 +85,7 @@ def _peak(stroke: Floats) -> Floats:
 
 
 def _moments(stroke: Floats, threshold: float) -> Floats:
-    """(n,) when each taxel was pressed most, in frames: the centre of the upper half of its answer."""
+    """Return (n,) the moment of the strongest press of each taxel, in frames: the centre of its answer's upper half."""
     weight = np.maximum(stroke - np.maximum(_peak(stroke) / 2, threshold), 0)
     total = weight.sum(axis=0)
     frames = np.arange(len(stroke))[:, np.newaxis]
@@ -94,7 +94,7 @@ def _moments(stroke: Floats, threshold: float) -> Floats:
 
 
 def _turned(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_]) -> tuple[list[str], Places | None]:
-    """What is wrong with all of a matrix, and where its taxels are then; None: that cannot be told."""
+    """Return faults of the whole matrix, and the places of its taxels then; None: unknown."""
     places = matrix.places
     if heard.sum() < 2:
         return [], None
@@ -116,7 +116,7 @@ def _turned(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_]) -> tu
 
 
 def _no_order(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], name: str) -> str:
-    """The taxels of an axis answer in no order: perhaps the matrix has another shape."""
+    """Explain an axis without order: perhaps the matrix has another shape."""
     other = Matrix(matrix.columns, matrix.rows)
     fits = [abs(_agreement(moments[heard, axis], other.places[heard, axis])) >= _SURE for axis in (0, 1)]
     if matrix.rows != matrix.columns and all(fits):
@@ -125,9 +125,9 @@ def _no_order(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], nam
 
 
 def _agreement(moments: Floats, places: npt.NDArray[np.int64]) -> float:
-    """Of all pairs of taxels in different lines, how many answered in the order of these: 1 all, -1 none.
+    """Return how many pairs of taxels in different lines answered in the order of the lines: 1 all, -1 none.
 
-    Pairs, since two exchanged taxels, however far apart, are in few of them.
+    Two exchanged taxels, however far apart, are in few pairs.
     """
     apart = np.sign(places[:, np.newaxis] - places)
     if not apart.any():
@@ -150,14 +150,14 @@ def _misplaced(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], pl
             if taxel < other:
                 words.append(f"taxels {taxel} and {other} are exchanged")
         else:
-            words.append(f"taxel {taxel} answers where taxel {other} is said to be")
+            words.append(f"taxel {taxel} answers at the place of taxel {other}")
     return words
 
 
 def _nearest(moments: Floats, place: Places, heard: npt.NDArray[np.bool_], size: int) -> Places:
-    """(n,) the row, or column, whose taxels answered at the moment at which each did."""
+    """Return (n,) the row or column whose taxels answered at the moment of each taxel."""
     counts = [int((heard & (place == line)).sum()) for line in range(size)]
-    if size < 2 or min(counts) < 3:  # with fewer, one that is misplaced would move its own row
+    if size < 2 or min(counts) < 3:  # with fewer, a misplaced one would move its own row
         return place
     usual = np.array([np.median(moments[heard & (place == line)]) for line in range(size)])
     distance = np.abs(np.nan_to_num(moments)[:, np.newaxis] - usual)

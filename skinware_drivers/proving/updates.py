@@ -1,8 +1,7 @@
-"""What a driver made of a wire, update by update, and the first in which it makes something else of it now.
+"""Compare two decodings of one wire, update by update, and find the first difference.
 
-An update is what a module showed at one time. Two decoders are compared by the updates that have the same time, or
-else one by one from the last one backwards: times by the clock of a device are estimated, at first not very well, and
-another decoder may begin with that at another update.
+Updates with the same time are compared, or else the updates one by one from the last one backwards: times by the clock
+of a device are estimated, at first not very well, and another decoder may begin to estimate at another update.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Updates:
-    """Of one module, in order.
+    """The updates of one module, in order.
 
     Attributes:
         sensors: (n,) names.
-        time_ns: (k,) int64, when, since the recording began.
+        time_ns: (k,) int64, since the recording began.
         values: (k, n) raw.
     """
 
@@ -43,17 +42,17 @@ class Updates:
 
 
 Decoding = Mapping[tuple[int, ...], Updates]
-"""All modules of which something came, by the uids of their sensors."""
+"""The updates of each module, by the uids of its sensors."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Something that one decoder makes of a wire and the other does not.
+    """A difference between two decodings.
 
     Attributes:
         time_s: since the recording began.
-        sensor: name of the first that differs.
-        then, now: its raw value; None: there is no such update.
+        sensor: name of the first sensor that differs.
+        then, now: its raw values; None: there is no such update.
     """
 
     time_s: float
@@ -71,8 +70,8 @@ class Comparison:
     """Two decodings of one wire.
 
     Attributes:
-        compared: updates that both have, and that were compared.
-        then, now: updates that each has.
+        compared: number of updates that were compared.
+        then, now: number of updates of each decoding.
         difference: the first by time; None: they are equal.
     """
 
@@ -83,10 +82,10 @@ class Comparison:
 
 
 class Collected:
-    """Puts updates together from frames, as they are published.
+    """Collect updates from snapshots.
 
     Args:
-        began_ns: when the recording began, in the time of the frames.
+        began_ns: beginning of the recording, in the time of the snapshots.
     """
 
     def __init__(self, began_ns: int = 0) -> None:
@@ -94,7 +93,7 @@ class Collected:
         self._parts: dict[tuple[int, ...], list[Updates]] = {}
 
     def add(self, structure: Structure, values: npt.NDArray[Any], module_time_ns: Times) -> None:
-        """Frames of one structure, in order.
+        """Add snapshots of one structure, in order.
 
         Args:
             structure: of the driver.
@@ -121,11 +120,11 @@ def _joined(parts: list[Updates]) -> Updates:
 
 
 def compare(then: Decoding, now: Decoding) -> Comparison:
-    """Hold two decodings of one wire against each other.
+    """Compare two decodings of one wire.
 
-    What is made of the beginning may differ: until a driver knows its devices, it shows nothing. So each module is
-    compared from its first common update to its last. In between, each update of then has to be there now, with the
-    same values. More of them now is no difference: a machine may have been too busy then to show all.
+    The beginnings may differ, because a driver shows nothing until it knows its devices. So each module is compared
+    from its first common update to its last. In between, each update of then must exist now with the same values. More
+    updates now are no difference: a machine may have been too busy to show all.
     """
     pairs = list(_in_pairs(then, now))
     differences = sorted((found for _, found in pairs if found is not None), key=lambda one: one.time_s)
@@ -138,7 +137,7 @@ def compare(then: Decoding, now: Decoding) -> Comparison:
 
 
 def _in_pairs(then: Decoding, now: Decoding) -> Iterator[tuple[int, Difference | None]]:
-    """How many updates of each module were compared, and the first that differs."""
+    """Yield the number of compared updates and the first difference of each module."""
     for uids, old in then.items():
         new = now.get(uids)
         yield (0, _without_partner(old, 0, is_then=True)) if new is None else _of_module(old, new)
@@ -173,13 +172,13 @@ def _of_module(old: Updates, new: Updates) -> tuple[int, Difference | None]:
 
 
 def _differ(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> Flags:
-    """Which values differ; NaN is equal to NaN."""
+    """Return which values differ; NaN is equal to NaN."""
     found: Flags = (one != other) & ~((one != one) & (other != other))
     return found
 
 
 def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:
-    """(k,) which update now is nearest to each of then; and whether it is the same one: nearest to each other."""
+    """Return (k,) the update of now nearest to each of then, and whether the two are nearest to each other."""
     nearest, back = _nearest(old_ns, new_ns), _nearest(new_ns, old_ns)
     apart_ns = np.abs(new_ns[nearest] - old_ns)
     usual_ns = float(np.median(np.diff(old_ns))) if len(old_ns) > 1 else np.inf
@@ -202,10 +201,10 @@ def _without_partner(of: Updates, row: int, *, is_then: bool) -> Difference:
 
 
 def save(decoding: Decoding, path: Path) -> None:
-    """Write a decoding into a file that others are held against.
+    """Write the expected values of a capture.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     arrays: dict[str, Any] = {}
     for number, (uids, of) in enumerate(decoding.items()):
@@ -219,17 +218,17 @@ def save(decoding: Decoding, path: Path) -> None:
 
 
 def load(path: Path) -> Decoding:
-    """Read what :func:`save` has written.
+    """Read a file of :func:`save`.
 
     Raises:
-        BadRecording: it is no such file.
-        OSError: it cannot be read.
+        BadRecording: the file is not one.
+        OSError: the file cannot be read.
     """
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             return dict(_modules_in(file, file.files))
     except (ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise BadRecording(f"{path}: no values that skin-prove has saved ({error})") from None
+        raise BadRecording(f"{path}: not a file of skin-prove --save ({error})") from None
 
 
 def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple[tuple[int, ...], Updates]]:

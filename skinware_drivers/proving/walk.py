@@ -1,4 +1,4 @@
-"""The walk over a device: a person is asked to press here and stroke there, and the values say what was felt."""
+"""Walk over a device: ask a person to press and stroke its modules, and judge the values."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._driver_snapshots import after, frames_until
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.text import figure_text, plural
+from skinware.text import figure_text, plural, words
+from skinware.views.driver_snapshots import after, frames_until
 from skinware_drivers.proving.proof import Proof, Verdict
 from skinware_drivers.proving.strokes import Matrix, judge
 
@@ -34,12 +34,12 @@ _UNUSABLE = int(Status.NEVER_SEEN | Status.STALE | Status.MASKED)
 
 
 class Step(NamedTuple):
-    """What a person is asked for.
+    """A request to a person.
 
     Attributes:
-        wanted: kind of it.
-        module: name of the module; empty: of all.
-        text: the same, in words.
+        wanted: kind of the step.
+        module: name of the module; empty: all.
+        text: the request in words.
     """
 
     wanted: Wanted
@@ -48,25 +48,25 @@ class Step(NamedTuple):
 
 
 class Person(Protocol):
-    """Who has the device in his hands."""
+    """The person with the device."""
 
     def ask(self, step: Step) -> None:
-        """Ask for something; does not wait for it."""
+        """Show a request, without waiting."""
 
     def skips(self) -> bool:
-        """Whether he does not want this module, since it was last asked."""
+        """Return whether the person has asked to leave this module out, since the last call."""
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How the walk is done.
+    """Settings of a walk.
 
     Attributes:
-        type_name: sensors that are looked at; None: pressure, force, or the first type.
-        only: words of which one is in the name of each module that is to be pressed; empty: all.
-        patience_s: for each step.
-        rest_s: how long nobody touches the skin at first.
-        with_tare: at last, have the driver tare, if it can.
+        type_name: type of the sensors; None: pressure, force, or the first type.
+        only: press the modules with one of these words in their names; empty: all.
+        patience_s: longest time of a step.
+        rest_s: duration of the rest at the beginning.
+        with_tare: let the driver tare at the end, if it can.
     """
 
     type_name: str | None = None
@@ -77,7 +77,7 @@ class Manner:
 
 
 class _Missed(Exception):
-    """Nobody did what was asked for in time: which check has no answer, and why."""
+    """A step was not done in time: the check without an answer, and why."""
 
     def __init__(self, what: str, why: str) -> None:
         super().__init__(why)
@@ -85,22 +85,22 @@ class _Missed(Exception):
 
 
 class _Skipped(Exception):
-    """He does not want to."""
+    """The person leaves the module out."""
 
 
 def walk(reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
-    """Go over all modules, and add what was seen to a proof, which is right also if this is interrupted.
+    """Check all modules, and add the checks to a proof, which is valid also if the walk is interrupted.
 
     Args:
         reader: of the driver.
         person: who presses.
-        manner: how.
-        proof: that is added to.
+        manner: the settings.
+        proof: takes the checks.
 
     Raises:
-        ServiceTimeout: no frame came for 5 s.
+        ServiceTimeout: no snapshot came for 5 s.
         StructureChanged: the driver has other sensors now.
-        StructureError: no sensors of this type, or no such module.
+        StructureError: the driver has no sensors of this type, or no such module.
     """
     _Walk(reader, person, manner, proof).go()
 
@@ -115,7 +115,7 @@ class _Walk:
         module = structure.module_of(chosen)
         self._modules = [int(number) for number in np.unique(module) if self._is_wanted(int(number))]
         if not self._modules:
-            raise StructureError(f"no module of {reader.name} is called so; there are: {', '.join(self._names)}")
+            raise StructureError(f"no module of {reader.name} has such a name; its modules: {', '.join(self._names)}")
         self._taxels = {int(number): np.flatnonzero(module == number) for number in np.unique(module)}
         self._rest: Values = np.zeros(0)
         self._low: Values = np.full(len(module), np.inf)
@@ -136,14 +136,14 @@ class _Walk:
     def go(self) -> None:
         self._proof.about["sensors"] = f"{self._structure.n_sensors}, judged by {self._type.name} ({self._type.unit})"
         try:
-            self._look_at_rest()
+            self._check_rest()
             for module in self._modules:
-                self._look_at(module)
+                self._check(module)
             self._tare()
         finally:
-            self._look_at_losses()
+            self._check_losses()
 
-    def _look_at(self, module: int) -> None:
+    def _check(self, module: int) -> None:
         name = self._names[module]
         try:
             self._press(module)
@@ -174,19 +174,19 @@ class _Walk:
             self._proof.add("tare", "", Verdict.SKIPPED, "not wanted")
         else:
             left = float(np.abs(values[-1][self._usable]).max()) if values and self._usable.any() else np.nan
-            told = f"at most {figure_text(left, 3)} {self._type.unit} is left"
-            self._proof.add("tare", "", left <= self._threshold, told)
+            seen = f"at most {figure_text(left, 3)} {self._type.unit} is left"
+            self._proof.add("tare", "", left <= self._threshold, seen)
 
     # -- at rest --------------------------------------------------------------------------------------------------
 
-    def _look_at_rest(self) -> None:
+    def _check_rest(self) -> None:
         self._ask("rest", "", "leave the device alone")
         frames, stamps = [], []
         for frame, values in self._frames(after(self._manner.rest_s), may_skip=False):
             frames.append(values)
             stamps.append(frame.module_time_ns.copy())
         if len(frames) < 2:
-            raise StructureError(f"{self._reader.name} publishes no frames that could be judged")
+            raise StructureError(f"{self._reader.name} publishes too few snapshots to judge")
         all_values = np.array(frames)
         self._rest = np.median(all_values, axis=0)
         count = abs(self._type.scale) if self._structure.dtype.kind != "f" else 0.0
@@ -198,7 +198,7 @@ class _Walk:
         self._proof.about["noise"] = (
             f"{figure_text(noise, 3)} {unit}; pressed is more than {figure_text(self._threshold, 3)}"
         )
-        self._look_at_rate(np.array(stamps))
+        self._check_rate(np.array(stamps))
 
     def _without_data(self) -> str:
         missing = np.flatnonzero(~self._usable)
@@ -206,8 +206,8 @@ class _Walk:
             return plural(len(self._usable), "taxel")
         return f"none from {self._named(missing)}"
 
-    def _look_at_rate(self, stamps: npt.NDArray[np.int64]) -> None:
-        """How often modules are new. Of frames that were not seen, as of those that were."""
+    def _check_rate(self, stamps: npt.NDArray[np.int64]) -> None:
+        """Check the rate of updates; snapshots that were missed count like those that were read."""
         first, last = self._first, self._last
         if first is None or last is None or last.published_ns == first.published_ns:
             return
@@ -221,14 +221,14 @@ class _Walk:
             is_right = rate_hz >= _LEAST_RATE * nominal_hz
             self._proof.add("rate", self._names[module], is_right, f"{rate_hz:.1f} of {nominal_hz:.1f} a second")
 
-    def _look_at_losses(self) -> None:
+    def _check_losses(self) -> None:
         if self._first is None or self._last is None:
             return
         before, now = self._reader.bus_counters(self._first), self._reader.bus_counters(self._last)
         for bus, (old, new) in enumerate(zip(before, now, strict=True)):
             grown = {name: new[name] - old.get(name, 0) for name in new if name in _LOSSES}
-            told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in grown.items() if count)
-            self._proof.add("losses", f"bus {bus}", not any(grown.values()), told or "none")
+            lost = ", ".join(f"{count} {words(name)}" for name, count in grown.items() if count)
+            self._proof.add("losses", f"bus {bus}", not any(grown.values()), lost or "none")
 
     # -- touched --------------------------------------------------------------------------------------------------
 
@@ -248,13 +248,13 @@ class _Walk:
         where = f"{self._structure.sensor_names(self._type.name)[most]} by {figure_text(signed, 3)} {self._type.unit}"
         self._proof.add("right module", name, answered == module, where)
         self._proof.add("sign", name, signed > 0, "grows" if signed > 0 else "goes down when it is pressed")
-        self._look_at_range(name, values[taxels], frame)
+        self._check_range(name, values[taxels], frame)
         self._ask("let go", name, f"let go of {name}")
         for _, values in self._patiently("comes to rest", "some taxels did not"):
             if np.nanmax(np.abs(values - self._rest)) <= self._threshold:
                 break
 
-    def _look_at_range(self, name: str, values: Values, frame: DriverSnapshot | None) -> None:
+    def _check_range(self, name: str, values: Values, frame: DriverSnapshot | None) -> None:
         flagged = 0
         if frame is not None:
             status = frame.status_of(self._type.name)
@@ -293,7 +293,7 @@ class _Walk:
             self._proof.add("taxel answers", name, False, f"{len(silent)} in all did not")
 
     def _stroked(self, module: int, wanted: Wanted, text: str) -> Values:
-        """(frames, n) how far the taxels of a module were from their rest, from the first touch until it is lifted."""
+        """Return (frames, n): distances of a module's taxels from their rest, from the first touch until the lift."""
         self._ask(wanted, self._names[module], text)
         taxels = self._taxels[module]
         found: list[Values] = []
@@ -312,20 +312,20 @@ class _Walk:
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Frames until whoever takes them has what he wants; else a check fails, and says why.
+        """Yield snapshots as :meth:`_frames` does, until the patience ends.
 
         Raises:
-            _Missed: it took too long.
-            _Skipped: the person does not want it.
+            _Missed: the patience ended.
+            _Skipped: the person leaves the module out.
         """
         yield from self._frames(after(self._manner.patience_s))
         raise _Missed(what, else_)
 
     def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Frames with physical values of the type, (n,); of taxels without data, those at rest.
+        """Yield snapshots with (n,) physical values of the type; taxels without data have their values at rest.
 
         Raises:
-            _Skipped: the person does not want it, and may say so: without the rest nothing can be judged.
+            _Skipped: the person leaves the module out.
         """
         for frame in frames_until(self._reader, is_over):
             if self._person.skips() and may_skip:
@@ -354,4 +354,4 @@ class _Walk:
 
 
 _LOSSES = ("lost", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
-"""Counters of a bus that grow where something was lost or damaged."""
+"""Counters of losses and damage on a bus."""

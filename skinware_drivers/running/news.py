@@ -32,7 +32,7 @@ WORDS = {
     BusReason.NO_ACKNOWLEDGEMENT: "no node acknowledges what is sent (wires, power, another bit rate?)",
     BusReason.BUS_ERRORS: "broken frames are heard (another bit rate, termination, wires?)",
 }
-"""The meaning of each reason, for people; the other reasons come with an error of their own."""
+"""The meaning of each reason, for people; other reasons come with an error."""
 
 
 def reason_text(reason: BusReason) -> str:

@@ -104,7 +104,7 @@ def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
     with running("skin-replay", str(path), "--wire", "--loop", "--bus", f"pty:{link}") as replay:
         replay.wait_for("ready")
         adapter = kind(kind.Options())
-        after = record(again, adapter, make_bus(str(link), payload_size=adapter.payload_size), 15)
+        after = record(again, adapter, make_bus(str(link), payload_size=adapter.payload_size), 15, updates=20)
         replay.stop()
     assert after.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
     for old, new in zip(updates_of(before), updates_of(after), strict=True):

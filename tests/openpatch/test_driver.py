@@ -253,8 +253,9 @@ def test_two_patches_on_two_ports_and_one_that_comes_late(firmware: Path) -> Non
         with driving_lines([left.line(), right.line()], "openpatch", wait=False) as running:
             wait_until(lambda: running.runner is not None and bool(running.runner.lines[0].patches))
             right.run()
+            wait_until(lambda: len(running.status().get("patches", ())) == 2)
             with DriverReader("openpatch", timeout_s=30) as reader:
-                frame = read_until(reader, lambda f: f.structure.n_patches == 2 and is_fresh(f))
+                frame = read_until(reader, is_fresh)
                 assert frame.structure.patch_name.tolist() == [b"test patch L", b"test patch R"]
                 assert frame.structure.sensor_uid.tolist()[13:] == [
                     uid + (1 << 32) for uid in frame.structure.sensor_uid.tolist()[:13]

@@ -78,7 +78,7 @@ def test_it_starts_a_driver_and_captures_its_first_byte(tmp_path: Path) -> None:
     own = ("--rest", "0.3", "--wait", "0.2", "--only", "palm", "-o", str(stem))
     missed = run("skin-prove", *own, "--", "--driver", "weiss_wts", "--bus", "virtual")
     assert missed.returncode == 1
-    assert "no module of weiss_wts is called so" in missed.stderr
+    assert "no module of weiss_wts has such a name" in missed.stderr
     with skinware.recording.open(tmp_path / "proof.mcap") as recording:
         (wire,) = recording.wires
         assert next(wire.items()).is_sent
@@ -253,7 +253,7 @@ def test_a_driver_whose_author_prints_is_heard_nevertheless(tmp_path: Path, tcp_
     bus = f"tcp://{tcp_patch('weiss_wts')}"
     missed = run("skin-prove", *own, "--", "--driver", str(tmp_path / "noisy.py"), "--bus", bus)
     assert missed.returncode == 1
-    assert "no module of noisy is called so" in missed.stderr
+    assert "no module of noisy has such a name" in missed.stderr
 
 
 def pressed(rest: Any, taxel: int) -> Any:

@@ -79,9 +79,11 @@ def test_taring_is_tried_if_it_is_wanted() -> None:
         raise BusError("it is not at rest")
 
     done = tared(tare)
-    assert (done.verdict, done.seen) == (Verdict.PASSED, "at most 2 counts is left")
+    assert done.verdict is Verdict.PASSED
+    assert done.seen in [f"at most {noise} counts is left" for noise in (1, 2)]
     in_vain = tared(lambda _hand: None)
-    assert (in_vain.verdict, in_vain.seen) == (Verdict.FAILED, "at most 12 counts is left")
+    assert in_vain.verdict is Verdict.FAILED
+    assert in_vain.seen in [f"at most {10 + noise} counts is left" for noise in (1, 2)]
     refused = tared(refuse)
     assert refused.verdict is Verdict.FAILED
     assert "it is not at rest" in refused.seen

@@ -65,9 +65,10 @@ def cable() -> Iterator[Cable]:
     cable.close()
 
 
-def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, **options: Any) -> Series:
-    """So many frames of a driver, with what goes over its wire; what was recorded of it."""
-    with recording(path, with_wires=True) as recorder, driving_lines([(adapter, bus)], "skin", **options):
+def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, *, updates: int = 0) -> Series:
+    """Record a driver and its wire until there are so many snapshots, and of each patch so many updates."""
+    with recording(path, with_wires=True) as recorder, driving_lines([(adapter, bus)], "skin") as driver:
+        wait_until(lambda: all(patch["updates"] >= updates for patch in driver.status()["patches"]))
         wait_until(lambda: recorder.messages.get("/skin/skin/frame", 0) >= frames)
     with skinware.recording.open(path) as opened:
         assert opened.problems == []

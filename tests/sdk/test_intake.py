@@ -82,6 +82,46 @@ def test_while_an_answer_is_waited_for_it_is_shorter(monkeypatch: pytest.MonkeyP
     assert rest_s == pytest.approx(TAKE_NS / 1e9)
 
 
+def test_none_of_its_looks_outlives_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a new generation starts it again while it rests."""
+    looks: list[asyncio.TimerHandle] = []
+
+    async def take() -> None:
+        loop = asyncio.get_running_loop()
+        gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), lambda _batch: None, 1.0)
+        rested = asyncio.Event()
+
+        def call_later(_delay_s: float, call: Any) -> asyncio.TimerHandle:
+            looks.append(loop.call_at(loop.time() + 3600, call))
+            rested.set()
+            return looks[-1]
+
+        monkeypatch.setattr(loop, "call_later", call_later)
+        for _ in range(2):
+            gather.start()
+            os.eventfd_write(fd, 1)
+            await rested.wait()
+            rested.clear()
+        gather.stop()
+
+    def receive(_batch: FrameBatch, _ordinal: int) -> int:
+        os.eventfd_read(fd)
+        return 0
+
+    fd = os.eventfd(0)
+    line: Any = SimpleNamespace(
+        bus=SimpleNamespace(receive=receive, fileno=lambda: fd, asks=False),
+        link=SimpleNamespace(is_awaiting=False, expects_data=False),
+        condition=SimpleNamespace(heard_ns=0),
+        ordinal=0,
+    )
+    with select.epoll() as epoll:
+        epoll.register(fd, select.EPOLLIN)
+        asyncio.run(take())
+    os.close(fd)
+    assert [look.cancelled() for look in looks] == [True, True]
+
+
 def test_a_wake_up_ends_in_time_however_much_waits() -> None:
     """Between two of them come signals, timers and handshakes."""
     clock_ns = now_ns()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from skinware import DriverReader
 from skinware.memory.statistics import BUCKETS, Histogram
-from skinware_drivers.running.patch_timing import PatchTiming
+from skinware_drivers.running.publisher import PatchTiming
 from tests.cli.fake_skin import fake_structure
 from tests.sdk.driving import driving, emulated, read_until
 

@@ -7,7 +7,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import dropwhile, pairwise
 from typing import cast
 
 import numpy as np
@@ -80,11 +80,11 @@ def test_answers_to_polls_are_published_one_by_one_at_absolute_deadlines() -> No
     device = Device()
     with driving_lines([(Answering(NoOptions()), bus_with(device))], "answering") as running:
         with DriverReader("answering") as reader:
-            fresh = (frame for frame in reader.in_order(timeout_s=30) if not frame.status.any())
+            fresh = dropwhile(lambda frame: bool(frame.status.any()), reader.in_order(timeout_s=30))
             values = [int(next(fresh).values[0]) for _ in range(20)]
         asked_ns = device.asked_ns.copy()
         missed = running.status()["buses"][0]["polls_missed"]  # by then, and perhaps a few since
-    assert all(b - a in (0, 1) for a, b in pairwise(values))
+    assert all(0 <= b - a <= 1 + reader.lost for a, b in pairwise(values))  # and a reader that was held up misses some
     # no drift: polls lie on one grid of 20 ms, but for how late each was sent; what it lacks was counted
     deadlines = [(asked - asked_ns[0]) / (20 * MS) for asked in asked_ns]
     assert max(round(d) for d in deadlines) <= len(deadlines) - 1 + missed + 1

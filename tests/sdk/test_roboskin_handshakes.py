@@ -227,15 +227,17 @@ def test_boards_of_a_second_bus_are_set_up_again_on_that_bus(
     first_log: list[msgspec.Struct] = []
     log: list[msgspec.Struct] = []
     first, second = emulated(first_log, boards=(7, 8)), emulated(log, boards=(7, 8), boot_s=0.1, pattern="idle")
-    with caplog.at_level(logging.WARNING), driving(first, second) as running, DriverReader("roboskin") as reader:
-        read_until(reader, lambda f: not (f.status & (Status.NEVER_SEEN | Status.STALE)).any())
-        before, first_before = len(commands(log)), len(commands(first_log))
-        running.do(lambda: hardware_of(second).restart(8, second._clock()))
-        read_until(reader, lambda f: f.patch_state[3] != PatchState.LIVE)
-        read_until(reader, lambda f: f.patch_state[3] == PatchState.LIVE)
-        assert {identifier for _, identifier, _ in commands(log)[before:]} == {0x208}
-        assert len(commands(first_log)) == first_before
-        wait_until(lambda: "bus1: board 8 is live again" in caplog.text)
+    with caplog.at_level(logging.WARNING), driving(first, second) as running:
+        wait_until(lambda: len(running.status()["patches"]) == 4)  # a held-up driver finds the last one late
+        with DriverReader("roboskin") as reader:
+            read_until(reader, lambda f: not (f.status & (Status.NEVER_SEEN | Status.STALE)).any())
+            before, first_before = len(commands(log)), len(commands(first_log))
+            running.do(lambda: hardware_of(second).restart(8, second._clock()))
+            read_until(reader, lambda f: f.patch_state[3] != PatchState.LIVE)
+            read_until(reader, lambda f: f.patch_state[3] == PatchState.LIVE)
+            assert {identifier for _, identifier, _ in commands(log)[before:]} == {0x208}
+            assert len(commands(first_log)) == first_before
+            wait_until(lambda: "bus1: board 8 is live again" in caplog.text)
     assert "bus1: board 8 is silent but answers: it has restarted" in caplog.text
 
 

@@ -272,7 +272,7 @@ def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.
 def test_a_listener_that_hears_nobody_says_so(caplog: pytest.LogCaptureFixture) -> None:
     bus = emulated(boards=(7,), listen_only=True)
     with caplog.at_level(logging.WARNING), driving(bus, wait=False, listen_only=True, learn_s=0.1):
-        wait_until(lambda: "no patch is heard, and nobody may be asked; waiting for one to appear" in caplog.text)
+        wait_until(lambda: "no patch is heard, and no device may be asked; waiting for one to appear" in caplog.text)
 
 
 def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:

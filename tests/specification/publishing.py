@@ -10,7 +10,7 @@ import numpy.typing as npt
 from skinware.realtime import now_ns
 from skinware.status import PatchState, Status
 from skinware_drivers.decoding.skin_state import Updates
-from skinware_drivers.running.publisher import NOBODY_WAITS, Publisher
+from skinware_drivers.running.publisher import NEVER_NS, Publisher
 from tests.specification.bursts import Bursts
 
 _STALE = np.uint8(Status.STALE)
@@ -118,7 +118,7 @@ class SpecifiedPublisher(Publisher):
         columns["data_path"][:] = self.data_path
         columns["bus_data_path"][:] = self.buses.data_path
         self.writer.commit(state.newest_ns or time_ns)
-        if self.wanted_ns < NOBODY_WAITS:
+        if self.wanted_ns < NEVER_NS:
             self.answer(self._oldest_new_ns(time_ns))
 
     def _update_patch_states(self, time_ns: int) -> None:

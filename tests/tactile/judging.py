@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.calm import BaselineSettings
+from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import BENCH_S, Cover, Gesture, Push, Stroke, World, bench_world, grid
 from tests.tactile.peers import CapSense, ICub, Judged, QTouch, Rule, TareOnce
 

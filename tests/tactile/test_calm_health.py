@@ -16,11 +16,11 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceReader, ServiceWriter, Status
 from skinware.errors import BadServiceFile
 from skinware.sensor_types import SHEAR_X, TEMPERATURE
-from skinware.tactile.calm_contacts import CalmHealth
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState, save_state
 from skinware.tactile.contacts_service import ContactsReader
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
+from skinware.tactile.derived_services import CalmHealth
+from skinware.tactile.health import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader, HealthWriter
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.tactile.test_calm_contacts import calming, press
@@ -138,7 +138,7 @@ def test_health_that_does_not_fit_is_begun_anew(
         LearnedState(path, skin.health).restore(skin.chain)
         skin.go_on(PERIOD_NS)
         assert skin.health.faulty == 0
-    assert ("begun anew" in caplog.text) == (damage != "of another scale")
+    assert ("what was learned is lost" in caplog.text) == (damage != "of another scale")
 
 
 def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace) -> None:

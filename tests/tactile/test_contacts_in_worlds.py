@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.calm import BaselineSettings
 from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
+from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import Response, World, grid
 from tests.tactile.skins import PITCH_M, placed
 

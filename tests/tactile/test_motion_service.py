@@ -9,7 +9,7 @@ import pytest
 
 from skinware import Namespace, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.tactile.calm_contacts import WatchedRegions
+from skinware.tactile.derived_services import WatchedRegions
 from skinware.tactile.motion import COLUMNS
 from skinware.tactile.motion_service import MotionReader, MotionWriter
 from skinware.tactile.regions import Region, Regions

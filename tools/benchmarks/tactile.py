@@ -160,8 +160,8 @@ def calm_down(pipe: Connection, source: Namespace, into: Namespace, state_path: 
         elif begun and time.monotonic() - begun[0] > seconds:
             calm.stop()
 
-    calm = CalmService("skin", namespace=source, into=into, state_path=state_path, on_ready=lambda: pipe.send("ready"))
-    calm.run(look, every_s=0.2)
+    calm = CalmService("skin", namespace=source, into=into, state_path=state_path)
+    calm.run(look, every_s=0.2, on_ready=lambda: pipe.send("ready"))
     pipe.send((time.process_time() - begun[1], time.monotonic() - begun[0], calm.frames - begun[2]))
 
 

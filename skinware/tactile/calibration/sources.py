@@ -12,8 +12,8 @@ from skinware.errors import ConfigurationError, Overrun, ServiceTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.structure import Structure
-from skinware.tactile.baseline import UNUSABLE
 from skinware.tactile.chain import Chain, ChainSettings
+from skinware.tactile.rule import UNUSABLE
 
 ArrayF = npt.NDArray[np.float64]
 

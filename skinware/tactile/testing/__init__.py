@@ -1,6 +1,6 @@
-"""A world to test in: a skin with places, somebody who presses it, and all that is wrong with real skins.
+"""Simulate a skin with places, somebody who presses it, and the faults of real skins, as a truth to test against.
 
-It gives arrays, so that algorithms can be tried against a truth that no real skin tells::
+It gives arrays, so that an algorithm can be compared with the load that no real skin knows::
 
     from skinware.tactile.testing import World, grid
 
@@ -11,12 +11,10 @@ It gives arrays, so that algorithms can be tried against a truth that no real sk
 """
 
 from skinware.tactile.testing.bench import BENCH_S, bench_world
-from skinware.tactile.testing.block import Block, Sample
-from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke, Wander
+from skinware.tactile.testing.gestures import Cover, Gesture, Play, Push, Stroke, Wander, read_stage
 from skinware.tactile.testing.response import Response
-from skinware.tactile.testing.stage import Play, read_stage
 from skinware.tactile.testing.surface import ARM_FRAME, Surface, arm, arm_path, grid, triangles
-from skinware.tactile.testing.world import World
+from skinware.tactile.testing.world import Block, Sample, World
 
 __all__ = [
     "ARM_FRAME",

@@ -1,4 +1,4 @@
-"""The world in which rules for baselines are compared: 25 minutes of a skin that drifts, and everything people do."""
+"""Make the world in which rules for baselines are compared: 25 minutes of drift and of all kinds of touches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinware.tactile.testing.surface import grid
 from skinware.tactile.testing.world import World
 
 BENCH_S = 1500.0
-"""How long it lasts."""
+"""How long it lasts, s."""
 _DRIFT_PER_MIN = {"slow": 0.5, "fast": 3.0}
 _TAXELS = 12
 
@@ -25,7 +25,7 @@ def bench_world(
     patches: int = 1,
     dtype: npt.DTypeLike = np.uint8,
 ) -> World:
-    """120 taxels in 10 modules of 12, 8 bits, that drift together, each in its own degree, and somebody who presses.
+    """Make 120 taxels in 10 modules of 12, 8 bits, that drift together, each in its own degree, and press them.
 
     Each kind of gesture has a module of its own, and its name:
 
@@ -39,16 +39,16 @@ def bench_world(
     4        ``weak``       6 counts from second 800 to 1100
     5        ``firm``       60 counts for 60 s, from second 200 and 900 on: its neighbours sag by up to 12
     6        ``stroke``     20 counts along its rows, 3 s, each 30 s from second 90 on
-    7 to 9                  nobody touches them
+    7 to 9                  never touched
     ======== ============== ======================================================================================
 
-    After a load goes, 20 % of it stays and goes with a time constant of 40 s.
+    After a release, 20 % of the load stays and fades with a time constant of 40 s.
 
     Args:
         drift: 0.5 or 3 counts per minute.
         rate_hz: of the frames.
         seed: of all that is random; the gestures do not depend on it.
-        patches: to which the modules belong in equal shares.
+        patches: number of patches; each has an equal share of the modules.
         dtype: of the values.
     """
     world = World(

@@ -1,16 +1,39 @@
-"""What somebody does to a skin: each gesture is a force over time, at a place that may move."""
+"""Press a simulated skin with gestures, forces over time at places that may move; read them from a stage file.
+
+::
+
+    format = "skinware-stage"
+    version = 1
+    repeat_s = 12.0                     # it begins again after this time; optional: default once
+
+    [[push]]
+    at_m = [0.07, 0.0225, 0.0]
+    force_n = 3.0
+    begin_s = 1.0
+    end_s = 4.0
+
+    [[stroke]]
+    path_m = [[0.02, 0.0225, 0.0], [0.12, 0.0225, 0.0]]
+    force_n = 4.0
+    begin_s = 5.0
+    end_s = 9.0
+    radius_m = 0.006                    # and rise_s, fall_s, name, as for Gesture
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TypedDict
+from pathlib import Path
+from typing import Annotated, TypedDict
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.testing.surface import Surface
+from skinware.toml_text import TomlText
 
 ArrayF = npt.NDArray[np.float64]
 
@@ -26,16 +49,16 @@ class How(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Gesture(ABC):
-    """Something that presses from ``begin_s`` to ``end_s``.
+    """A force that presses from ``begin_s`` to ``end_s``.
 
     Attributes:
-        force: at its full; what a taxel shows of it is the world's affair (``World.sensitivity``).
+        force: at its full; ``World.sensitivity`` says how much of it a taxel shows.
         begin_s: the force is 0 until then.
         end_s: the force is 0 from then on.
-        rise_s: the force grows for so long, linearly.
-        fall_s: before its end it shrinks for so long; None: as ``rise_s``, where there is time for it.
+        rise_s: the force grows for this long, linearly.
+        fall_s: before its end it shrinks for this long; None: as ``rise_s``, where there is time for it.
         radius_m: of the thing that presses: within it the load is even.
-        name: for tests that look for it.
+        name: for tests that select it.
 
     Raises:
         ConfigurationError: it ends before it has risen and fallen, or a number is not finite.
@@ -57,13 +80,13 @@ class Gesture(ABC):
 
     @property
     def falls_s(self) -> float:
-        """How long it falls."""
+        """How long it falls, s."""
         if self.fall_s is not None:
             return self.fall_s
         return max(min(self.rise_s, self.end_s - self.begin_s - self.rise_s), 0.0)
 
     def forces(self, time_s: ArrayF) -> ArrayF:
-        """(m,) the force at m times."""
+        """Return (m,) the force at m times."""
         points = np.array([self.begin_s, self.begin_s + self.rise_s, self.end_s - self.falls_s, self.end_s])
         full = np.interp(time_s, points, [0.0, 1.0, 1.0, 0.0], left=0.0, right=0.0)
         on = (time_s >= self.begin_s) & (time_s < self.end_s)
@@ -72,15 +95,15 @@ class Gesture(ABC):
 
     @abstractmethod
     def points_m(self, time_s: ArrayF) -> ArrayF:
-        """(m, 3) its place at m times, m; NaN if it has none."""
+        """Return (m, 3) its place at m times, m; NaN if it has none."""
 
     @abstractmethod
     def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
-        """(m, k) or (1, k): how far k taxels are from the thing that presses, at m times; NaN or inf: nowhere near."""
+        """Return (m, k) or (1, k) the distances of k taxels from it at m times, m; NaN or inf: out of reach."""
 
     @abstractmethod
     def least_distances_m(self, surface: Surface) -> ArrayF:
-        """(n,) how near the thing ever comes to each taxel."""
+        """Return (n,) how near it ever comes to each taxel, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +121,10 @@ class Push(Gesture):
 
     def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
         del time_s  # it does not move
-        return self._beyond(surface.position_m[taxels])[np.newaxis]
+        return self.least_distances_m(surface)[taxels][np.newaxis]
 
     def least_distances_m(self, surface: Surface) -> ArrayF:
-        return self._beyond(surface.position_m)
-
-    def _beyond(self, position_m: ArrayF) -> ArrayF:
-        distance = np.linalg.norm(position_m - np.array(self.at_m), axis=1)
+        distance = np.linalg.norm(surface.position_m - np.array(self.at_m), axis=1)
         beyond: ArrayF = np.maximum(distance - self.radius_m, 0)
         return beyond
 
@@ -140,7 +160,7 @@ class Stroke(Gesture):
         return self._least(surface, self._line()[0])
 
     def _line(self, *, closed: bool = False) -> tuple[ArrayF, ArrayF]:
-        """(k, 3) the points, and (k,) the way to each of them."""
+        """(k, 3) the points, and (k,) the length of the line up to each of them."""
         path = np.array(self.path_m + self.path_m[: int(closed)], np.float64)
         return path, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
@@ -155,17 +175,16 @@ class Stroke(Gesture):
 
 
 def _along(path: ArrayF, length: ArrayF, way: ArrayF) -> ArrayF:
-    """(m, 3) the places at m ways along a line of points."""
     return np.stack([np.interp(way, length, path[:, axis]) for axis in range(3)], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wander(Stroke):
-    """A finger that goes round a closed path, and presses and lets go while it does.
+    """A finger that goes round a closed path, and presses and lets go on its way.
 
     Attributes:
         speed_m_s: along the path.
-        press_s: how long each press lasts, with ``rise_s`` and ``falls_s`` in it.
+        press_s: how long each press lasts, ``rise_s`` and ``falls_s`` included.
         pause_s: from the end of a press to the next.
     """
 
@@ -210,3 +229,68 @@ class Cover(Gesture):
         distance = np.full(len(surface), np.inf)
         distance[list(self.taxels)] = 0
         return distance
+
+
+FORMAT, VERSION = "skinware-stage", 1
+
+
+class _Act(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    force_n: float
+    begin_s: float
+    end_s: float
+    rise_s: float = 0.05
+    fall_s: float | None = None
+    radius_m: float = 0.006  # a finger
+    name: str = ""
+
+
+class _Push(_Act, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    at_m: tuple[float, float, float]
+
+
+class _Stroke(_Act, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    path_m: tuple[tuple[float, float, float], ...]
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    format: str
+    version: int
+    repeat_s: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    push: tuple[_Push, ...] = ()
+    stroke: tuple[_Stroke, ...] = ()
+
+
+@dataclass(frozen=True)
+class Play:
+    """The gestures of a stage file.
+
+    Attributes:
+        gestures: forces in N.
+        repeat_s: everything begins again after this time; None: it happens once.
+    """
+
+    gestures: tuple[Gesture, ...]
+    repeat_s: float | None
+
+
+def read_stage(path: str | Path) -> Play:
+    """Read a stage file.
+
+    Raises:
+        ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
+    """
+    text = TomlText(Path(path))
+    file = text.of_format("stage file", FORMAT, VERSION, _File)
+    gestures: list[Gesture] = []
+    kinds: list[tuple[str, type[Gesture], tuple[_Act, ...]]] = [
+        ("push", Push, file.push),
+        ("stroke", Stroke, file.stroke),
+    ]
+    for kind, gesture, acts in kinds:
+        for number, act in enumerate(acts):
+            how = msgspec.structs.asdict(act)
+            try:
+                gestures.append(gesture(force=how.pop("force_n"), **how))
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{text.place((kind, number))}: {error}") from None
+    return Play(tuple(gestures), file.repeat_s)

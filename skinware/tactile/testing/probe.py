@@ -1,4 +1,4 @@
-"""A probe that presses an emulated skin, point by point, and publishes where it is: a robot, as a calibration sees it.
+"""Press an emulated skin point by point and publish the points, as a robot does for a calibration.
 
 ::
 
@@ -34,18 +34,18 @@ class Probe:
 
     Args:
         skin: name of the driver or emulator.
-        name: of the service of its poses.
+        name: name of the service of its points.
         namespace: of both; default: the one of ``SKINWARE_NAMESPACE``.
         noise_m: standard deviation of the error of each published point in each axis.
-        force_n: of a press.
-        radius_m: of the probe.
+        force_n: force of a press.
+        radius_m: radius of the probe.
         press_s: how long each press lasts.
-        pause_s: from one to the next.
-        rate_hz: of the service.
-        seed: of the noise.
+        pause_s: from the end of a press to the next.
+        rate_hz: rate of the service.
+        seed: seed of the noise.
 
     Attributes:
-        presses: that were begun so far.
+        presses: number of presses so far.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class Probe:
         self.presses = 0
 
     def press(self, points_m: npt.ArrayLike) -> None:
-        """Press (m, 3) points, m, when those before are done; from any thread."""
+        """Press (m, 3) points, m, after those given before; may be called from any thread."""
         self._to_press.extend(np.asarray(points_m, np.float64).reshape(-1, 3).tolist())
 
     def run(self, stopping: threading.Event) -> None:
-        """Press and publish until it is stopped.
+        """Press and publish until ``stopping`` is set.
 
         Raises:
             ServiceNotFound: there is no such driver or emulator.

@@ -1,4 +1,4 @@
-"""Simulate how a skin answers a force, and what is wrong with it."""
+"""Simulate how a skin answers a force, and its faults."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from skinware.status import Status
 
 ArrayF = npt.NDArray[np.float64]
 _FAR = 5.0
-"""Beyond so many widths nothing is felt."""
+"""Widths beyond which nothing is felt."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """What taxels at a distance from a force show of it.
+    """The answer of taxels at a distance from a force.
 
     Attributes:
         width_m: of the bell, m: its standard deviation.
-        sag: the cover is pulled down round a contact: so much of the load is missing at ``sag_radius_m``.
+        sag: share of the load by which the cover is pulled down at ``sag_radius_m`` from a contact.
         sag_radius_m: where it sags most, m.
-        creep: under a load the value grows by this part of it.
-        remainder: when a load goes, this part of it stays for a while.
+        creep: share of a load by which the value grows under it.
+        remainder: share of a load that stays for a while after it.
         creep_s: time constant of both.
 
     Raises:
@@ -45,27 +45,27 @@ class Response:
 
     @property
     def reach_m(self) -> float:
-        """Farther than that from a contact nothing changes."""
+        """Distance from a contact beyond which nothing changes, m."""
         return _FAR * self.width_m if self.sag == 0 else max(_FAR * self.width_m, 4 * self.sag_radius_m)
 
     def bell(self, distance_m: ArrayF) -> ArrayF:
-        """The part of the force that is felt as load, at distances; 0 at NaN."""
+        """Return the share of the force that is felt as load, at distances; 0 at NaN."""
         near = distance_m <= _FAR * self.width_m
         load: ArrayF = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
         return load
 
     def ring(self, distance_m: ArrayF) -> ArrayF:
-        """The part of the force that is missing round it, at distances; 0 at NaN."""
+        """Return the share of the force that is missing round it, at distances; 0 at NaN."""
         squared = np.where(distance_m <= 4 * self.sag_radius_m, distance_m / self.sag_radius_m, 0) ** 2
         missing: ArrayF = self.sag * squared * np.exp(1 - squared)
         return missing
 
     def slowly(self, load: ArrayF, crept: ArrayF, period_s: float) -> ArrayF:
-        """What creep and remainder add to a block of loads.
+        """Return what creep and remainder add to a block of loads.
 
         Args:
             load: (m, k) at even times.
-            crept: (k,) the load that the material has got used to; brought up to date.
+            crept: (k,) the load that the material is used to; updated.
             period_s: between the rows.
 
         Returns:
@@ -90,8 +90,8 @@ class Missing:
         taxels: (k,) their numbers.
         begin_s: from then on.
         end_s: until then.
-        status: what the driver says of them meanwhile.
-        value: what stands in their place; None: what was there before (before the first frame: 0).
+        status: their status meanwhile.
+        value: value in their place; None: the last one (before the first frame: 0).
     """
 
     taxels: ArrayI
@@ -109,7 +109,7 @@ class Jump:
         taxels: (k,) their numbers.
         counts: by which the values move.
         at_s: when.
-        suspect_s: for how long the driver calls them suspect; 0 if it does not notice.
+        suspect_s: for how long their status is ``SUSPECT``; 0 if the driver does not notice.
     """
 
     taxels: ArrayI
@@ -127,8 +127,8 @@ class Faults:
         noise: (n,) factor on its noise.
         stuck: (n,) the value that a taxel always shows; NaN: it is not stuck.
         source: (n,) the taxel whose data arrives in each one's place.
-        missing: see :class:`Missing`.
-        jumps: see :class:`Jump`.
+        missing: gaps.
+        jumps: jumps.
     """
 
     feels: npt.NDArray[np.bool_]
@@ -143,7 +143,7 @@ class Faults:
         return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
     def jumped(self, time_s: ArrayF, patch: ArrayI) -> tuple[ArrayF | None, npt.NDArray[np.bool_] | None]:
-        """What jumps add to the values of (m, n_patches) times, and who is suspect then: (m, n), or None if nothing.
+        """Return (m, n) what jumps add to the values, and (m, n) which are suspect; None if there is no jump yet.
 
         Args:
             time_s: (m, n_patches) of the acquisitions.

@@ -1,4 +1,4 @@
-"""Place the taxels of a simulated skin: plates, fingers, and a forearm of triangles."""
+"""Place the taxels of a simulated skin: plates, and a forearm of triangles."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from skinware.structure import Structure
 ArrayF = npt.NDArray[np.float64]
 ArrayI = npt.NDArray[np.int64]
 Taxels = slice | npt.ArrayLike
-"""Some of n taxels: whatever indexes an array of them (numbers, a slice, a mask)."""
+"""Some of n taxels: an index of an array of them (numbers, a slice, a mask)."""
 
 PITCH_M = 0.0065
-"""Between neighbouring taxels of a ROBOSKIN triangle."""
+"""Distance between neighbouring taxels of a ROBOSKIN triangle."""
 SIDE_M = 0.03
-"""Of a ROBOSKIN triangle."""
+"""Side of a ROBOSKIN triangle."""
 _CELLS = ((2, 5), (3, 6), (3, 4), (2, 3), (3, 2), (3, 0), (2, 1), (1, 2), (0, 3), (1, 4))
 """The ten taxels of a triangle in the order of their channels: row from its tip, and column in halves of a pitch."""
 TRIANGLE_M = np.array([[(half - 3) / 2, (2 - row) * np.sqrt(0.75)] for row, half in _CELLS]) * PITCH_M
-"""(10, 2) where the taxels of a triangle are, from its centre, seen from outside, its tip up, m."""
+"""(10, 2) places of the taxels of a triangle, from its centre, seen from outside, its tip up, m."""
 _PADS = ((3, 4, 6), (7, 8, 9))
 CHANNELS_M = np.insert(TRIANGLE_M, [6, 9], [TRIANGLE_M[list(corners)].mean(axis=0) for corners in _PADS], axis=0)
-"""(12, 2) the same of all channels: the thermal pads, 6 and 10, lie between three taxels each (which is assumed)."""
+"""(12, 2) the same for all channels: the thermal pads, 6 and 10, lie between three taxels each (an assumption)."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Surface:
     """n taxels of one type, in the driver's order.
 
     Attributes:
-        position_m: (n, 3) float64, m; NaN where nobody knows: no push reaches such a taxel.
-        normal: (n, 3) float64, outwards, of length 1; NaN where nobody knows.
+        position_m: (n, 3) float64, m; NaN: not known, and no push reaches the taxel.
+        normal: (n, 3) float64, outwards, of length 1; NaN: not known.
         module: (n,) int64, from 0 without gaps.
         patch: (n,) int64, from 0 without gaps; a module is of one patch.
 
@@ -71,7 +71,7 @@ class Surface:
         module: npt.ArrayLike | None = None,
         patch: npt.ArrayLike | None = None,
     ) -> Surface:
-        """Taxels at given places; what is left out is unknown (normals), or one module, or one patch."""
+        """Make a surface of taxels at given places; by default without normals, as one module and one patch."""
         position = np.array(position_m, np.float64).reshape(-1, 3)
         nothing = np.zeros(len(position), np.int64)
         return cls(
@@ -83,7 +83,7 @@ class Surface:
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, geometry: Geometry | None = None) -> Surface:
-        """The taxels of one type of a driver, at the places of ``geometry`` or else of the structure's own.
+        """Make a surface of the taxels of one type of a driver, at the places of ``geometry`` or of the structure.
 
         Raises:
             StructureError: the driver has no such type.
@@ -114,11 +114,11 @@ class Surface:
         return int(self.patch.max()) + 1 if len(self) else 0
 
     def geometry(self, frame: str = "world", type_name: str = "pressure") -> Geometry:
-        """The places of the n taxels, whose uid are 0 to n - 1.
+        """Return the places of the n taxels, with the uids 0 to n - 1.
 
         Args:
             frame: name of the coordinate frame.
-            type_name: of the taxels.
+            type_name: sensor type of the taxels.
         """
         n = len(self)
         places = Geometry.unknown([type_name] * n, np.arange(n, dtype=np.uint64))
@@ -126,7 +126,7 @@ class Surface:
         return places
 
     def taxels(self, some: Taxels) -> ArrayI:
-        """The numbers of some taxels.
+        """Return the numbers of some taxels.
 
         Raises:
             ConfigurationError: there are no such taxels.
@@ -147,15 +147,15 @@ def grid(
     pitch_m: float = PITCH_M,
     gap_m: float = 0.05,
 ) -> Surface:
-    """Flat rectangular modules in a row along x, facing +z; modules are given to patches in equal shares.
+    """Make flat rectangular modules in a row along x, facing +z, an equal share of them for each patch.
 
     Args:
-        modules: how many.
-        rows: of taxels in a module, along y.
-        columns: of taxels in a module, along x.
-        patches: how many.
-        pitch_m: between neighbours in a module.
-        gap_m: between the last column of a module and the first of the next.
+        modules: number of modules.
+        rows: rows of taxels in a module, along y.
+        columns: columns of taxels in a module, along x.
+        patches: number of patches.
+        pitch_m: distance of neighbours in a module.
+        gap_m: distance of the last column of a module from the first of the next.
     """
     y, x = np.divmod(np.arange(rows * columns), columns)
     module = np.repeat(np.arange(modules), rows * columns)
@@ -165,11 +165,11 @@ def grid(
 
 
 def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
-    """A flat strip of triangles of ten taxels along x, as of a ROBOSKIN, facing +z; every second one upside down.
+    """Make a flat strip of ROBOSKIN triangles of ten taxels along x, facing +z, every second one upside down.
 
     Args:
-        modules: how many.
-        patches: how many; the triangles are given to them in equal shares.
+        modules: number of triangles.
+        patches: number of patches, with an equal share of the triangles each.
     """
     places = [
         TRIANGLE_M * (-1 if number % 2 else 1) + [number * SIDE_M / 2, number % 2 * SIDE_M / np.sqrt(12)]
@@ -179,7 +179,6 @@ def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
 
 
 def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) -> Surface:
-    """A surface in the plane z = 0."""
     position = np.zeros((len(places), 3))
     position[:, :2] = places
     normal = np.zeros_like(position)
@@ -188,14 +187,13 @@ def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) 
 
 
 def _numbered(of: npt.NDArray[Any]) -> ArrayI:
-    """The same groups, numbered from 0 without gaps."""
     return np.unique(of, return_inverse=True)[1].astype(np.int64)
 
 
 TRIANGLES = 16
-"""On each board."""
+"""Triangles on each board."""
 ARM_FRAME = "arm"
-"""Whose axes positions are in: x from the elbow to the fingertips, z up."""
+"""Coordinate frame of the arm: x from the elbow to the fingertips, z up."""
 
 _HEIGHT_M = SIDE_M * np.sqrt(0.75)
 _FACES = 6
@@ -209,7 +207,7 @@ _TOURS = ((*range(8), *range(15, 7, -1)), (0, 1, 2, 3, 7, 6, 5, 4, 8, 9, 10, 11,
 
 
 def arm(boards: Sequence[int] = (0, 1, 2, 3), *, pads: bool = False) -> Surface:
-    """Boards of 16 triangles on a forearm (boards 0 to 2) and a hand (board 3); 4 to 7 are another arm beside it.
+    """Make boards of 16 triangles on a forearm (boards 0 to 2) and a hand (board 3); 4 to 7 are an arm beside it.
 
     The forearm is a prism of six faces, 135 mm long and 52 mm wide; each board covers two of them with a strip of
     eight triangles each. The hand has two strips of four on its palm (triangles 0 to 7) and two on its back. Patches
@@ -231,14 +229,14 @@ def arm(boards: Sequence[int] = (0, 1, 2, 3), *, pads: bool = False) -> Surface:
 
 
 def arm_path(board: int) -> ArrayF:
-    """(16, 3) the middles of a board's triangles in the order of a closed walk over all of them, m."""
+    """Return (16, 3) the middles of a board's triangles in the order of a closed walk over them, m."""
     middle = np.zeros((1, 2))
     tour = _TOURS[board % _PARTS == _HAND]
     return np.concatenate([_triangle(board, triangle, middle)[0] for triangle in tour])
 
 
 def _triangle(board: int, triangle: int, flat: npt.NDArray[np.float64]) -> tuple[ArrayF, ArrayF]:
-    """(k, 3) where points of a triangle are, given (k, 2) in its plane; and its normal."""
+    """(k, 3) points of a triangle, given as (k, 2) in its plane; and its normal."""
     number, part = divmod(board, _PARTS)
     if part == _HAND:
         strip, along = divmod(triangle, _HAND_STRIP)

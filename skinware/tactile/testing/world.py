@@ -1,9 +1,9 @@
-"""A skin that is pressed, drifts and fails, as arrays: what its driver would publish, and the truth beside it."""
+"""Run a skin that is pressed, drifts and fails, as arrays: the frames that its driver would publish, and the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field, fields
 from typing import Unpack
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
-from skinware.tactile.testing.block import Block, Sample
+from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.testing.gestures import Cover, Gesture, How, Push, Stroke
 from skinware.tactile.testing.response import Faults, Jump, Missing, Response
 from skinware.tactile.testing.surface import Surface, Taxels
@@ -23,9 +23,73 @@ _ROWS = 2048
 _MOST_KNOWN = 1000
 
 
+@dataclass(frozen=True)
+class Block:
+    """m frames of n taxels.
+
+    Attributes:
+        time_ns: (m,) int64, when each frame's newest data was acquired.
+        module_time_ns: (m, n_modules) int64, when each module's data was acquired.
+        values: (m, n), pressure-positive, of the world's dtype.
+        status: (m, n) uint8, bits of :class:`skinware.Status`.
+        truth: (m, n) float32, the load in counts, without drift, noise, sag, creep and faults. It does not clip.
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    module_time_ns: npt.NDArray[np.int64]
+    values: npt.NDArray[np.generic]
+    status: npt.NDArray[np.uint8]
+    truth: npt.NDArray[np.float32]
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Block]) -> Block:
+        """Join blocks, one after the other.
+
+        Raises:
+            ConfigurationError: there is no block.
+        """
+        if not blocks:
+            raise ConfigurationError("no frames: the time is over before it began")
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def usable(self) -> npt.NDArray[np.bool_]:
+        """(m, n) bool: there is a value, and it is of this frame."""
+        usable: npt.NDArray[np.bool_] = (self.status & np.uint8(UNUSABLE)) == 0
+        return usable
+
+    def __iter__(self) -> Iterator[Sample]:
+        usable = self.usable
+        for row in range(len(self)):
+            yield Sample(
+                int(self.time_ns[row]),
+                self.module_time_ns[row],
+                self.values[row],
+                self.status[row],
+                usable[row],
+                self.truth[row],
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One frame, a row of a :class:`Block`: its arrays are (n,) and (n_modules,)."""
+
+    time_ns: int
+    module_time_ns: npt.NDArray[np.int64]
+    values: npt.NDArray[np.generic]
+    status: npt.NDArray[np.uint8]
+    usable: npt.NDArray[np.bool_]
+    truth: npt.NDArray[np.float32]
+
+
 @dataclass
 class World:
-    """A skin and what happens to it, from second 0 on. The same settings and seed give the same values.
+    """A skin and everything that happens to it, from second 0 on. The same settings and seed give the same values.
 
     Counts are pressure-positive: an idle taxel shows ``idle``, a pressed one more.
 
@@ -34,7 +98,7 @@ class World:
         seed: of all that is random.
         rate_hz: of the frames.
         jitter: of the time between frames, as a part of it, 0 to 0.9.
-        sensitivity: counts at the centre of a contact per unit of force. At 1 a force is what it shows.
+        sensitivity: counts at the centre of a contact per unit of force.
         gain_spread: standard deviation of the taxels' gains, around 1.
         response: how the skin answers a force.
         noise: standard deviation, counts.
@@ -43,13 +107,12 @@ class World:
         wave_s: its period.
         drift_spread: standard deviation of how strongly each taxel follows the common drift, around 1.
         walk: each taxel's own random walk, counts after one minute (standard deviation).
-        idle: what an idle taxel shows.
-        minimum: values are clipped there.
-        maximum: and there.
+        idle: value of an idle taxel.
+        minimum, maximum: values are clipped there.
         step: values are whole multiples of it; 0: they are not rounded.
         dtype: of the values.
-        gestures: what is done to it, in the order in which it was said.
-        faults: what is wrong with it.
+        gestures: the gestures that press it, in their order.
+        faults: its faults.
         gain: (n,) of each taxel.
         follows: (n,) how strongly each taxel follows the common drift.
         wave_phase: (n_patches,) of the slow wave, rad.
@@ -113,7 +176,7 @@ class World:
         if not info.min <= self.minimum <= self.maximum <= info.max:
             raise ConfigurationError(f"{self.minimum} to {self.maximum}: more than {dtype.name} holds")
 
-    # What somebody does
+    # Gestures
 
     def push(self, at_m: npt.ArrayLike, force: float, begin_s: float, end_s: float, **how: Unpack[How]) -> Push:
         """Press at one point; ``how``: the other attributes of :class:`.Gesture`."""
@@ -140,32 +203,29 @@ class World:
         return cover
 
     def pressing(self, time_s: float) -> list[tuple[Gesture, ArrayF, float]]:
-        """The gestures that press at a time, each with its place (3,) and its force."""
+        """Return the gestures that press at a time, each with its place (3,) and its force."""
         at = np.array([time_s])
         found = [(gesture, gesture.points_m(at)[0], float(gesture.forces(at)[0])) for gesture in self.gestures]
         return [one for one in found if one[2]]
 
-    # What goes wrong
+    # Faults
 
     def dead(self, taxels: Taxels) -> None:
-        """These feel no load; they still drift and are noisy."""
+        """Let taxels feel no load; they still drift and are noisy."""
         self.faults.feels[self.surface.taxels(taxels)] = False
 
     def stuck(self, taxels: Taxels, value: float) -> None:
-        """These show one value for ever, between ``minimum`` and ``maximum``."""
+        """Let taxels always show one value, between ``minimum`` and ``maximum``."""
         if not self.minimum <= value <= self.maximum:
             raise ConfigurationError(f"stuck at {value}: values are between {self.minimum} and {self.maximum}")
         self.faults.stuck[self.surface.taxels(taxels)] = value
 
     def noisy(self, taxels: Taxels, factor: float) -> None:
-        """The noise of these is ``factor`` times that of others."""
+        """Multiply the noise of taxels by ``factor``."""
         self.faults.noise[self.surface.taxels(taxels)] = factor
 
     def swap(self, first: Taxels, second: Taxels) -> None:
-        """Exchange the connectors of as many taxels: the data of each arrives in the other's place.
-
-        The truth stays where the load is.
-        """
+        """Exchange two equal numbers of taxels: their data arrives in each other's place; the truth does not move."""
         one, other = self.surface.taxels(first), self.surface.taxels(second)
         if len(one) != len(other):
             raise ConfigurationError(f"{len(one)} taxels cannot be exchanged with {len(other)}")
@@ -181,14 +241,14 @@ class World:
         status: Status = Status.STALE,
         value: float | None = None,
     ) -> None:
-        """No data of these for a while. For none in the first frame, begin before 0.
+        """Let taxels send nothing for a while. For nothing in the first frame, begin before 0.
 
         Args:
             taxels: which.
             begin_s: from then on.
             end_s: until then.
-            status: what the driver says of them; ``Status(0)``: nothing.
-            value: what stands in their place (NaN, if the dtype has it); None: what was there before.
+            status: their status meanwhile; ``Status(0)``: none.
+            value: value in their place (NaN, if the dtype has it); None: the last one.
         """
         dtype = np.dtype(self.dtype)
         if value is not None and not (dtype.kind == "f" or np.iinfo(dtype).min <= value <= np.iinfo(dtype).max):
@@ -196,18 +256,18 @@ class World:
         self.faults.missing.append(Missing(self.surface.taxels(taxels), begin_s, end_s, status, value))
 
     def jump(self, taxels: Taxels, counts: float, at_s: float, *, suspect_s: float = 0.0) -> None:
-        """A board moves the baseline of these; for ``suspect_s`` the driver calls them suspect."""
+        """Move the baseline of taxels, as a board does; for ``suspect_s`` the driver calls them suspect."""
         self.faults.jumps.append(Jump(self.surface.taxels(taxels), counts, at_s, suspect_s))
 
-    # What comes of it
+    # Frames
 
     def frames(self, until_s: float) -> Iterator[Sample]:
-        """Every frame from second 0 on, one by one; always the same ones."""
+        """Yield every frame from second 0 on; always the same ones."""
         for block in self.blocks(until_s):
             yield from block
 
     def record(self, until_s: float) -> Block:
-        """Every frame from second 0 on, in one block.
+        """Return every frame from second 0 on, in one block.
 
         Raises:
             ConfigurationError: there is none.
@@ -215,17 +275,17 @@ class World:
         return Block.joined(list(self.blocks(until_s)))
 
     def blocks(self, until_s: float, rows: int = _ROWS) -> Iterator[Block]:
-        """Every frame from second 0 on, in blocks of at most ``rows``; the values do not depend on ``rows``."""
+        """Yield every frame from second 0 on, in blocks of at most ``rows``; the values do not depend on ``rows``."""
         state = _State(self)
         total = max(int(np.ceil(until_s * self.rate_hz - 1e-9)), 0)
         for first in range(0, total, rows):
             yield state.next_block(first, min(rows, total - first))
 
     def loads(self, time_s: ArrayF) -> tuple[ArrayF, ArrayF]:
-        """What all gestures together do to the taxels, in counts.
+        """Return the load of all gestures together, in counts.
 
         Args:
-            time_s: (m, n_patches) when each patch is looked at.
+            time_s: (m, n_patches) when each patch acquires its data.
 
         Returns:
             (m, n) the load, and (m, n) what is missing because the cover sags.
@@ -247,13 +307,13 @@ class World:
         return load, missing
 
     def felt(self, time_s: ArrayF, taxels: Taxels) -> ArrayF:
-        """What some of the taxels feel of all gestures at any moments, in counts: the load less what sags.
+        """Return what taxels feel of all gestures at given times, in counts: the load less the sag.
 
-        For who makes frames of it in his own time, and of his own noise.
+        It is for programs that make frames with times and noise of their own.
 
         Args:
             time_s: (m,).
-            taxels: k of them.
+            taxels: k taxels.
 
         Returns:
             (m, k).
@@ -269,7 +329,6 @@ class World:
         return total
 
     def _near(self, gesture: Gesture) -> npt.NDArray[np.bool_]:
-        """(n,) bool: the taxels that it ever reaches."""
         key = gesture, self.response.reach_m
         near = self._known_near.get(key)
         if near is None:
@@ -279,7 +338,6 @@ class World:
         return near
 
     def _felt(self, gesture: Gesture, time_s: ArrayF, taxels: npt.NDArray[np.int64]) -> tuple[ArrayF, ArrayF]:
-        """(m, k) load, and what is missing round it: 0 where nothing sags."""
         force = self.sensitivity * gesture.forces(time_s)[:, np.newaxis] * self.gain[taxels]
         distance = gesture.distances_m(time_s, self.surface, taxels)
         load = force * self.response.bell(distance)
@@ -287,7 +345,7 @@ class World:
 
 
 class _State:
-    """What a run of a world remembers from block to block."""
+    """The memory of a run of a world from block to block."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -298,7 +356,7 @@ class _State:
         self._walked = np.zeros(n)
         self._crept = np.zeros(n)
         self._before: npt.NDArray[np.generic] = np.zeros(n, world.dtype)
-        """Values of the last frame, as taxels that fall silent then keep them."""
+        """Values of the last frame: silent taxels keep them."""
 
     def next_block(self, first: int, rows: int) -> Block:
         world, surface = self._world, self._world.surface
@@ -323,7 +381,6 @@ class _State:
         return Block(time_ns.max(axis=1), time_ns[:, of_patch], values, status, load.astype(np.float32))
 
     def _signal(self, time_s: ArrayF, load: ArrayF) -> ArrayF:
-        """(m, n) load, creep, drift and noise, around 0."""
         world, faults = self._world, self._world.faults
         m, n = load.shape
         signal: ArrayF = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
@@ -348,7 +405,6 @@ class _State:
         return signal
 
     def _values(self, signal: ArrayF) -> npt.NDArray[np.generic]:
-        """(m, n) what the hardware makes of the signal."""
         world, faults = self._world, self._world.faults
         signal += world.idle
         if world.step:

@@ -1,0 +1,159 @@
+"""Read the driver that is calmed, and publish it again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_service import DriverReader, DriverWriter
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.errors import (
+    BadServiceFile,
+    Overrun,
+    Paused,
+    ServiceNotFound,
+    ServiceTimeout,
+    StructureChanged,
+)
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
+from skinware.status import PatchState, Status
+from skinware.structure import Structure
+
+_WAIT_S = WAIT_SLICE_NS / NS_PER_S
+
+
+class DriverSource:
+    """Reads a driver that may stop, restart and change.
+
+    Args:
+        name: name of the driver.
+        namespace: where it is.
+
+    Attributes:
+        reader: the reader of the driver; None before it was found.
+    """
+
+    def __init__(self, name: str, namespace: Namespace) -> None:
+        self._name, self._namespace = name, namespace
+        self.reader: DriverReader | None = None
+        self._last: DriverSnapshot | None = None
+        self._structure: Structure | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether the driver runs."""
+        return self.reader is not None and self.reader.alive
+
+    def next_frame(self) -> DriverSnapshot | None:
+        """Return the newest frame, if a newer one came within 50 ms; never the last one of a dead driver."""
+        try:
+            if self.reader is None:
+                self.reader = DriverReader(self._name, namespace=self._namespace)
+                return None
+            try:
+                frame = self.reader.read(newer_than=self._last, timeout_s=_WAIT_S)
+            except StructureChanged:
+                self.reader.reattach()
+                return None
+        except (ServiceTimeout, Overrun):
+            return None
+        except (ServiceNotFound, BadServiceFile):
+            time.sleep(_WAIT_S)
+            return None
+        self._last = frame
+        return None if frame.stale else frame
+
+    def has_changed(self, frame: DriverSnapshot) -> bool:
+        """Return whether a frame has another structure than the frame before it."""
+        before, self._structure = self._structure, frame.structure
+        return frame.structure is not before and frame.structure != before
+
+    def close(self) -> None:
+        if self.reader is not None:
+            self.reader.close()
+
+
+class CalmedDriver:
+    """Publishes a driver again, with the output of a chain.
+
+    Args:
+        name: name of the driver.
+        into: namespace where it is published.
+        group: group whose members may read it.
+        operations: operations that programs may ask for.
+
+    Attributes:
+        writer: the writer; None before the driver was seen.
+    """
+
+    def __init__(
+        self, name: str, into: Namespace, group: str | None, operations: Mapping[str, Callable[..., object]]
+    ) -> None:
+        self._name, self._into, self._group, self._operations = name, into, group, operations
+        self.writer: DriverWriter | None = None
+        self._counters: list[list[str]] = []
+        self._copied: list[str] = []
+        self._unknown: list[str] = []
+
+    def follow(self, structure: Structure, source: DriverReader, rate_hz: float | None) -> None:
+        """Go on with another structure.
+
+        Args:
+            structure: structure of the calmed driver.
+            source: reader of the driver, for its counters and columns.
+            rate_hz: nominal rate of the driver.
+        """
+        static = source.static()
+        names = [f"{what}_counter_name" for what in ("bus", "patch")]
+        counters = [[bytes(one).decode() for one in static[name].tolist()] if name in static else [] for name in names]
+        if self.writer is not None and counters == self._counters:
+            self.writer.restructure(structure, rate_hz=rate_hz)
+        else:
+            self.close()
+            self.writer = DriverWriter(
+                self._name,
+                structure,
+                driver_type="calm",
+                bus_counters=counters[0],
+                patch_counters=counters[1],
+                namespace=self._into,
+                rate_hz=rate_hz,
+                group=self._group,
+                operations=self._operations,
+            )
+            self.writer.request_server()
+            self._counters = counters
+        own = set(self.writer.column_offsets()) - {"values", "status"}
+        self._copied = sorted(own & set(source.schema.columns))
+        self._unknown = sorted(own - set(self._copied))
+
+    def begin(self, frame: DriverSnapshot) -> dict[str, npt.NDArray[Any]] | None:
+        """Return the columns of the next frame, all but values and status filled; None while paused."""
+        assert self.writer is not None  # noqa: S101 - follow() made it
+        try:
+            columns = self.writer.begin()
+        except Paused:
+            return None
+        for name in self._copied:
+            columns[name][:] = frame.column(name)
+        for name in self._unknown:
+            columns[name][:] = 0
+        return columns
+
+    def publish_stale(self) -> None:
+        """Publish the last frame again, all of it stale, as the driver is dead."""
+        assert self.writer is not None  # noqa: S101 - there was a frame
+        columns = self.writer.begin(from_last=True)
+        columns["status"] |= np.uint8(Status.STALE)
+        live = columns["patch_state"] == PatchState.LIVE
+        columns["patch_state"][live] = PatchState.STALE
+        self.writer.commit(now_ns())
+
+    def close(self) -> None:
+        if self.writer is not None:
+            self.writer.close()

@@ -1,0 +1,300 @@
+"""Publish contacts, motion and health beside a calmed driver.
+
+They share one pattern: each follows the chain of the driver from structure to structure, publishes what it computes
+from every frame, and gives itself up on an error, as calm values are worth more than any of them.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError, NameInUse
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S
+from skinware.status import Status
+from skinware.tactile.chain import BaselineStage, Chain, ChainState
+from skinware.tactile.chain_health import ChainHealth
+from skinware.tactile.contacts import ContactSet
+from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.health_service import RATE_HZ, HealthWriter
+from skinware.tactile.motion_service import NAME, MotionWriter
+from skinware.tactile.regions import Regions
+from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
+from skinware.tactile.source_service import ServiceOptions, SourceWriter
+
+log: logging.Logger = logging.getLogger("skinware.calm")
+
+WriterT = TypeVar("WriterT", bound=SourceWriter)
+
+_HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
+
+
+@dataclass(frozen=True)
+class WatchedRegions:
+    """Regions whose motion is published.
+
+    Attributes:
+        regions: the regions.
+        name: name of the service.
+    """
+
+    regions: Regions
+    name: str = NAME
+
+
+class DerivedService(ABC, Generic[WriterT]):
+    """A service beside a calmed driver, computed from its frames.
+
+    Args:
+        name: of the service. If another program has it, the driver's name and a hyphen come before it.
+        driver: name of the driver.
+        into: namespace of the calmed driver.
+        group: group whose members may read it.
+    """
+
+    subject: str
+    """What it is about, for messages."""
+
+    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+        self._name, self._driver = name, driver
+        self._options: ServiceOptions = {"namespace": into, "group": group}
+        self._writer: WriterT | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the service; empty while there is none."""
+        return "" if self._writer is None else self._writer.name
+
+    def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
+        """Go on with another chain, of other sensors.
+
+        Args:
+            chain: the chain whose values come from now on.
+            rate_hz: nominal rate of the driver.
+        """
+        try:
+            self._follow(chain, rate_hz)
+        except (ConfigurationError, NameInUse) as error:  # places without neighbours; a name of another program
+            self._give_up(error)
+
+    @abstractmethod
+    def _follow(self, chain: Chain, rate_hz: float | None) -> None: ...
+
+    def close(self) -> None:
+        """Withdraw the service. Idempotent."""
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None
+
+    def _open(self, make: Callable[[str], WriterT]) -> None:
+        """Make the writer, under the first name that is free.
+
+        Raises:
+            NameInUse: other programs have both names.
+            ConfigurationError: the longer name is too long.
+        """
+        try:
+            self._writer = make(self._name)
+        except NameInUse:
+            self._writer = make(f"{self._driver}-{self._name}")
+
+    def _give_up(self, error: Exception) -> None:
+        self.close()
+        log.warning("no %s of %r: %s", self.subject, self._driver, str(error))
+
+
+class CalmContacts(DerivedService[ContactsWriter]):
+    """The contacts of one calmed driver, found in its pressure sensors, or else in others that a touch only raises.
+
+    Args:
+        name, driver, into, group: as for :class:`DerivedService`.
+        watched: regions whose motion is published beside it; None: none.
+
+    Attributes:
+        motion: the service of motion; None: there are no regions.
+        count: number of contacts in the newest frame.
+    """
+
+    subject = "contacts"
+
+    def __init__(
+        self, name: str, driver: str, into: Namespace, group: str | None = None, watched: WatchedRegions | None = None
+    ) -> None:
+        super().__init__(name, driver, into, group)
+        self.count = 0
+        self.motion: CalmMotion | None = None
+        if watched is not None:
+            self.motion = CalmMotion(watched.name, driver, into, group, watched.regions)
+        self._type_name = ""
+        self._chain: Chain | None = None
+        self._stage: BaselineStage | None = None
+
+    def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
+        """See :class:`DerivedService`."""
+        super().follow(chain, rate_hz)
+        if self.motion is not None:
+            self.motion.contacts, self.motion.type_name = self._writer, self._type_name
+            self.motion.follow(chain, rate_hz)
+
+    def _follow(self, chain: Chain, rate_hz: float | None) -> None:
+        stages = {name: stage for name, stage in chain.baseline_stages.items() if not name.startswith(SIGNED_TYPES)}
+        before, type_name = self._type_name, "pressure" if "pressure" in stages else next(iter(stages), "")
+        self._chain, self._stage, self._type_name, self.count = chain, stages.get(type_name), type_name, 0
+        if self._writer is not None and type_name == before:
+            self._writer.restructure(chain.structure)
+            return
+        super().close()
+        if type_name:
+            options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
+            self._open(
+                lambda name: ContactsWriter(chain.structure, type_name, driver=self._driver, name=name, **options)
+            )
+
+    def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
+        """Find the contacts of the next frame, and publish them.
+
+        Args:
+            values: (n_sensors,) output of the chain.
+            status: (n_sensors,) output of the chain; sensors without a value of this frame touch nothing.
+            acquired_ns: of the frame.
+        """
+        if self._writer is None or self._chain is None or self._stage is None:
+            return
+        index = self._chain.structure.index(self._type_name)
+        usable = (status[index] & UNUSABLE) == 0
+        try:
+            found = self._writer.publish(values[index], self._stage.touched & usable, acquired_ns)
+        except NameInUse as error:
+            self._give_up(error)
+            return
+        self.count = len(found)
+        if self.motion is not None:
+            self.motion.publish(found, values[index], acquired_ns)
+
+    def publish_none(self, time_ns: int) -> None:
+        """Publish that nothing is touched, as the driver is dead."""
+        if self._chain is not None:
+            n = self._chain.structure.n_sensors
+            self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
+
+    def close(self) -> None:
+        """See :class:`DerivedService`."""
+        super().close()
+        self.count = 0
+        if self.motion is not None:
+            self.motion.close()
+
+
+class CalmMotion(DerivedService[MotionWriter]):
+    """The motion of the regions of one calmed driver.
+
+    Args:
+        name, driver, into, group: as for :class:`DerivedService`.
+        regions: the regions.
+
+    Attributes:
+        contacts: the service of the contacts that move; None: there is none.
+        type_name: sensor type of these contacts.
+    """
+
+    subject = "motion"
+
+    def __init__(self, name: str, driver: str, into: Namespace, group: str | None, regions: Regions) -> None:
+        super().__init__(name, driver, into, group)
+        self.contacts: ContactsWriter | None = None
+        self.type_name = ""
+        self._regions = regions
+
+    def _follow(self, chain: Chain, rate_hz: float | None) -> None:
+        self.close()
+        if self.contacts is None:
+            return
+        frames = self.contacts.frames
+        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
+        self._open(
+            lambda name: MotionWriter(
+                chain.structure, self.type_name, self._regions, frames, driver=self._driver, name=name, **options
+            )
+        )
+
+    def publish(self, contacts: ContactSet, values: npt.NDArray[np.float32], acquired_ns: int) -> None:
+        """Publish the motion of the next frame, from its contacts and (n,) values."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.publish(contacts, values, acquired_ns)
+        except NameInUse as error:
+            self._give_up(error)
+
+
+class CalmHealth(DerivedService[HealthWriter]):
+    """The health of one calmed driver, for all types that have a baseline and that a touch only raises.
+
+    Args:
+        name, driver, into, group: as for :class:`DerivedService`.
+
+    Attributes:
+        faulty: number of sensors with a fault.
+    """
+
+    subject = "health"
+
+    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+        super().__init__(name, driver, into, group)
+        self.faulty = 0
+        self._health: ChainHealth | None = None
+        self._status: npt.NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._due_ns = 0
+
+    def _follow(self, chain: Chain, rate_hz: float | None) -> None:
+        del rate_hz  # it has a rate of its own
+        self._health, self.faulty = ChainHealth(chain, self._driver), 0
+        self._status = np.zeros(chain.structure.n_sensors, np.uint8)
+        if not self._health:
+            self.close()
+        elif self._writer is not None:
+            self._writer.restructure(chain.structure)
+        else:
+            self._open(lambda name: HealthWriter(chain.structure, self._driver, name=name, **self._options))
+
+    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """Return what is known, by type: arrays by name, and ``uid``."""
+        return {} if self._health is None else self._health.state()
+
+    def restore(self, state: ChainState) -> None:
+        """Go on with what was known of the sensors of this chain, if its baselines saw the same values then.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        if self._health is not None:
+            self._health.restore(state)
+
+    def step(self, status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
+        """Take in what the chain made of the next frame; mark sensors with a fault as ``UNHEALTHY``.
+
+        Args:
+            status: (n_sensors,) output of the chain, changed in place.
+            acquired_ns: of the frame.
+        """
+        if self._health is None:
+            return
+        self._health.update(acquired_ns)
+        if acquired_ns >= self._due_ns:
+            self._due_ns = acquired_ns + _HEALTH_PERIOD_NS
+            reports = self._health.reports()
+            self._status = np.uint8(Status.UNHEALTHY) * self._health.faulty(reports)
+            self.faulty = int(np.count_nonzero(self._status))
+            try:
+                if self._writer is not None:
+                    self._writer.publish(reports, acquired_ns)
+            except NameInUse as error:
+                self._give_up(error)
+        status |= self._status

@@ -1,0 +1,285 @@
+"""Gather the evidence of taxels' health: their noise, their use, and how they compare with the taxels around them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.geometry import Geometry
+from skinware.tactile.baseline import Calm
+from skinware.tactile.neighbours import NONE, Table, pitch_m
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.int64]
+
+_ENOUGH_FRAMES = 100
+"""Frames away from touches that a measurement of noise needs; with fewer it goes on."""
+_GROWTH = 1.2
+"""Times: a noise grows by at most this from one measurement to the next."""
+_APART_S = 1.0
+"""Seconds: touches of a taxel with less time between them count as one."""
+_MODULE_APART_S = 5.0
+"""Seconds: the same for a module, of which fingers touch one part after the other."""
+_KEPT = 0.95
+"""Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
+_MOST_AT_ONCE = 2048
+"""Touched taxels that are compared in one frame. Of more, each frame takes another part."""
+_NEAR_PITCHES = 1.3
+"""Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
+_OPPOSITE_COSINE = -0.9
+"""Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
+_EVEN = 1.4
+"""Times: the farther of two opposite neighbours is at most this much farther than the nearer."""
+
+
+class Noise:
+    """Measures the noise of n taxels again and again, by the differences from frame to frame.
+
+    A press nearby makes differences too, so a noise grows slowly. A release makes one as large as its load, if the
+    baseline was taken under that load (at the start, or by a tare): the taxel falls far below its baseline, which
+    follows it there soon. Differences in between do not count.
+
+    Args:
+        n: number of taxels.
+        measured_s: how long one measurement takes.
+
+    Attributes:
+        deviation: (n,) float32, standard deviation, in the unit of the values; NaN before it is known.
+        at_end: (n,) float32, share of the time at an end of the range; NaN before it is known.
+    """
+
+    def __init__(self, n: int, measured_s: float) -> None:
+        self.deviation: Floats = np.full(n, np.nan, np.float32)
+        self.at_end: Floats = np.full(n, np.nan, np.float32)
+        self._measured_s = measured_s
+        self._begun_s = 0.0
+        self._was_free: Flags = np.zeros(n, bool)
+        self._sums: Floats = np.zeros((3, n), np.float32)
+        """Sums of squared differences, of frames, and of frames at an end of the range."""
+        self._low: Flags = np.zeros(n, bool)
+        self._stays_low: Flags = np.zeros(n, bool)
+        """Taxels that were low before the last measurement ended: no baseline follows these."""
+        self._before_low: Floats = np.zeros((3, n), np.float32)
+        """The sums when each taxel fell."""
+
+    def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, calm: Calm) -> bool:
+        """Take the next frame in.
+
+        Args:
+            now_s: its time.
+            difference: (n,) of the values from those of the frame before.
+            at_end: (n,) which are at an end of the range.
+            low: (n,) which are far below their baselines.
+            calm: what the baseline made of the frame.
+
+        Returns:
+            Whether a measurement ends with it.
+        """
+        self._note_low(low, calm)
+        free = calm.usable & ~calm.touched
+        both = free & self._was_free
+        self._was_free = free
+        difference = np.where(both, difference, np.float32(0))
+        squares, frames, ends = self._sums
+        squares += difference * difference
+        frames += both
+        ends += both & at_end
+        if now_s - self._begun_s < self._measured_s:
+            return False
+        self._begun_s = now_s
+        self._conclude()
+        return True
+
+    def _note_low(self, low: Flags, calm: Calm) -> None:
+        """Follow which taxels are low; drop the sums of those whose baselines have followed them meanwhile."""
+        changed = np.flatnonzero((low != self._low) & calm.usable)
+        if not len(changed):
+            return
+        fell = low[changed]
+        fallen, back = changed[fell], changed[~fell]
+        followed = back[calm.forced[back]]
+        self._before_low[:, fallen] = self._sums[:, fallen]
+        self._sums[:, followed] = self._before_low[:, followed]
+        self._low[changed] = fell
+        self._stays_low[back] = False
+
+    def _conclude(self) -> None:
+        """End a measurement. For taxels that fell only now, it ends before their fall."""
+        counted = np.where(self._low & ~self._stays_low, self._before_low, self._sums)
+        squares, frames, ends = counted
+        enough = frames >= _ENOUGH_FRAMES
+        noise = np.sqrt(squares[enough] / (2 * frames[enough]))
+        self.deviation[enough] = np.fmin(noise, _GROWTH * self.deviation[enough])
+        self.at_end[enough] = ends[enough] / frames[enough]
+        self._sums[:, enough] -= counted[:, enough]
+        self._before_low[:, enough] = 0
+        self._stays_low[:] = self._low
+
+
+class Use:
+    """Follows when n taxels changed, and how hard they and their modules were touched.
+
+    Args:
+        module: (n,) int, the module of each taxel.
+        touches: touches of a module whose times are kept.
+
+    Attributes:
+        seen: (n,) bool, which taxels have ever had a value.
+        value: (n,) float32, the newest.
+        changed_s: (n,) when it last changed, s.
+        touched: (n,) bool, in the newest frame.
+        peak: (n,) float32, the most that a touch showed.
+        usual: (n,) float32, the same, less of it with each touch.
+        module_touched_s: (n_modules, touches) when each module was last touched, s, the oldest first.
+    """
+
+    def __init__(self, module: npt.NDArray[np.intp], touches: int) -> None:
+        n = len(module)
+        self._module = module
+        self.seen: Flags = np.zeros(n, bool)
+        self.value: Floats = np.full(n, np.nan, np.float32)
+        self.changed_s: npt.NDArray[np.float64] = np.zeros(n)
+        self.touched: Flags = np.zeros(n, bool)
+        self.peak: Floats = np.zeros(n, np.float32)
+        self.usual: Floats = np.zeros(n, np.float32)
+        self.module_touched_s = np.full((int(module.max(initial=-1)) + 1, touches), -math.inf)
+
+    def add(self, now_s: float, passed_s: float, given: Floats, calm: Calm) -> None:
+        """Take the next frame in; time without data does not count as time without change."""
+        usable = calm.usable
+        changed = usable & (given != self.value)
+        np.copyto(self.changed_s, now_s, where=changed)
+        if not usable.all():
+            self.changed_s += passed_s * ~usable
+        np.copyto(self.value, given, where=changed)
+        self.seen |= usable
+        touched = calm.touched & usable
+        active = np.flatnonzero(touched)
+        begun = active[~self.touched[active]]
+        self.touched = touched
+        self.usual[begun] *= _KEPT
+        for most in (self.peak, self.usual):
+            most[active] = np.maximum(most[active], calm.value[active])
+        if len(begun):
+            module = np.unique(self._module[begun])
+            last = self.module_touched_s[module]
+            module, last = (of[now_s - last[:, -1] >= _MODULE_APART_S] for of in (module, last))
+            self.module_touched_s[module] = np.column_stack([last[:, 1:], np.full(len(module), now_s)])
+
+
+class Dues:
+    """Compares n taxels with what is due to them: the geometric mean of both their sides, where both are touched.
+
+    Args:
+        geometry: places of the n taxels; None: not known, and nothing is due.
+        table: (n, k) their neighbours.
+
+    Attributes:
+        due: (n,) sum of the squares of what was due in the touches so far; older ones count less.
+        shown: (n,) the same sum of due times shown.
+        touches: (n,) int64, separate touches of both sides.
+    """
+
+    def __init__(self, geometry: Geometry | None, table: Table) -> None:
+        n = len(table)
+        self._pairs = None if geometry is None else Pairs(geometry, table)
+        self._frames = 0
+        self.due, self.shown = np.zeros(n), np.zeros(n)
+        self.touches: Whole = np.zeros(n, np.int64)
+        self._hardest_due, self._hardest_shown = np.zeros(n), np.zeros(n)
+        self._compared_s = np.full(n, -math.inf)
+
+    def add(self, now_s: float, given: Floats, calm: Calm, hard: Flags) -> None:
+        """Take the next frame in.
+
+        Args:
+            now_s: its time.
+            given: (n,) its values.
+            calm: what the baseline made of it.
+            hard: (n,) taxels that are clearly touched.
+        """
+        self._frames += 1
+        if self._pairs is None:
+            return
+        active = np.flatnonzero(hard)
+        step = len(active) // _MOST_AT_ONCE + 1
+        middle, one, other = self._pairs.around(active[self._frames % step :: step], hard)
+        if not len(middle):
+            return
+        self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= _APART_S]))
+        self._compared_s[middle] = now_s
+        shown, left, right = (np.maximum(given[taxel] - calm.baseline[taxel], 0) for taxel in (middle, one, other))
+        due = np.sqrt(left * right)
+        harder = np.flatnonzero(calm.usable[middle] & (due > self._hardest_due[middle]))
+        harder = harder[np.argsort(due[harder], kind="stable")]  # of several pairs round a taxel the hardest stays
+        self._hardest_due[middle[harder]], self._hardest_shown[middle[harder]] = due[harder], shown[harder]
+
+    def share_shown(self, touches: int) -> npt.NDArray[np.float64]:
+        """Return (n,) the share of its due that each taxel showed; NaN after fewer touches."""
+        known = (self.touches >= touches) & (self.due > 0)
+        share: npt.NDArray[np.float64] = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
+        return share
+
+    def _end_touches(self, taxels: Whole) -> None:
+        """Add up what some taxels showed in their last touch."""
+        due, shown = self._hardest_due[taxels], self._hardest_shown[taxels]
+        self.due[taxels] = _KEPT * self.due[taxels] + due * due
+        self.shown[taxels] = _KEPT * self.shown[taxels] + due * shown
+        self.touches[taxels] += due > 0
+        self._hardest_due[taxels] = 0
+
+
+class Pairs:
+    """The pairs of taxels on opposite sides of each of n taxels, at about the same distance.
+
+    Args:
+        geometry: places of the n taxels; one whose place is not known lies between none.
+        table: (n, k) int32, which taxels lie beside each other: :func:`skinware.tactile.neighbours.neighbours`.
+    """
+
+    def __init__(self, geometry: Geometry, table: Table) -> None:
+        away_m = np.linalg.norm(geometry.position_m[table] - geometry.position_m[:, None], axis=2)
+        close = (table != NONE) & (away_m > 0) & (away_m <= _NEAR_PITCHES * pitch_m(geometry)[:, None])
+        nearest = np.argsort(~close, axis=1, kind="stable")[:, : int(close.sum(axis=1).max(initial=0))]
+        ring = np.take_along_axis(np.where(close, table, np.int32(NONE)), nearest, axis=1)
+        middle, one, other = _opposite(geometry, ring)
+        first = np.argsort(one, kind="stable")
+        count = np.bincount(one, minlength=len(geometry))
+        shape = len(geometry), int(count.max(initial=0))
+        column = np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count)
+        self._middle, self._other = np.full(shape, NONE, np.int32), np.full(shape, NONE, np.int32)
+        self._middle[one[first], column], self._other[one[first], column] = middle[first], other[first]
+
+    def around(self, taxels: Whole, touched: Flags) -> tuple[Whole, Whole, Whole]:
+        """Find taxels between two touched ones.
+
+        Args:
+            taxels: the touched ones from which pairs are looked for: all of them, or a part.
+            touched: (n,) bool.
+
+        Returns:
+            (m,) the taxels, (m,) the one side and (m,) the other; a taxel between several pairs is in several rows.
+        """
+        other = self._other[taxels]
+        row, column = np.nonzero(touched[other] & (other != NONE))
+        found = taxels[row]
+        return self._middle[found, column].astype(np.int64), found, other[row, column].astype(np.int64)
+
+
+def _opposite(geometry: Geometry, ring: Table) -> npt.NDArray[Any]:
+    """(3, m): a taxel and two of its nearest neighbours, on opposite sides, the lower number first."""
+    way_m = np.where((ring != NONE)[:, :, None], geometry.position_m[ring] - geometry.position_m[:, None], np.nan)
+    length_m = np.linalg.norm(way_m, axis=2)
+    found = [np.zeros((3, 0), np.int64)]
+    for one in range(ring.shape[1]):
+        for other in range(one + 1, ring.shape[1]):
+            product = np.einsum("ij,ij->i", way_m[:, one], way_m[:, other])
+            cosine = product / (length_m[:, one] * length_m[:, other])
+            uneven = np.maximum(length_m[:, one] / length_m[:, other], length_m[:, other] / length_m[:, one])
+            middle = np.flatnonzero((cosine <= _OPPOSITE_COSINE) & (uneven <= _EVEN))
+            found.append(np.stack([middle, ring[middle, one], ring[middle, other]]))
+    return np.concatenate(found, axis=1).astype(np.int64)

@@ -74,9 +74,9 @@ def command(number: int, arguments: bytes = b"") -> bytes:
     return sent + XOR.to_bytes(sent)
 
 
-def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEGIN), header: int = 3) -> Packet:
+def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEGIN)) -> Packet:
     table = LengthTable(at, totals)
-    return Packet(sync=sync, length=table, checksum=XOR, identifier=Field(2), header=header)
+    return Packet(sync=sync, length=table, checksum=XOR, identifier=Field(2), header=3)
 
 
 class AgniDriver(SerialAdapter[AgniOptions]):

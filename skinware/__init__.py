@@ -19,10 +19,9 @@ from skinware.memory.ring import Sample
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
-from skinware.snapshot import Snapshot
+from skinware.snapshot import Snapshot, Window
 from skinware.status import BusReason, BusState, PatchState, Status
 from skinware.structure import Structure
-from skinware.window import Window
 
 __all__ = [
     "BusReason",
@@ -50,5 +49,5 @@ __all__ = [
 
 
 def get_include() -> str:
-    """The folder of ``skinware.h``, with which C and C++ programs read skins: ``cc -I"$(...)"``."""
+    """Return the folder of ``skinware.h``, with which C and C++ programs read skins: ``cc -I"$(...)"``."""
     return os.path.join(os.path.dirname(__file__), "include")

@@ -25,14 +25,14 @@ def as_index(positions: npt.NDArray[np.int64]) -> Index:
 
 
 def group(owner: npt.NDArray[np.uint32], count: int) -> list[Index]:
-    """Positions of what belongs to each of ``count`` owners, in order."""
+    """Return positions of what belongs to each of ``count`` owners, in order."""
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(count + 1))
     return [as_index(order[bounds[i] : bounds[i + 1]]) for i in range(count)]
 
 
 def column(name: str, data: npt.ArrayLike, code: str) -> npt.NDArray[Any]:
-    """A column of a dtype, read-only.
+    """Return a column of a dtype, read-only.
 
     Raises:
         StructureError: what is given does not fit; the message says what.

@@ -10,7 +10,7 @@ _BY_TYPE = ("temperature", "acceleration", "angular_rate")
 
 
 def distinct(names: Sequence[str], owners: Sequence[str], how: str) -> tuple[str, ...]:
-    """The names; where several things have one name, with what they belong to: ``board 8 on can0``."""
+    """Return the names; where several things have one name, with what they belong to: ``board 8 on can0``."""
     count = Counter(names)
     pairs = zip(names, owners, strict=True)
     return tuple(f"{name} {how} {owner}" if count[name] > 1 else name for name, owner in pairs)
@@ -19,7 +19,7 @@ def distinct(names: Sequence[str], owners: Sequence[str], how: str) -> tuple[str
 def module_names(
     own_names: Sequence[str], kinds: Sequence[str], patches: Sequence[int], names_of_patches: Sequence[str]
 ) -> tuple[str, ...]:
-    """The names of all modules, each after that of its patch.
+    """Return the names of all modules, each after that of its patch.
 
     One without a name of its own has its kind and, among several of that kind in its patch, a number from 0; the only
     module of a patch is called as the patch.
@@ -29,7 +29,7 @@ def module_names(
 
 
 def names_in_patches(own_names: Sequence[str], kinds: Sequence[str], patches: Sequence[int]) -> tuple[str, ...]:
-    """What ``module_names`` adds to the names of the patches; empty where it adds nothing."""
+    """Return what ``module_names`` adds to the names of the patches; empty where it adds nothing."""
     in_patch = Counter(patches)
     of_kind = Counter(zip(patches, kinds, strict=True))
     seen: Counter[tuple[int, str]] = Counter()
@@ -45,7 +45,7 @@ def names_in_patches(own_names: Sequence[str], kinds: Sequence[str], patches: Se
 
 
 def name_in_module(type_name: str, number: int, is_only: bool) -> str:
-    """The name of a sensor's place within its module; empty: that of the module says all.
+    """Return the name of a sensor's place within its module; empty: that of the module says all.
 
     Args:
         type_name: its type.

@@ -1,4 +1,4 @@
-"""How a bridge is: a service of the namespace in which a robot appears.
+"""The state of a bridge: a service of the namespace in which a robot appears.
 
 Once a second, and whenever the link comes or goes::
 
@@ -27,9 +27,9 @@ KIND = "bridge"
 RATE_HZ = 1.0
 """How often it is published at least."""
 MOST = 64
-"""Services that are told of."""
+"""Number of services that a state lists at most."""
 STATES = ("unheard", "live", "paused", "closed", "dead")
-"""Of services: as on the robot, or not heard."""
+"""States of services: as on the robot, or not heard."""
 MODES = ("pull", "push")
 
 _ROW = np.dtype(
@@ -65,7 +65,7 @@ _COLUMNS = {
 
 @dataclass(frozen=True)
 class ServiceState:
-    """How a service comes over a bridge.
+    """State of one service that comes over a bridge.
 
     Attributes:
         state: one of ``STATES``.
@@ -89,14 +89,14 @@ class ServiceState:
 
 @dataclass(frozen=True)
 class BridgeState:
-    """How a bridge is.
+    """State of a bridge.
 
     Attributes:
         robot: its name.
         is_up: its bridge is heard.
         since_ns: since when that is so, CLOCK_MONOTONIC.
         clock_offset_ns: our clock minus the robot's; None: not known.
-        clock_error_ns: what that may be wrong by; likewise.
+        clock_error_ns: largest error of the offset; None: not known.
         round_trip_ns: the shortest lately.
         services: by name.
         instance: number of the bridge that is followed; empty: none so far.
@@ -127,7 +127,7 @@ def service_name(robot: str) -> str:
 
 
 class BridgeSample(Sample):
-    """How a bridge was at one time."""
+    """State of a bridge at one moment."""
 
     __slots__ = ()
 
@@ -154,7 +154,7 @@ class BridgeSample(Sample):
 
 
 class BridgeReader(ServiceReader[BridgeSample]):
-    """Reads how a bridge is.
+    """Read the state of a bridge.
 
     Args:
         name: of the service (:func:`service_name`).
@@ -177,7 +177,7 @@ class BridgeReader(ServiceReader[BridgeSample]):
 
 
 class BridgeStateWriter:
-    """Publishes how a bridge is.
+    """Publish the state of a bridge.
 
     Args:
         robot: its name.
@@ -196,7 +196,7 @@ class BridgeStateWriter:
         )
 
     def publish(self, state: BridgeState, at_ns: int) -> None:
-        """Publish how it is at a time, CLOCK_MONOTONIC ns.
+        """Publish the state at a time, CLOCK_MONOTONIC ns.
 
         Raises:
             Closed, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.

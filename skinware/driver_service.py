@@ -10,7 +10,7 @@ Static columns: the structure's tables, ``driver_type`` and the names of the cou
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,16 +20,17 @@ from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
+from skinware.realtime import NS_PER_S
 from skinware.samples import SAMPLE, SAMPLES
-from skinware.service import Columns, RequestServer, ServiceReader, ServiceWriter
+from skinware.service import Schema, ServiceReader, Writer
 from skinware.structure import Structure
 
 KIND = "driver"
 _REQUIRED = ("values", "status", "module_time_ns", "patch_state", "bus_state")
 
 
-class DriverWriter:
-    """Publishes a skin: its structure and its frames.
+class DriverWriter(Writer):
+    """Publish a skin: its structure and its snapshots.
 
     Args:
         name: name of the driver in the namespace.
@@ -57,129 +58,44 @@ class DriverWriter:
     ) -> None:
         self.structure: Structure = structure
         self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
-        self._service = ServiceWriter(
+        super().__init__(
             name,
-            self._frame_columns(),
-            self._static(),
-            namespace=namespace,
+            namespace,
+            schema=self._schema_of(structure),
+            static=self._tables_of(structure),
             kind=KIND,
             slots=slots,
-            rate_hz=rate_hz,
+            period_ns=round(NS_PER_S / rate_hz) if rate_hz else 0,
             group=group,
-            operations=operations,
+            operations=operations or {},
+            published_before=None,
         )
 
-    @property
-    def name(self) -> str:
-        """Name of the driver."""
-        return self._service.name
-
-    @property
-    def namespace(self) -> Namespace:
-        """Where it publishes."""
-        return self._service.namespace
-
-    @property
-    def slots(self) -> int:
-        """Frames that the ring holds."""
-        return self._service.slots
-
-    @property
-    def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
-        return self._service.sequence
-
-    @property
-    def ring_address(self) -> int | None:
-        """Of the ring's ``skinware_ring_writer``, for C code that publishes through it; None where Python does."""
-        return self._service.ring_address
-
-    def column_offsets(self) -> dict[str, int]:
-        """Where each column begins, bytes from the beginning of a slot."""
-        return self._service.column_offsets()
-
-    @property
-    def position(self) -> tuple[int, int]:
-        """(generation, sequence) of the newest frame."""
-        return self._service.position
-
-    @property
-    def paused(self) -> bool:
-        """Whether ``pause`` was called last."""
-        return self._service.paused
-
-    def pause(self) -> None:
-        """Publish nothing until ``resume``; users are told."""
-        self._service.pause()
-
-    def resume(self) -> None:
-        """Go on after ``pause``."""
-        self._service.resume()
-
-    def request_server(self) -> RequestServer:
-        """Where users' requests come in; see :class:`skinware.service.ServiceWriter`."""
-        return self._service.request_server()
-
-    def keep_files(self) -> None:
-        """Make files again that somebody removed; see :class:`skinware.service.ServiceWriter`."""
-        self._service.keep_files()
-
-    @property
-    def closed(self) -> bool:
-        """Whether ``close`` was called, or this is the child of a fork."""
-        return self._service.closed
-
-    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of the next frame by column name, to be filled; then ``commit``.
-
-        Args:
-            from_last: begin with the newest frame, to change parts of it only.
-        """
-        return self._service.begin(from_last=from_last)
-
-    def commit(self, acquired_ns: int) -> int:
-        """Publish; ``acquired_ns`` is the newest time stamp in the frame. Returns its sequence."""
-        return self._service.commit(acquired_ns)
-
     def restructure(self, structure: Structure, *, rate_hz: float | None = None) -> None:
-        """Go on with other sensors or another dtype, as a new generation; users are told.
+        """Go on with other sensors or another dtype, as a new generation; readers notice it.
 
         Args:
-            structure: the new one. With an equal one users go over without noticing.
+            structure: the new one. With an equal one readers go over without noticing.
             rate_hz: the nominal rate from now on, if it is another.
 
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        before, self.structure = self.structure, structure
-        try:
-            self._service.restructure(self._frame_columns(), self._static(), rate_hz=rate_hz)
-        except BaseException:
-            self.structure = before
-            raise
+        self._succeed(self._schema_of(structure), self._tables_of(structure), rate_hz)
+        self.structure = structure
 
-    def close(self) -> None:
-        """Withdraw the driver. Idempotent."""
-        self._service.close()
-
-    def _frame_columns(self) -> Columns:
+    def _schema_of(self, structure: Structure) -> Schema:
         _, bus_counters, patch_counters = self._names
-        return _frame_columns(self.structure, len(bus_counters), len(patch_counters))
+        return Schema.of(_frame_columns(structure, len(bus_counters), len(patch_counters)), "")
 
-    def _static(self) -> dict[str, npt.NDArray[Any]]:
+    def _tables_of(self, structure: Structure) -> dict[str, npt.NDArray[Any]]:
         driver_type, bus_counters, patch_counters = self._names
         return {
-            **self.structure.to_columns(),
+            **structure.to_columns(),
             "driver_type": np.array([driver_type.encode()], "S32"),
             "bus_counter_name": np.array([name.encode() for name in bus_counters], "S24"),
             "patch_counter_name": np.array([name.encode() for name in patch_counters], "S24"),
         }
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class DriverReader(ServiceReader[DriverSnapshot]):
@@ -198,15 +114,15 @@ class DriverReader(ServiceReader[DriverSnapshot]):
 
     @property
     def driver_type(self) -> str:
-        """Name of the driver's class, as it told; empty if it did not."""
+        """Name of the driver's class; empty if the driver does not publish it."""
         return "".join(_names(self.static(), "driver_type")[:1])
 
     def bus_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
-        """The counters of every bus in a frame, by name."""
+        """Return the counters of every bus in a frame, by name."""
         return self._counters(frame, "bus", len(self.structure.buses))
 
     def patch_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
-        """The counters of every patch in a frame, by name."""
+        """Return the counters of every patch in a frame, by name."""
         return self._counters(frame, "patch", self.structure.n_patches)
 
     def _counters(self, frame: DriverSnapshot, what: str, count: int) -> list[dict[str, int]]:
@@ -222,7 +138,7 @@ class DriverReader(ServiceReader[DriverSnapshot]):
 def counters_of(
     frame: DriverSnapshot, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
 ) -> tuple[list[str], npt.NDArray[np.uint64]]:
-    """Counters in a frame: their names, and (count, names) numbers; no names where the driver tells none.
+    """Return counters in a frame: their names, and (count, names) numbers; no names where the driver publishes none.
 
     Args:
         frame: of the driver.
@@ -238,7 +154,7 @@ def counters_of(
 
 
 def structure_of(segment: segments.Segment) -> Structure:
-    """The structure of a generation of a driver.
+    """Return the structure of a generation of a driver.
 
     Raises:
         BadServiceFile: its tables contradict each other or its columns.
@@ -266,7 +182,6 @@ def structure_of(segment: segments.Segment) -> Structure:
 def _frame_columns(
     structure: Structure, n_bus_counters: int, n_patch_counters: int
 ) -> dict[str, tuple[npt.DTypeLike, int]]:
-    """Of every column of a driver's frames: dtype and length."""
     n_buses, n_patches = len(structure.buses), structure.n_patches
     return {
         "values": (structure.dtype, structure.n_sensors),

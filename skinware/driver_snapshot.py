@@ -60,7 +60,7 @@ class DriverSnapshot(Sample):
 
         Their values are fresh all the same. All False where the driver does not look for that.
         """
-        return self._told("module_untouched", (self.structure.n_modules,), np.uint8).astype(bool)
+        return self._optional("module_untouched", (self.structure.n_modules,), np.uint8).astype(bool)
 
     @property
     def patch_state(self) -> npt.NDArray[np.uint8]:
@@ -74,67 +74,67 @@ class DriverSnapshot(Sample):
 
     @property
     def bus_reason(self) -> npt.NDArray[np.uint8]:
-        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not tell."""
-        return self._told("bus_reason", (len(self.structure.buses),), np.uint8)
+        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not publish it."""
+        return self._optional("bus_reason", (len(self.structure.buses),), np.uint8)
 
     @property
     def bus_since_ns(self) -> npt.NDArray[np.int64]:
-        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
-        return self._told("bus_since_ns", (len(self.structure.buses),), np.int64)
+        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not known."""
+        return self._optional("bus_since_ns", (len(self.structure.buses),), np.int64)
 
     @property
     def bus_load(self) -> npt.NDArray[np.uint16]:
         """(n_buses,) uint16, share of the bus' time in use over the last second, in thousandths, at least 1.
 
-        0: not known, or the driver does not tell; 0xFFFF: not known because of the bus' filters.
+        0: not known; 0xFFFF: not known because of the bus' filters.
         """
-        return self._told("bus_load", (len(self.structure.buses),), np.uint16)
+        return self._optional("bus_load", (len(self.structure.buses),), np.uint16)
 
     @property
     def bus_samples(self) -> npt.NDArray[np.void]:
         """(n_buses, SAMPLES) of :data:`skinware.samples.SAMPLE`: frames that were not used, the newest few of a kind.
 
-        Empty places where there are none, or the driver does not tell.
+        Places are empty where there are none.
         """
         n_buses = len(self.structure.buses)
-        return self._told("bus_samples", (n_buses, SAMPLES * SAMPLE.itemsize), np.uint8).view(SAMPLE)
+        return self._optional("bus_samples", (n_buses, SAMPLES * SAMPLE.itemsize), np.uint8).view(SAMPLE)
 
     @property
     def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
         """(n_patches, BUCKETS) uint64: histogram of the time between two updates of a module, for every patch.
 
-        The buckets are those of :class:`skinware.memory.statistics.Histogram`; all 0 where the driver does not tell.
+        The buckets are those of :class:`skinware.memory.statistics.Histogram`; all 0: not published.
         """
-        return self._told("patch_interval_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+        return self._optional("patch_interval_counts", (self.structure.n_patches, BUCKETS), np.uint64)
 
     @property
     def patch_age_counts(self) -> npt.NDArray[np.uint64]:
-        """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published, likewise."""
-        return self._told("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+        """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published."""
+        return self._optional("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
 
     @property
     def latency_ns(self) -> int:
-        """The longest that frames on a bus wait so that more are taken with them, ns; 0: not at all, or not told."""
-        return int(self._told("latency_ns", (1,), np.int64)[0])
+        """The longest that frames on a bus wait so that more are taken with them, ns; 0: not at all, or not known."""
+        return int(self._optional("latency_ns", (1,), np.int64)[0])
 
     @property
     def data_path(self) -> DataPath:
         """Which way the driver's frames take; ``MIXED`` where it is another for some buses, see ``bus_data_path``."""
-        own, of_buses = DataPath(int(self._told("data_path", (1,), np.uint8)[0])), set(self.bus_data_path.tolist())
+        own, of_buses = DataPath(int(self._optional("data_path", (1,), np.uint8)[0])), set(self.bus_data_path.tolist())
         return DataPath.MIXED if of_buses >= {DataPath.PYTHON, DataPath.NATIVE} else own
 
     @property
     def bus_data_path(self) -> npt.NDArray[np.uint8]:
-        """(n_buses,) uint8, :class:`skinware.status.DataPath`: what reads each bus; 0 where it is not told."""
-        return self._told("bus_data_path", (len(self.structure.buses),), np.uint8)
+        """(n_buses,) uint8, :class:`skinware.status.DataPath`: what reads each bus; 0 where it is not known."""
+        return self._optional("bus_data_path", (len(self.structure.buses),), np.uint8)
 
-    def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    def _optional(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         return self.column(name).reshape(shape) if name in self._columns else np.zeros(shape, dtype)
 
     # -- by type ------------------------------------------------------------------------------------------------
 
     def raw(self, type_name: str) -> npt.NDArray[Any]:
-        """(n,) of the structure's dtype: raw counts of all sensors of a type, in the order of ``structure.index``.
+        """Return (n,) of the structure's dtype: raw counts of a type's sensors, in the order of ``structure.index``.
 
         Raises:
             StructureError: no such type here; the same for all that take a type.
@@ -142,22 +142,22 @@ class DriverSnapshot(Sample):
         return self.values[self.structure.index(type_name)]
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
-        """(n,) float32: values of all sensors of a type, in the type's unit; float64 where raw values are int32."""
+        """Return (n,) float32: values of all sensors of a type, in its unit; float64 where raw values are int32."""
         return self.structure.physical(self.values, type_name)
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """(n,) uint8: status of all sensors of a type."""
+        """Return (n,) uint8: status of all sensors of a type."""
         return self.status[self.structure.index(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: ``group_time_ns`` of the update group of each sensor of a type."""
+        """Return (n,) int64: ``group_time_ns`` of the update group of each sensor of a type."""
         structure = self.structure
         return self.group_time_ns[structure.sensor_group[structure.index(type_name)]]
 
     def fresh(
         self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
     ) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which sensors of a type can be trusted now.
+        """Return (n,) bool: which sensors of a type can be trusted now.
 
         Those have the status 0, their driver lived when the frame was taken, and their data is not too old.
 

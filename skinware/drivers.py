@@ -11,7 +11,7 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
-from skinware.service._tap import wake_word_of
+from skinware.service._reader import wake_word_of
 
 LOOK_EVERY_NS = NS_PER_S // 5
 """Time between two looks for services that came or went."""

@@ -9,11 +9,11 @@ The file is TOML. Sensors stand in groups that share a type and a frame::
     name = "torso, board 7, triangle 5"     # for people
     type = "pressure"
     frame = "chest"                         # whose axes the numbers are in
-    radius_m = 0.002                        # of each sensor; left out where nobody knows
+    radius_m = 0.002                        # of each sensor; may be left out
     confidence = 0.95                       # that a sensor is within half a pitch of its place; may be left out
     uid = [0x70500, 0x70501]
     position_m = [[0.01, 0.02, 0.03], [0.01, 0.03, 0.03]]
-    normal = [[0.0, 0.0, 1.0], [nan, nan, nan]]     # outwards, of length 1; nan where nobody knows; may be left out
+    normal = [[0.0, 0.0, 1.0], [nan, nan, nan]]     # outwards, of length 1; nan: not known; may be left out
 
 ``uid`` are those of the driver's structure. A sensor that the file does not have has no known place.
 """
@@ -37,13 +37,13 @@ from skinware.toml_text import Keys, TomlText
 FORMAT, VERSION = "skinware-geometry", 1
 
 _LENGTH_TOLERANCE = 0.02
-"""Of a normal: files give them with few digits."""
+"""Largest deviation of a normal's length from 1: files give few digits."""
 _LONGEST_NAME = 64
-"""Of a frame, bytes."""
+"""Longest name of a coordinate frame, bytes."""
 
 
 class Sensors(Protocol):
-    """What has sensors in an order: a :class:`skinware.Structure`."""
+    """Sensors in an order: a :class:`skinware.Structure`."""
 
     @property
     def sensor_uid(self) -> npt.NDArray[np.uint64]: ...
@@ -65,8 +65,8 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         normal: of each sensor, of length 1, outwards; NaN where it is not known, None if no normal is known.
         radius_m: of each of them, m; None if it is not known.
         name: for people.
-        confidence: 0 to 1, the part of them that is within half a pitch of its place, as who measured them estimates;
-            None where nobody does.
+        confidence: 0 to 1, the part of them that is within half a pitch of its place, as estimated from
+            measurements; None: not estimated.
     """
 
     type: str
@@ -138,7 +138,7 @@ class Geometry:
         return known
 
     def of(self, structure: Sensors, type_name: str) -> Geometry:
-        """The places of a skin's sensors of one type, in the order of ``structure.index(type_name)``.
+        """Return the places of a skin's sensors of one type, in the order of ``structure.index(type_name)``.
 
         Raises:
             StructureError: the skin has no such type.
@@ -147,7 +147,7 @@ class Geometry:
         return self.at([type_name] * len(uid), uid)
 
     def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """The places of n sensors; not known where this geometry does not have them.
+        """Return the places of n sensors; not known where this geometry does not have them.
 
         Args:
             type_name: name of each one's type.
@@ -168,11 +168,11 @@ class Geometry:
 
     @classmethod
     def unknown(cls, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """Sensors whose places nobody knows."""
+        """Return the geometry of sensors whose places are not known."""
         return _empty(0).at(type_name, uid)
 
     def to_groups(self) -> list[GeometryGroup]:
-        """The sensors whose places are known, for a file: a group for each type, frame, radius and confidence."""
+        """Return the sensors with known places, for a file: a group for each type, frame, radius and confidence."""
         rows_of: dict[tuple[str, str, float | None, float | None], list[int]] = {}
         for row in np.flatnonzero(self.known).tolist():
             radius_m, confidence = (
@@ -237,7 +237,7 @@ class Geometry:
         )
 
     def _take(self, rows: npt.NDArray[np.int64], type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """The places of ``rows``; -1: not known."""
+        """Return the places of ``rows``; -1: not known."""
         n = len(rows)
         taken = _empty(n)
         known = rows >= 0
@@ -258,7 +258,7 @@ def read_geometry(path: str | Path) -> Geometry:
 
 
 def geometry_of(text: TomlText) -> Geometry:
-    """What a geometry file says.
+    """Return the contents of a geometry file.
 
     Raises:
         ConfigurationError: as for :func:`read_geometry`.
@@ -267,7 +267,7 @@ def geometry_of(text: TomlText) -> Geometry:
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
-    """The text of a geometry file.
+    """Return the text of a geometry file.
 
     Args:
         groups: what is in it.
@@ -338,5 +338,5 @@ def _triples(rows: npt.NDArray[np.float64]) -> tuple[Triple, ...]:
 
 
 def _string(text: str) -> str:
-    """A TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
+    """Return a TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
     return msgspec.json.encode(text).decode().replace("\x7f", "\\u007f")

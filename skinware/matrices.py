@@ -22,7 +22,7 @@ _MOST_NAMES = 20
 
 
 def rows_and_columns(kind: str) -> tuple[int, int] | None:
-    """What the kind of a module says, as ``4x6`` does; None: nothing of the sort."""
+    """Return the size in a module's kind, such as ``4x6``; None if the kind is no such text."""
     said = _KIND.fullmatch(kind)
     return (int(said[1]), int(said[2])) if said else None
 
@@ -48,7 +48,7 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
     Args:
         type_name: of the sensors.
         keys: of all modules.
-        kinds: likewise.
+        kinds: of all modules.
         module_of: (n,) the module of each sensor; in a matrix, they are row by row.
         names: of all modules; a name that only one of them has is as good as its key.
     """
@@ -73,7 +73,7 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
                 self._matrices[key] = frozen(positions[index].reshape(shape))
 
     def __getitem__(self, key: Key | str) -> npt.NDArray[np.int64]:
-        """(rows, columns) int64 of a module.
+        """Return (rows, columns) int64 of a module.
 
         Raises:
             StructureError: no such module, several of that name, or it is no matrix of these sensors.
@@ -101,5 +101,5 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
 
     def _why_no_matrix(self, key: Key | str, kind: str) -> str:
         if rows_and_columns(kind) is None:
-            return f"module {key!r} is no matrix but {kind!r}; its geometry tells where its sensors are"
+            return f"module {key!r} is no matrix but {kind!r}; its geometry has the places of its sensors"
         return f"module {key!r} is {kind}, but does not have a {self._type_name} sensor at each place"

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 SAMPLES_OF_A_KIND = 3
-"""Of each kind, for each bus."""
+"""Number of samples for each reason and bus."""
 DATA_BYTES = 8
-"""That are shown of a frame, at most."""
+"""Bytes of a frame that are kept at most."""
 _EXTENDED_FLAG = 0x8000_0000  # CAN_EFF_FLAG of linux/can.h
 
 SAMPLE = np.dtype(
@@ -38,7 +38,7 @@ SAMPLES = SAMPLES_OF_A_KIND * len(Unused)
 
 
 def sample_report(samples: npt.NDArray[np.void]) -> list[dict[str, Any]]:
-    """Samples as programs are told.
+    """Return samples as JSON has them.
 
     Args:
         samples: (n,) :data:`SAMPLE`; empty places are left out.

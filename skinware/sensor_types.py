@@ -1,4 +1,4 @@
-"""What a sensor senses: the shared catalogue, and how a driver says what its raw counts mean.
+"""Sensor types: the shared catalogue, and the meaning of a driver's raw counts.
 
 An identifier is ``vendor << 12 | number`` (20 + 12 bits), as in Skinware 2.0. Vendor 0 is the shared catalogue:
 an algorithm that asks for ``pressure`` works with every skin whose driver uses it.
@@ -90,7 +90,7 @@ MAGNETIC_FIELD_Z = SensorType("magnetic_field_z", 14, "T")
 FORCE_X = SensorType("force_x", 15, "N")
 FORCE_Y = SensorType("force_y", 16, "N")
 FORCE_Z = SensorType("force_z", 17, "N")
-"""Along the normal of the skin, for devices that tell a force and not a pressure; ``force_x`` and ``_y`` lie in it."""
+"""Along the normal of the skin, for devices that measure forces; ``force_x`` and ``force_y`` lie in the skin."""
 
 ACCELERATION = (ACCELERATION_X, ACCELERATION_Y, ACCELERATION_Z)
 ANGULAR_RATE = (ANGULAR_RATE_X, ANGULAR_RATE_Y, ANGULAR_RATE_Z)

@@ -15,7 +15,7 @@ from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.memory.take import NEWER, NEWEST, Take, take_of
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
-from skinware.service._tap import Tap
+from skinware.service._reader import Tap
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.status import age_limit_ns
@@ -98,7 +98,7 @@ class Skin:
         return self._layout
 
     def geometry(self, type_name: str) -> Geometry:
-        """Where every sensor of a type is, as the drivers tell, in the order of snapshots of the present layout.
+        """Return the places of all sensors of a type, in the order of snapshots of the present layout.
 
         Positions, normals and radii are NaN where a driver has no geometry, or none for that sensor.
 
@@ -108,7 +108,7 @@ class Skin:
         return self._layout.geometry(type_name)
 
     def reader(self, driver: str) -> DriverReader:
-        """The reader behind one driver, for its counters and losses.
+        """Return the reader behind one driver, for its counters and losses.
 
         Raises:
             ServiceNotFound: no such driver in this skin now.
@@ -127,15 +127,15 @@ class Skin:
         align: bool = False,
         timeout_s: float | None = 5.0,
     ) -> Snapshot:
-        """The newest frame of every living driver.
+        """Return the newest frame of every living driver.
 
         Args:
             newer_than: wait until a driver has published something newer, came or went. Default: take what is
                 there, and wait only if there is no driver.
             max_age_s: wait until the newest data of every driver is at most this old; default: of any age.
-            align: of every driver, of the frames that its ring still holds, the one nearest to one moment: the newest
-                that all of them have reached. A driver that has fallen silent does not hold the moment back.
-                ``Snapshot.spread_s`` says how near they came.
+            align: take from every driver the frame nearest to one moment, among those that its ring still holds: the
+                newest moment that all drivers have reached. A silent driver does not hold the moment back.
+                ``Snapshot.spread_s`` is the remaining difference.
             timeout_s: longest wait; None for no limit.
 
         Raises:
@@ -172,7 +172,7 @@ class Skin:
             if self._drivers.look():
                 self._discover()
             for reader in self._drivers.readers.values():
-                reader.tell()
+                reader.report()
         if self._in_c is None or self._closed or (known is not None and known is not self._latest):
             return False, None
         if known is None:

@@ -51,7 +51,7 @@ class SkinLayout:
         }
 
     def parts(self, type_name: str) -> list[tuple[int, Index]]:
-        """Where the sensors of a type are: (driver, positions in that driver's frame), in order.
+        """Return where the sensors of a type are: (driver, positions in that driver's frame), in order.
 
         Raises:
             StructureError: no driver has such sensors; the message lists the types there are.
@@ -80,13 +80,13 @@ class SkinLayout:
         )
 
     def _in_whole(self, column: str, count: str) -> npt.NDArray[np.int64]:
-        """A column of row numbers of all drivers, one after the other, counted through."""
+        """Return a column of row numbers of all drivers, one after the other, counted through."""
         before = np.cumsum([0, *(getattr(structure, count) for structure in self.structures)])
         parts = [getattr(structure, column) + first for structure, first in zip(self.structures, before, strict=False)]
         return np.concatenate(parts, dtype=np.int64) if parts else np.zeros(0, np.int64)
 
     def unit(self, type_name: str) -> str:
-        """Unit of the physical values of a type.
+        """Return unit of the physical values of a type.
 
         Raises:
             StructureError: no driver has such sensors, or several have them in different units; the message says how
@@ -95,41 +95,41 @@ class SkinLayout:
         parts = self.parts(type_name)
         units = {self.drivers[driver]: self.structures[driver].type(type_name).unit for driver, _ in parts}
         if len(set(units.values())) > 1:
-            told = ", ".join(f"{unit} of {driver}" for driver, unit in units.items())
+            found = ", ".join(f"{unit} of {driver}" for driver, unit in units.items())
             raise StructureError(
-                f"{type_name} comes in different units: {told}; read one driver with"
+                f"{type_name} comes in different units: {found}; read one driver with"
                 f" snapshot.of({next(iter(units))!r}).physical({type_name!r}), or choose some with Skin(drivers=[...])"
             )
         return next(iter(units.values()))
 
     def _rows(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: row of every sensor of a type among all sensors, driver by driver."""
+        """Return (n,) int64: row of every sensor of a type among all sensors, driver by driver."""
         before = np.cumsum([0, *(structure.n_sensors for structure in self.structures)])
         return np.concatenate(
             [np.arange(before[driver], before[driver + 1])[index] for driver, index in self.parts(type_name)]
         )
 
     def uids(self, type_name: str) -> npt.NDArray[np.uint64]:
-        """(n,) uint64: uid of every sensor of a type, in the order of ``Snapshot.physical``."""
+        """Return (n,) uint64: uid of every sensor of a type, in the order of ``Snapshot.physical``."""
         parts = self.parts(type_name)
         return np.concatenate([self.structures[driver].sensor_uid[index] for driver, index in parts])
 
     def driver_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``drivers`` of every sensor of a type, in the same order."""
+        """Return (n,) int64: index into ``drivers`` of every sensor of a type, in the same order."""
         return np.concatenate(
             [np.full(len(self.structures[driver].sensor_uid[index]), driver) for driver, index in self.parts(type_name)]
         )
 
     def module_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``modules`` of every sensor of a type, in the same order."""
+        """Return (n,) int64: index into ``modules`` of every sensor of a type, in the same order."""
         return self._in_whole("sensor_module", "n_modules")[self._rows(type_name)]
 
     def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``patches`` of every sensor of a type, in the same order."""
+        """Return (n,) int64: index into ``patches`` of every sensor of a type, in the same order."""
         return self._in_whole("sensor_patch", "n_patches")[self._rows(type_name)]
 
     def sensor_name(self, type_name: str, position: int) -> str:
-        """Name of a sensor's place, as people know it: ``board 8, triangle 3, taxel 5``.
+        """Return name of a sensor's place, as people know it: ``board 8, triangle 3, taxel 5``.
 
         Args:
             type_name: its type.
@@ -142,7 +142,7 @@ class SkinLayout:
         return _names.joined(module, self.structures[driver].name_in_module(row))
 
     def matrices(self, type_name: str) -> Matrices[ModuleKey]:
-        """Where the sensors of a type are in modules that are matrices: indices for arrays in the same order.
+        """Return where the sensors of a type are in modules that are matrices: indices for arrays in the same order.
 
         ``snapshot.physical("pressure")[layout.matrices("pressure")["inspire", "right hand", "index top"]]`` is
         (rows, columns). The name that the module has in its driver, ``"right hand, index top"``, does as well while one
@@ -167,7 +167,7 @@ class SkinLayout:
         return {}
 
     def geometry(self, type_name: str) -> Geometry:
-        """Where every sensor of a type is, in the same order; not known where its driver does not tell.
+        """Return where every sensor of a type is, in the same order; not known where its driver does not publish it.
 
         Raises:
             StructureError: no driver has such sensors.
@@ -181,7 +181,7 @@ class SkinLayout:
         return Geometry.joined(parts)
 
     def position(self, type_name: str, uid: int, driver: str | None = None) -> int:
-        """Where a sensor is in the order of ``Snapshot.physical``.
+        """Return where a sensor is in the order of ``Snapshot.physical``.
 
         Args:
             type_name: its type.

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import StructureError
+from skinware.errors import ConfigurationError, StructureError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.skin_layout import SkinLayout
 
@@ -27,7 +27,7 @@ class Snapshot:
     frames: tuple[DriverSnapshot, ...]
 
     def of(self, driver: str) -> DriverSnapshot:
-        """The frame of one driver.
+        """Return the frame of one driver.
 
         Raises:
             StructureError: no such driver in this snapshot; the message lists those there are.
@@ -50,7 +50,7 @@ class Snapshot:
     # -- by type: the sensors of all drivers that have it, driver by driver ---------------------------------------
 
     def raw(self, type_name: str) -> npt.NDArray[Any]:
-        """(n,) raw counts of all sensors of a type, of the narrowest dtype that holds those of every driver.
+        """Return (n,) raw counts of all sensors of a type, of the narrowest dtype that holds those of every driver.
 
         Raises:
             StructureError: no driver has such sensors; the same for all that take a type.
@@ -58,7 +58,7 @@ class Snapshot:
         return np.concatenate([frame.raw(type_name) for frame in self._frames_with(type_name)])
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
-        """(n,) float32 values of all sensors of a type, in ``unit(type_name)``; float64 if raw values are int32.
+        """Return (n,) float32 values of all sensors of a type, in ``unit(type_name)``; float64 if raw values are int32.
 
         Raises:
             StructureError: also where drivers have different units; the message says how to choose.
@@ -67,17 +67,17 @@ class Snapshot:
         return np.concatenate([frame.physical(type_name) for frame in self._frames_with(type_name)])
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """(n,) uint8 status of all sensors of a type, bits of :class:`skinware.Status`; see ``fresh``."""
+        """Return (n,) uint8 status of all sensors of a type, bits of :class:`skinware.Status`; see ``fresh``."""
         return np.concatenate([frame.status_of(type_name) for frame in self._frames_with(type_name)])
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: time of the data of each sensor of a type (of its module), CLOCK_MONOTONIC ns; 0: never seen."""
+        """Return (n,) int64: time of each sensor's data, of its update group, CLOCK_MONOTONIC ns; 0: never seen."""
         return np.concatenate([frame.time_ns(type_name) for frame in self._frames_with(type_name)])
 
     def fresh(
         self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
     ) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which sensors of a type can be trusted now.
+        """Return (n,) bool: which sensors of a type can be trusted now.
 
         Those have the status 0, their driver lived when its frame was taken, and their data is not too old.
 
@@ -92,7 +92,7 @@ class Snapshot:
         return np.concatenate([frame.fresh(type_name, max_age_s=max_age_s, at_ns=at_ns) for frame in frames])
 
     def unit(self, type_name: str) -> str:
-        """Unit of ``physical(type_name)``.
+        """Return unit of ``physical(type_name)``.
 
         Raises:
             StructureError: also where drivers have different units.
@@ -100,12 +100,88 @@ class Snapshot:
         return self.layout.unit(type_name)
 
     def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``layout.patches``, the names of patches, of every sensor of a type."""
+        """Return (n,) int64: index into ``layout.patches``, the names of patches, of every sensor of a type."""
         return self.layout.patch_of(type_name)
 
     def module_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``layout.modules``, the names of modules, of every sensor of a type."""
+        """Return (n,) int64: index into ``layout.modules``, the names of modules, of every sensor of a type."""
         return self.layout.module_of(type_name)
 
     def _frames_with(self, type_name: str) -> list[DriverSnapshot]:
         return [self.frames[driver] for driver, _ in self.layout.parts(type_name)]
+
+
+class Window:
+    """The last frames of one sensor type, for filters and other computations that need past values.
+
+    Add frames of one driver (``in_order`` returns every one) or snapshots of a skin::
+
+        window = Window("pressure", 100)
+        for frame in reader.in_order():
+            window.add(frame)
+            slow = window.physical.mean(axis=0)
+
+    Args:
+        type_name: which sensors.
+        length: how many frames to keep, N.
+
+    Raises:
+        ConfigurationError: a length below 1.
+    """
+
+    def __init__(self, type_name: str, length: int) -> None:
+        if length < 1:
+            raise ConfigurationError(f"a window of {length} frames: give at least 1")
+        self.type_name = type_name
+        self.length = length
+        self._of: object = None
+        self._added = 0
+        self._time_ns = np.zeros(length, np.int64)
+        self._physical: npt.NDArray[Any] = np.zeros((length, 0), np.float32)
+        self._fresh = np.zeros((length, 0), bool)
+
+    def add(self, frame: DriverSnapshot | Snapshot) -> None:
+        """Take a frame in; the oldest gives way.
+
+        A frame of another structure, or a snapshot of another layout, empties the window first: its sensors are others.
+
+        Raises:
+            StructureError: it has no sensors of the type, or has them in different units.
+        """
+        physical, fresh = frame.physical(self.type_name), frame.fresh(self.type_name)
+        of = frame.layout if isinstance(frame, Snapshot) else frame.structure
+        if of is not self._of:
+            self._of, self._added = of, 0
+            self._physical = np.zeros((self.length, len(physical)), physical.dtype)
+            self._fresh = np.zeros(self._physical.shape, bool)
+        row = self._added % self.length
+        self._time_ns[row] = np.max(frame.acquired_ns)
+        self._physical[row], self._fresh[row] = physical, fresh
+        self._added += 1
+
+    def __len__(self) -> int:
+        """Frames in it: N as soon as so many were added."""
+        return min(self._added, self.length)
+
+    @property
+    def physical(self) -> npt.NDArray[np.floating[Any]]:
+        """(len, n) physical values, the oldest frame first; a copy."""
+        return self._in_order(self._physical)
+
+    @property
+    def fresh(self) -> npt.NDArray[np.bool_]:
+        """(len, n) bool: which could be trusted when their frame was added; a copy."""
+        return self._in_order(self._fresh)
+
+    @property
+    def time_ns(self) -> npt.NDArray[np.int64]:
+        """(len,) int64: time of the newest data of each frame, CLOCK_MONOTONIC ns; a copy."""
+        return self._in_order(self._time_ns)
+
+    def _in_order(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        if self._added <= self.length:
+            return rows[: self._added].copy()
+        return np.roll(rows, -(self._added % self.length), axis=0)
+
+    def __repr__(self) -> str:
+        return f"<Window of {self.type_name}: {len(self)} of {self.length} frames>"

@@ -17,7 +17,7 @@ LONGEST_PERIOD_S = 86_400.0
 
 
 def age_limit_ns(period_ns: int) -> int:
-    """How old data may be and still count as fresh: three periods, and at least 0.2 s.
+    """Return how old data may be and still count as fresh: three periods, and at least 0.2 s.
 
     A driver marks sensors ``STALE`` after the same time. :meth:`skinware.Structure.age_limits_ns` has that of each
     sensor.
@@ -36,7 +36,7 @@ def is_fresh(
     max_age_ns: int | npt.NDArray[np.int64],
     alive: bool = True,
 ) -> npt.NDArray[np.bool_]:
-    """Which of n sensors are fresh.
+    """Return which of n sensors are fresh.
 
     Args:
         status: (..., n) bits of :class:`skinware.Status`.
@@ -74,11 +74,11 @@ class Status(enum.IntFlag):
     SUSPECT = 64
     """Some event makes the value doubtful (for example, the hardware moved its own baseline)."""
     UNHEALTHY = 128
-    """What the sensor has shown for minutes makes the value doubtful (stuck, noisy, dead ...): told by skin-calm."""
+    """The sensor has been stuck, noisy or dead for minutes, so its value is doubtful; skin-calm sets this bit."""
 
 
 class PatchState(enum.IntEnum):
-    """What a patch (microcontroller) is doing."""
+    """State of a patch (microcontroller)."""
 
     EXPECTED = 0
     """Part of the structure, but has not sent yet."""
@@ -91,7 +91,7 @@ class PatchState(enum.IntEnum):
 
 
 class BusState(enum.IntEnum):
-    """What a bus is doing."""
+    """State of a bus."""
 
     CONNECTING = 0
     """Not open yet, or being opened again."""
@@ -139,7 +139,7 @@ class BusReason(enum.IntEnum):
 
 
 class DataPath(enum.IntEnum):
-    """What receives the frames of a bus. Compiled code decodes and publishes all of them."""
+    """The code that receives the frames of a bus. Compiled code decodes and publishes all of them."""
 
     NOT_TOLD = 0
     """The driver does not say."""
@@ -161,7 +161,7 @@ LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF
 
 
 def load_report(load: int) -> dict[str, float | str | None]:
-    """A bus' load as programs are told: ``load``, 0 to 1, and if that is not known, in ``load_unknown`` why."""
+    """Return a bus' load as JSON has it: ``load``, 0 to 1; if it is not known, ``load_unknown`` says why."""
     if load in (LOAD_UNKNOWN, LOAD_FILTERED):
         return {"load": None, "load_unknown": "filter" if load == LOAD_FILTERED else "bit_rate"}
     return {"load": load / 1000, "load_unknown": None}

@@ -124,7 +124,7 @@ class Structure:
         self._check()
 
     def replace(self, **changes: Any) -> Structure:
-        """The same tables, but for some: arguments as of the constructor.
+        """Return the same tables, but for some: arguments as of the constructor.
 
         Raises:
             StructureError: they contradict the others.
@@ -133,7 +133,7 @@ class Structure:
         return Structure(**{name: getattr(self, name) for name in own} | changes)
 
     def only(self, positions: Index) -> Structure:
-        """The same patches and modules with some of their sensors.
+        """Return the same patches and modules with some of their sensors.
 
         Args:
             positions: in a frame, of the sensors that stay, in their order.
@@ -150,7 +150,7 @@ class Structure:
         )
 
     def placed(self, geometry: Geometry) -> Structure:
-        """The same sensors, at the places that a geometry has for them by type and uid."""
+        """Return the same sensors, at the places that a geometry has for them by type and uid."""
         by_id = {t.id: t.name for t in self.types}
         type_names = [by_id[type_id] for type_id in self.sensor_type.tolist()]
         return self.replace(geometry=geometry.at(type_names, self.sensor_uid))
@@ -186,7 +186,7 @@ class Structure:
         return frozen(self.module_patch[self.group_module])
 
     def age_limits_ns(self, period_ns: int) -> npt.NDArray[np.int64]:
-        """(n_sensors,) int64: how old the data of each sensor may be and still count as fresh.
+        """Return (n_sensors,) int64: how old the data of each sensor may be and still count as fresh.
 
         Args:
             period_ns: the driver's nominal period, for groups that have none of their own; 0 if it has none.
@@ -196,7 +196,7 @@ class Structure:
         return self._age_limits_ns[period_ns]
 
     def group_age_limits_ns(self, period_ns: int) -> npt.NDArray[np.int64]:
-        """(n_groups,) int64: the same for each update group."""
+        """Return (n_groups,) int64: the same for each update group."""
         return np.array([age_limit_ns(own or period_ns) for own in self.group_period_ns.tolist()], np.int64)
 
     @cached_property
@@ -247,7 +247,7 @@ class Structure:
         )
 
     def sensor_name(self, position: int) -> str:
-        """Name of a sensor's place, as people know it: ``board 8, triangle 3, taxel 5``.
+        """Return name of a sensor's place, as people know it: ``board 8, triangle 3, taxel 5``.
 
         All axes of a taxel have one name. Taxels are counted by uid from the lowest of their module, which is 0; the
         only one of a module is called as the module. Temperatures, accelerations and angular rates have the name of
@@ -275,7 +275,7 @@ class Structure:
         ]
 
     def name_in_module(self, position: int) -> str:
-        """What ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
+        """Return what ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
         of_module = self.module_index(int(self.sensor_module[position]))
         type_id = int(self.sensor_type[position])
         return _names.name_in_module(
@@ -285,7 +285,7 @@ class Structure:
         )
 
     def type(self, name: str) -> SensorType:
-        """The driver's sensor type of this name.
+        """Return the driver's sensor type of this name.
 
         Raises:
             StructureError: no sensor of that type here; the message lists those there are.
@@ -298,7 +298,7 @@ class Structure:
         )
 
     def index(self, type_name: str) -> Index:
-        """Positions in a frame of all sensors of a type, in frame order.
+        """Return positions in a frame of all sensors of a type, in frame order.
 
         Raises:
             StructureError: no such type here.
@@ -306,15 +306,15 @@ class Structure:
         return self._index_by_type[self.type(type_name).name]
 
     def module_index(self, module: int) -> Index:
-        """Positions in a frame of the sensors of a module, in frame order."""
+        """Return positions in a frame of the sensors of a module, in frame order."""
         return self._index_by_module[module]
 
     def patch_index(self, patch: int) -> Index:
-        """Positions in a frame of the sensors of a patch, in frame order."""
+        """Return positions in a frame of the sensors of a patch, in frame order."""
         return self._index_by_patch[patch]
 
     def position(self, type_name: str, uid: int) -> int:
-        """Position in a frame of one sensor.
+        """Return position in a frame of one sensor.
 
         Raises:
             StructureError: no such type, or no sensor of that uid with this type.
@@ -326,7 +326,7 @@ class Structure:
             raise StructureError(f"no {type_name} sensor with uid {uid:#x} in this skin") from None
 
     def module_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64, index of the module of each sensor of a type, in the order of ``index(type_name)``.
+        """Return (n,) int64, index of the module of each sensor of a type, in the order of ``index(type_name)``.
 
         Raises:
             StructureError: no such type here.
@@ -334,11 +334,11 @@ class Structure:
         return self._module_by_type[self.type(type_name).name]
 
     def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64, index of the patch of each sensor of a type, likewise."""
+        """Return (n,) int64, index of the patch of each sensor of a type, in the same order."""
         return self.module_patch[self.module_of(type_name)].astype(np.int64)
 
     def matrices(self, type_name: str) -> Matrices[str]:
-        """Where the sensors of a type are in modules that are matrices: indices for arrays in the order of ``index``.
+        """Return the places of a type's sensors in modules that are matrices: indices into arrays as of ``index``.
 
         Returns:
             By names of modules, (rows, columns) int64.
@@ -375,7 +375,7 @@ class Structure:
         return single * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
-        """The tables as named columns, for a service's file."""
+        """Return the tables as named columns, for a service's file."""
         types = self.types
         data: dict[str, npt.ArrayLike] = {
             "type_id": [t.id for t in types],

@@ -9,7 +9,7 @@
         ...  # do something else
 
 The thread owns what it was given, and closes it at its end. Its callback must not be slow for long: a reader then loses
-frames, a writer misses periods; nobody else is held up.
+frames, a writer misses periods; no other program is held up.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
-from skinware.service import ServiceReader, ServiceWriter
+from skinware.service import ServiceReader, Writer
 from skinware.skin import Skin
 from skinware.snapshot import Snapshot
 
@@ -161,7 +161,7 @@ def start_reader(
 
 
 def start_writer(
-    writer: ServiceWriter,
+    writer: Writer,
     function: Callable[[dict[str, npt.NDArray[Any]]], object],
     *,
     rate_hz: float | None = None,
@@ -188,12 +188,12 @@ def start_writer(
 
 
 class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
-    """While it is paused, readers and requesters are told so.
+    """A paused worker pauses its writer, so that readers and requesters notice it.
 
-    The writer itself yields nothing then; what it has begun before is filled, and not published.
+    The writer itself yields nothing then; a frame that was begun before is filled, and not published.
     """
 
-    _owned: ServiceWriter
+    _owned: Writer
 
     @property
     def paused(self) -> bool:
@@ -244,7 +244,7 @@ class SkinReplica(Worker[Snapshot]):
         return self._snapshot
 
     def wait(self, *, newer_than: Snapshot | None = None, timeout_s: float = 5.0) -> Snapshot:
-        """The next snapshot.
+        """Return the next snapshot.
 
         Args:
             newer_than: another than this one. Default: any.

@@ -1,4 +1,4 @@
-"""TOML files whose mistakes are told with file and line; the parser does not tell in which line a value stands."""
+"""Read TOML files, and find the line of a value for messages: the parser does not keep it."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ class TomlText:
         return f"{self._path}:{line_of(self._text, keys)}"
 
     def of_format(self, what: str, format_name: str, version: int, struct: type[T]) -> T:
-        """What it says, if it is a file of one of our formats, which begin with ``format`` and ``version``.
+        """Return the contents of a file of one of our formats, which begin with ``format`` and ``version``.
 
         Args:
             what: such a file is called, for messages.
             format_name: that it must have.
-            version: likewise.
+            version: that it must have.
             struct: of all that may be in it, these two included.
 
         Raises:
@@ -88,7 +88,7 @@ def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:
 
 
 def line_of(text: str, keys: Sequence[str | int]) -> int:
-    """The number of the line of a value, or of the table or value that has it in itself; 1 if there is none.
+    """Return the number of the line of a value, or of the table or value that has it in itself; 1 if there is none.
 
     Args:
         text: of the file.
@@ -120,7 +120,7 @@ def _paths(text: str) -> Iterator[tuple[int, Keys]]:
 
 
 def _element(path: Keys, elements: Counter[Keys]) -> Keys:
-    """The newest element of an array of tables; a table as it is."""
+    """Return the newest element of an array of tables; a table as it is."""
     return (*path, elements[path] - 1) if elements[path] else path
 
 

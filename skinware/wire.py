@@ -1,4 +1,4 @@
-"""What goes over the wires of drivers, in pieces: frames of a CAN bus, or bytes of a serial line, with their times.
+"""Pieces of the traffic on the wires of drivers: frames of a CAN bus, or bytes of a serial line, with their times.
 
 A piece, all little-endian::
 
@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 KIND = "wire"
-"""Kind of a service that tells what goes over the wires of a driver."""
+"""Kind of a service with the traffic on the wires of a driver."""
 WISH = "~wire"
-"""What somebody announces who wants it (:func:`skinware.memory.announcement.is_wished`); no service has this name."""
+"""Announced by programs that want it (:func:`skinware.memory.announcement.is_wished`); no service has this name."""
 BATCH_BYTES = 1 << 15
 """Pieces of a frame of such a service, at most."""
 MOST_FRAMES, MOST_BYTES = 64, 1 << 14
-"""Of one piece."""
+"""Size of one piece at most."""
 
 CLASSIC, FD, BYTES = 1, 2, 3
 """Forms of a piece: ``struct can_frame``, ``struct canfd_frame``, and bytes of a serial line."""
@@ -42,12 +42,12 @@ EXTENDED, REMOTE, ERROR, MASK = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x1FFF_FF
 IS_FD = 0x04
 """Flag of a CAN FD frame (``CANFD_FDF``)."""
 IS_CUT = 0x80
-"""Flag of a frame that is longer than any that its driver knows: ``length`` tells how much of it is there."""
+"""Flag of a frame that is longer than any that its driver knows: ``length`` is that of the part that is there."""
 
 COLUMNS: dict[str, Any] = {"bus": ("<u2", ()), "used": ("<u4", ()), "lost": ("<u8", ()), "pieces": ("u1", BATCH_BYTES)}
-"""Of such a service. ``used``: bytes of the pieces; ``lost``: frames or bytes of the bus that there was no room for
-so far. Static columns: ``driver``, its name, ``bus_name``, those of its buses, and ``about``, JSON: what the driver is,
-and with which options (``driver_type``, ``listen_only``, ``versions``; ``buses`` with ``medium`` and ``options``)."""
+"""Columns of such a service. ``used``: bytes of the pieces; ``lost``: frames or bytes of the bus for which there was no
+room so far. Static columns: ``driver``, its name, ``bus_name``, the names of its buses, and ``about``, JSON: the
+driver and its options (``driver_type``, ``listen_only``, ``versions``; ``buses`` with ``medium`` and ``options``)."""
 
 
 class Piece(NamedTuple):
@@ -77,7 +77,7 @@ def size_of(form: int, count: int) -> int:
 
 
 def read_pieces(data: bytes | memoryview) -> tuple[list[Piece], bool]:
-    """The pieces that some bytes consist of.
+    """Return the pieces that some bytes consist of.
 
     Returns:
         (pieces, whether the bytes end as a piece does): what comes after something that is none is left out.
@@ -94,7 +94,7 @@ def read_pieces(data: bytes | memoryview) -> tuple[list[Piece], bool]:
 
 
 def _read_piece(data: memoryview) -> tuple[Piece, int] | None:
-    """A piece and its size; None if there is none."""
+    """Return a piece and its size; None if there is none."""
     if len(data) < PIECE.itemsize:
         return None
     head = np.frombuffer(data, PIECE, 1)[0]
@@ -108,3 +108,48 @@ def _read_piece(data: memoryview) -> tuple[Piece, int] | None:
     if is_frames:
         return Piece(is_sent, time_ns, np.frombuffer(data, ROWS[form], count, rest), b""), size
     return Piece(is_sent, time_ns, None, bytes(data[rest : rest + count])), size
+
+
+_TOLD = 0x03
+"""Flags of a CAN FD frame that the text has."""
+_LONGEST_INTERFACE = 15  # IFNAMSIZ without its end
+
+
+def candump_line(
+    epoch_us: int, channel: str, identifier: int, fd_flags: int | None, payload: bytes, direction: str = ""
+) -> str:
+    """Return a frame as ``candump -L`` writes it, and ``canplayer`` and python-can read it.
+
+    ::
+
+        (1700000000.123456) vcan0 473#40F0F0F0F0F0F0F0      11-bit identifier: three digits
+        (1700000000.123456) vcan0 12345678#0102             29-bit identifier: eight digits
+        (1700000000.123456) vcan0 473##1112233              CAN FD: ## and the flags (1 bit-rate switch, 2 error)
+        (1700000000.123456) vcan0 123#R                     remote frame
+        (1700000000.123456) vcan0 20000004#0004000000000000 error frame: eight digits, with its flag
+
+    Source: can-utils lib.h and the manual of candump.
+
+    Args:
+        epoch_us: when, microseconds since 1970.
+        channel: name of the interface (:func:`channel_name`).
+        identifier: with the flags of linux/can.h.
+        fd_flags: of a CAN FD frame; None of a classic one.
+        payload: its data.
+        direction: ``R`` received, ``T`` sent; empty: not known.
+    """
+    seconds, microseconds = divmod(epoch_us, 1_000_000)
+    if identifier & ERROR:
+        name = f"{identifier & (MASK | ERROR):08X}"
+    else:
+        name = f"{identifier & MASK:08X}" if identifier & EXTENDED else f"{identifier & MASK:03X}"
+    data = "R" if identifier & REMOTE and not identifier & ERROR else payload.hex().upper()
+    flags = "" if fd_flags is None else f"#{fd_flags & _TOLD:X}"
+    behind = f" {direction}" if direction else ""
+    return f"({seconds}.{microseconds:06d}) {channel} {name}#{flags}{data}{behind}"
+
+
+def channel_name(interface: str, channel: str) -> str:
+    """Return a name without blanks that can stand for an interface: ``can0``, ``ttyACM0``, ``virtual``."""
+    name = channel.rpartition("/")[2] or interface
+    return "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)[:_LONGEST_INTERFACE]

@@ -1,4 +1,4 @@
-"""What a driver says of its hardware. Subclass a transport's adapter (``can.adapter.CanAdapter``), declare, done."""
+"""Describe hardware: a driver subclasses the adapter of its transport, such as ``can.adapter.CanAdapter``."""
 
 from __future__ import annotations
 
@@ -28,37 +28,37 @@ _COMMAND_OPTIONS = (
 
 
 class Adapter(HasOptions[OptionsT], ABC):
-    """One bus of a driver: what is attached to it, what its frames mean, and how to start it.
+    """A driver on one bus: the devices attached to it, the meaning of their frames, and how to start them.
 
-    The brackets of the base class name its options: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
+    The brackets of the base class name the options: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
     ``CanAdapter[NoOptions]``.
 
-    The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
-    ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
-    of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went
-    down) or ``OSError``; the runner then logs it and tries again later. Anything else is a fault of the driver's
-    code: the bus is set aside and tried again later, and if no other one is served, the driver ends.
+    The runner makes one object per bus and calls ``describe``, ``configure`` and ``start``; while data flows, ``probe``
+    and ``revive`` for a patch that fell silent; and ``stop`` before it closes the bus. All are coroutines of one event
+    loop: they must never block. If one raises ``BusError`` (a device did not answer, the bus went down) or ``OSError``,
+    the runner logs it and tries again. Anything else is a fault in the driver's code: the bus is set aside and tried
+    again later, and if no other bus is served, the driver ends.
 
     In listen-only mode only ``describe``, ``attend`` and ``join`` are called, and every send is refused.
 
-    Operations that programs may call while it runs are marked with :func:`skinware_drivers.operations.operation`.
+    Operations that programs may call are marked with :func:`skinware_drivers.operations.operation`.
 
-    An object of the class can set its own ``types``, ``dtype``, ``layout``, ``geometry`` and ``period_s``, in
-    ``__init__`` or, for hardware that describes itself, in ``describe``. The types of all buses are joined, and the
-    values of all buses have the smallest dtype that holds those of each.
+    An object can set its own ``types``, ``dtype``, ``layout``, ``geometry`` and ``period_s``, in ``__init__`` or, for
+    hardware that describes itself, in ``describe``. The types of all buses are joined, and the values of all buses
+    have the smallest dtype that holds those of each.
 
     Attributes:
         medium: kind of bus: ``can``, ``serial`` or ``virtual``.
         elsewhere: classes with the same options for the same devices on other kinds of bus.
-        Options: struct of the options, as named in the brackets; becomes command-line options and TOML keys.
+        Options: struct of the options, as named in the brackets; its fields become command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
-        layout: what frames mean.
-        patches: what is attached to each bus, unless ``describe`` finds out.
-        geometry: where their sensors are, by the uids that they have on their bus; None: nobody knows. What the bus
-            knows, or a person gives, comes first. For hands: :mod:`skinware_drivers.hand`.
-        period_s: nominal time between two updates of a module, 0.02 unless the class says another; an option
-            ``period_ms`` sets it. Ages and silence are judged by it.
+        layout: the meaning of the frames.
+        patches: the patches on each bus, unless ``describe`` finds them.
+        geometry: positions of the sensors, by their uids on the bus; None: unknown. A geometry of the bus or of a
+            person takes its place. For hands: :mod:`skinware_drivers.hand`.
+        period_s: nominal time between two updates of a module, 0.02 by default; an option ``period_ms`` sets it. Ages
+            and silence are judged by it.
         by_cycle: publish when every live patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
         heard_by: receives the notices of ``tell``; the runner sets it.
@@ -80,19 +80,19 @@ class Adapter(HasOptions[OptionsT], ABC):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """Requests to devices that only answer, sent repeatedly from ``start`` to ``stop``; called before each one."""
+        """Requests to devices that only answer, repeated from ``start`` to ``stop``; read before each request."""
         return ()
 
     @property
     def payload_size(self) -> int:
-        """Longest payload that a bus must be able to receive. Override it if ``describe`` makes the layout."""
+        """Longest payload that a bus must be able to receive, bytes. Override it if ``describe`` makes the layout."""
         return self.layout.payload_size
 
     def check(self) -> None:
-        """Check early that the driver's declarations are complete, unless ``describe`` asks its devices for them.
+        """Check that the declarations are complete, unless ``describe`` asks the devices for them.
 
         Raises:
-            ConfigurationError: something is missing, or contradicts something else; the message says what.
+            ConfigurationError: a declaration is missing, or contradicts another; the message names it.
         """
         name = type(self).__name__
         if not self.period_s > 0:
@@ -104,7 +104,7 @@ class Adapter(HasOptions[OptionsT], ABC):
                 raise ConfigurationError(f"{name} has no `{needed}`")
         try:
             tables = assemble([("bus", self.patches)], self.types, self.dtype)
-        except (StructureError, TypeError, AttributeError) as error:  # the last two: one where a list belongs, or so
+        except (StructureError, TypeError, AttributeError) as error:  # the last two: one object in place of a list
             raise ConfigurationError(f"{name}: `patches`, `types` and `dtype` make no skin: {error}") from None
         try:
             check_layout(self.layout, self.patches, tables, self.period_s)
@@ -112,11 +112,11 @@ class Adapter(HasOptions[OptionsT], ABC):
             raise ConfigurationError(f"{name}: {error}") from None
 
     def wire_s(self, poll: Poll) -> float:  # noqa: ARG002
-        """How long question and answer of a poll take on the wire at least, s; 0 where that is not known."""
+        """Return the least time that question and answer of a poll take on the wire, s; 0 if it is not known."""
         return 0.0
 
     def fit(self, bus: Bus) -> None:
-        """Prepare a bus that is not open yet for what this driver expects of it.
+        """Prepare a bus, which is not open yet, for this driver.
 
         Raises:
             ConfigurationError: it is another kind of bus.
@@ -128,7 +128,7 @@ class Adapter(HasOptions[OptionsT], ABC):
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
-        """The patches on this bus; by default the declared ones. None yet: the runner asks again, indefinitely."""
+        """Return the patches on this bus, by default the declared ones; if there are none, the runner asks again."""
         return self.patches
 
     async def configure(self, link: Link) -> None:
@@ -141,65 +141,67 @@ class Adapter(HasOptions[OptionsT], ABC):
         """Stop the data stream, also if ``configure`` or ``start`` was interrupted. It has less than a second."""
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask a patch that sends no data whether it is there; called repeatedly while it is silent.
+        """Ask a silent patch whether it is there; called repeatedly while it is silent.
 
-        By default no request is sent, since many devices answer none: it may have lost its power, and is revived.
+        By default no request is sent, since many devices answer none: the patch may have lost its power, and is
+        revived.
 
         Returns:
-            True if it answered: it has restarted, and ``revive`` is called next.
+            True: the patch answered. It has restarted, and ``revive`` is called next.
 
         Raises:
-            HandshakeTimeout: it did not answer. That is the same as False.
+            HandshakeTimeout: the patch did not answer, which is the same as False.
         """
         await self.revive(link, patch)
         return False
 
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set one patch up anew and start it; by default, whatever is on the bus, once for all that need it.
+        """Set one patch up again and start it; by default all patches of the bus.
 
-        To be overridden where patches can be set up one by one: as long as one patch is missing, the others are
-        disturbed, after 1 s, 2 s, 4 s and so on, at last once a minute.
+        Override it if patches can be set up one by one. Otherwise a missing patch disturbs the others, after 1 s, 2 s,
+        4 s and so on, at last once a minute.
         """
         await self.configure(link)
         await self.start(link)
 
     async def attend(self, link: Link) -> None:
-        """Runs beside the data from ``describe`` to the end: for devices that speak of their own state (``tell``).
+        """Listen to devices that report their own state, from ``describe`` to the end; pass it on with ``tell``.
 
-        What belongs to no module can be heard with ``link.follow``. A ``BusError`` ends it, and it is called again.
+        ``link.follow`` returns frames that belong to no module. After a ``BusError``, ``attend`` is called again.
         """
 
     def tell(self, patch: Patch, notice: Notice) -> None:
-        """To be called, from any of the coroutines, with what a patch says of itself; before there is data in vain."""
+        """Report what a patch says about itself; it has no effect before there is data. Call it in any coroutine."""
         if self.heard_by is not None:
             self.heard_by(patch, notice)
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
-        """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""
+        """Return the known patches and those that have appeared on the bus since; by default, describe again."""
         del known
         return await self.describe(link)
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Ask who is there, without knowing anything of the bus, for ``skin-find --probe``. By default nobody is asked.
+        """Ask an unknown bus for devices of this kind, for ``skin-find --probe``; by default send nothing.
 
-        Only what can do no harm to any device of this kind may be sent, whatever it is doing.
+        Send only requests that do no harm to any device of this kind, whatever it is doing.
 
         Args:
             link: the bus.
-            idle: nothing is sending: requests that would disturb a device which sends are harmless too.
+            idle: no device is sending, so requests that disturb a sending device are harmless, too.
 
         Returns:
-            Who answered, in a few words for people; None if nobody did.
+            The device that answered, in a few words for people; None: no device did.
 
         Raises:
-            BusError: it could not be asked; ``HandshakeTimeout``: nobody answered.
+            BusError: the request could not be sent.
+            HandshakeTimeout: no device answered.
         """
         return None
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
-        """What marks doubtful values; by default nothing does."""
+        """Return the object that marks doubtful values; by default it marks none."""
         return Watch(tables)
 
 

@@ -1,7 +1,7 @@
-"""What carries frames: the contract of a bus, and the batch that all buses of a driver fill.
+"""The contract of a bus, and the batch of frames that all buses of a driver fill.
 
 A bus knows nothing of skins. It moves frames between a wire and a :class:`FrameBatch`, stamps them with
-``CLOCK_MONOTONIC`` and counts what it had to drop. Implementations: ``can.socketcan`` (Linux), ``can.pythoncan``
+``CLOCK_MONOTONIC`` and counts those that it dropped. Implementations: ``can.socketcan`` (Linux), ``can.pythoncan``
 (every python-can interface), ``virtual.bus`` (emulated hardware in the same process).
 """
 
@@ -23,8 +23,8 @@ from skinware_drivers.wire_tap import WireTap
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h).
 
-Wherever an identifier is a number, one of 29 bits has this bit set: ``EXTENDED_FLAG | 0x18DA00F1``. As text it is what
-candump writes (:func:`identifier_text`).
+Every identifier of 29 bits has this bit set: ``EXTENDED_FLAG | 0x18DA00F1``. As text it is written as candump does
+(:func:`identifier_text`).
 """
 IDENTIFIER_MASK = 0x1FFF_FFFF
 """Identifier bits of a frame, without the flags."""
@@ -36,7 +36,7 @@ ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
 
 BATCH_FRAMES, _FRAMES_OF_A_BUS, _FEWEST_FRAMES, _BATCH_BYTES = 2048, 256, 64, 1 << 20
-"""What is read at once: so many frames or, of many buses, so many of each; of long frames as many as fill a MiB."""
+"""Room of a batch: frames in all, or frames of each bus if there are many; long frames fill at most a MiB."""
 
 _MEDIA = {
     "can": ("a CAN bus", ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual"),
@@ -44,7 +44,7 @@ _MEDIA = {
     "modbus": ("a Modbus line", ", as modbus:/dev/ttyUSB0 or modbus:tcp://192.168.1.10"),
     "virtual": ("a bus of this process", ": virtual"),
 }
-"""What the buses of a medium are called, and how they are written."""
+"""The name of a bus of each medium, for people, and examples of how it is written."""
 
 
 CHOOSE = "__skinware_choose_class__"
@@ -55,7 +55,7 @@ _MakeT = TypeVar("_MakeT", bound=Callable[..., Any])
 
 
 def identifier_text(identifier: int) -> str:
-    """An identifier as candump writes it: three digits for one of 11 bits, eight for one of 29."""
+    """Return an identifier as candump writes it: three digits for 11 bits, eight for 29."""
     if identifier & EXTENDED_FLAG:
         return f"{identifier & IDENTIFIER_MASK:08X}"
     return f"{identifier:03X}"
@@ -88,12 +88,12 @@ _CAN_PAYLOAD = 64
 
 
 def kind_of_bus(medium: str | None) -> str:
-    """What people call a bus of a medium: ``a CAN bus``."""
+    """Return the name of a bus of a medium for people: ``a CAN bus``."""
     return _MEDIA[medium][0] if medium in _MEDIA else f"a bus of medium {medium!r}"
 
 
 def wire_dtype(payload_size: int) -> np.dtype[np.void]:
-    """Row of a batch: the layout of ``struct can_frame`` (payload 8) and ``struct canfd_frame`` (64).
+    """Return the dtype of a row of a batch, the layout of ``struct can_frame`` and ``struct canfd_frame``.
 
     Frames of serial devices can be longer; their rows have a wider ``length``.
 
@@ -120,10 +120,9 @@ class FrameBatch:
         wire: (capacity,) :func:`wire_dtype`; rows ``start`` to ``stop`` are valid.
         time_ns: (capacity,) int64, CLOCK_MONOTONIC ns at which the kernel (or device) saw the frame.
         bus: (capacity,) uint16, ordinal of the bus in the driver.
-        start: first valid row. The rows before it are headroom, into which the decoder puts frames that
-            it still holds from the batch before.
+        start: first valid row. The rows before it are headroom for frames of the batch before that wait for partners.
         stop: one past the last valid row.
-        limit: rows before it may be filled: buses that share a batch must not crowd each other out.
+        limit: rows before it may be filled, so that no bus takes the room of the others.
     """
 
     def __init__(self, capacity: int, payload_size: int = 8, headroom: int = 0) -> None:
@@ -142,7 +141,7 @@ class FrameBatch:
 
     @classmethod
     def for_buses(cls, count: int, payload_size: int, headroom: int = 0) -> Self:
-        """Room for what so many buses bring at once; of long frames, fewer."""
+        """Return a batch with room for so many buses; for long frames, with fewer rows."""
         wanted = max(BATCH_FRAMES, _FRAMES_OF_A_BUS * count)
         return cls(max(_FEWEST_FRAMES, min(wanted, _BATCH_BYTES // payload_size)), payload_size, headroom)
 
@@ -152,12 +151,12 @@ class FrameBatch:
         return self.limit - self.stop
 
     def clear(self) -> None:
-        """Forget all rows; the memory stays."""
+        """Remove all rows; the memory stays."""
         self.start = self.stop = self.headroom
         self.limit = self.capacity
 
     def append(self, bus: int, time_ns: int, identifier: int, payload: bytes) -> None:
-        """Add one frame: the slow path of buses that hand out frames one by one.
+        """Add one frame; slow, for buses that receive frames one by one.
 
         Raises:
             ValueError: the payload is longer than a row holds.
@@ -180,18 +179,18 @@ class Bus(ABC):
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
-        device_end: makes the end at which emulated devices are, like the class itself; None: both ends are alike.
-        counters: what happened on it so far.
+        device_end: makes the end to which emulated devices are attached; None: both ends are alike.
+        counters: counts what happens on the bus.
         samples: some of the frames that could not be used.
-        tap: what goes over the wire, in both directions, as long as somebody wants it.
-        narrows: it can leave out frames that nobody wants, see ``narrow``.
+        tap: keeps what goes over the wire, in both directions, while a program records it.
+        narrows: it can leave out unwanted frames, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
         fullest: largest share of the receive buffer in use after a ``receive``, since it was last set to 0.
 
-    Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
-    down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and
-    opened again by its owner, indefinitely, with growing pauses.
+    Frames of one bus arrive in order. ``counters.lost`` counts frames that were lost. A bus that goes down or away
+    raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once; its owner then closes it and opens it again,
+    indefinitely, with growing pauses.
 
     Args:
         channel: the part of the bus' name behind ``interface:`` (``vcan0``, ``/dev/ttyUSB0``).
@@ -238,12 +237,12 @@ class Bus(ABC):
 
     @property
     def asks(self) -> bool:
-        """Whether it asks its devices by itself, so that the next question waits until the answer is taken."""
+        """Whether the bus itself asks its devices, so that the next question waits until the answer is taken."""
         return False
 
     @abstractmethod
     def open(self) -> None:
-        """Connect to the wire. Opening again after ``close`` is allowed; counters go on.
+        """Connect to the wire. A closed bus may be opened again; its counters continue.
 
         Raises:
             skinware.errors.BusNotAvailable: no such interface, interface down, or not permitted.
@@ -251,11 +250,11 @@ class Bus(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """A descriptor that is readable (for epoll) when ``receive`` has something to do."""
+        """Return a descriptor that is readable (for epoll) when ``receive`` has something to do; -1: not open."""
 
     @abstractmethod
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append what has arrived to ``batch``, marked with this bus' ``ordinal``; never blocks.
+        """Append the frames that have arrived to ``batch``, marked with this bus' ``ordinal``; never block.
 
         Returns:
             The number of frames appended; at most ``batch.free``.
@@ -266,17 +265,17 @@ class Bus(ABC):
 
     @abstractmethod
     def send(self, identifier: int, payload: bytes) -> None:
-        """Hand one frame to the wire; never blocks.
+        """Hand one frame to the wire; never block.
 
         Raises:
             skinware.errors.BusSendError: down, queue full, or ``listen_only``.
         """
 
     def may_send_by(self, way: _WayT | None) -> _WayT:
-        """The first thing in ``send``: refuse where nothing may be sent.
+        """Refuse to send where nothing may be sent; ``send`` begins with it.
 
         Args:
-            way: what hands frames to the wire, None while the bus is closed; given back.
+            way: what hands frames to the wire, None while the bus is closed; returned.
 
         Raises:
             skinware.errors.BusSendError: closed, or ``listen_only``.
@@ -289,23 +288,23 @@ class Bus(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the wire. Idempotent."""
+        """Disconnect from the wire. Idempotent."""
 
     def narrow(self, filters: Sequence[Filter]) -> None:  # noqa: B027  (a bus need not be able to)
-        """From now on leave out what none of these lets through; without any, nothing is left out.
+        """Receive only frames that one of these filters lets through; without filters, receive all.
 
-        Called only where ``narrows`` is true. It holds until the next call, also over ``close`` and ``open``.
+        Called only if ``narrows`` is true. The filters hold until the next call, also over ``close`` and ``open``.
         """
 
     def check(self) -> None:  # noqa: B027  (nothing to look after is the default)
-        """Look after a bus from which nothing comes, twice a second: a loss need not show in ``receive``.
+        """Look for a loss that does not show in ``receive``; called twice a second while nothing comes.
 
         Raises:
             skinware.errors.BusNotAvailable: the interface is down or away.
         """
 
     def reason(self, time_ns: int) -> BusReason:  # noqa: ARG002
-        """What is wrong with the open bus as of now, as far as its hardware tells.
+        """Return what is wrong with the open bus, as far as its hardware reports it.
 
         Args:
             time_ns: now, CLOCK_MONOTONIC ns.
@@ -314,21 +313,64 @@ class Bus(ABC):
 
     @property
     def geometry(self) -> Geometry | None:
-        """Where the sensors on it are, by the types and uids of their driver; None: the bus does not know."""
+        """Positions of the sensors on the bus, by the types and uids of their driver; None: unknown to the bus."""
         return None
 
     @property
     def note(self) -> str:
-        """What a person should know about this bus (say, a receive buffer smaller than asked for)."""
+        """A warning about this bus for people, such as a receive buffer smaller than requested; empty: none."""
         return ""
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """The name of the bus in messages."""
         return f"bus {self.channel}"
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.channel}>"
+
+
+class KernelBus(Bus):
+    """A bus of the kernel: a socket whose datagrams are ``struct can_frame`` or ``struct canfd_frame``, or a line."""
+
+    @property
+    @abstractmethod
+    def reads_natively(self) -> bool:
+        """Whether C can read the open bus in place of ``receive``."""
+
+    @abstractmethod
+    def hand_over(self, batch: FrameBatch, source: Any) -> bool:
+        """Describe the bus to C, which then reads it in place of ``receive``.
+
+        Args:
+            batch: gets the frames.
+            source: filled in: the descriptor, and the stream of a line; for a socket, the memory of ancillary data, the
+                clocks and the counts so far.
+
+        Returns:
+            Whether C can read it now.
+        """
+
+    @abstractmethod
+    def take_back(self, source: Any) -> None:
+        """Take over what C counted since ``hand_over``; called before any other method."""
+
+    def sort_out(self, batch: FrameBatch, new: slice) -> int:  # noqa: ARG002
+        """Remove rows that are no data frames from new rows of a batch; return the number of rows that are left."""
+        return len(range(new.start, new.stop))
+
+    @abstractmethod
+    def nothing_received(self, number: int) -> int:
+        """Handle an error of the kernel in place of frames; 0: there were none although the socket was readable.
+
+        Raises:
+            skinware.errors.BusNotAvailable: the interface went down or away.
+        """
+
+
+def is_read_natively(bus: Bus) -> bool:
+    """Return whether C can read a bus, as far as it is known."""
+    return isinstance(bus, KernelBus) and bus.reads_natively
 
 
 def chosen_by(choose: Callable[[str, dict[str, str]], type[Bus]]) -> Callable[[_MakeT], _MakeT]:

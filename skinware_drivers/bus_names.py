@@ -14,13 +14,13 @@ _PLACING: dict[str, dict[str, str]] = {
     "udp_multicast": {"port": "43113"},
     "socketcand": {"host": "", "port": ""},
 }
-"""By interface: the options that tell one bus from another beside the channel, with their defaults."""
+"""By interface: the options that determine the bus beside the channel, with their defaults."""
 NETWORKS = ("tcp", "udp", "websocket", "yarp")
 """Interfaces of serial devices that are reached over a network."""
 
 
 class BusPlace(NamedTuple):
-    """The parts of a bus name that tell one bus from another; ``options`` always come in the same order."""
+    """The parts of a bus name that determine the bus; ``options`` always have the same order."""
 
     interface: str
     channel: str

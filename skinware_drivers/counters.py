@@ -1,4 +1,4 @@
-"""Count what a bus carries, and keep a few of the frames that could not be used."""
+"""Count frames and bytes of a bus, and keep a few of the frames that could not be used."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from skinware.samples import SAMPLE, SAMPLES_OF_A_KIND, Unused
 
 @dataclass
 class FramerCounters:
-    """What was found in a stream of bytes, and what was not.
+    """Counts of the bytes and frames of a serial line.
 
-    ``bytes_in == frame_bytes + idle_bytes + skipped_bytes`` and those that may still become part of a frame.
+    ``bytes_in`` is the sum of ``frame_bytes``, ``idle_bytes``, ``skipped_bytes`` and the bytes that are not decided.
     """
 
     bytes_in: int = 0
@@ -38,14 +38,14 @@ class FramerCounters:
 
 @dataclass
 class BusCounters:
-    """What happened on one bus since it was made, counted by the bus itself."""
+    """Counts of one bus, kept by the bus itself."""
 
     frames: int = 0
     """Frames received."""
     lost: int = 0
     """Frames that the kernel (or the interface's queue) dropped before we could read them."""
     errors: int = 0
-    """CAN error frames and their like."""
+    """CAN error frames and similar."""
     refused: int = 0
     """Frames that do not fit this bus' batch (remote frames, FD frames on a classic layout)."""
     sent: int = 0
@@ -53,19 +53,19 @@ class BusCounters:
     send_failures: int = 0
     """Sends that the interface refused."""
     polls_missed: int = 0
-    """Polls of devices that only answer which could not be sent in time."""
+    """Polls that could not be sent in time."""
     polls_unanswered: int = 0
     """Polls in lock step whose answer did not come in time."""
     polls_late: int = 0
     """Answers to polls in lock step that came after their timeout; what they say is shown all the same."""
     updates_skipped: int = 0
-    """Updates of modules that were never published, as newer ones came before that was possible."""
+    """Updates of modules that newer ones replaced before they could be published."""
     overflows: int = 0
-    """How often the controller told that it had lost frames."""
+    """How often the controller reported lost frames."""
     bus_offs: int = 0
     """How often the controller left the wire."""
     framing: FramerCounters = field(default_factory=FramerCounters)
-    """Of a serial line."""
+    """Counts of a serial line."""
 
 
 _OWN = {each.name: each.name for each in fields(BusCounters) if each.name != "framing"} | {
@@ -77,7 +77,7 @@ _OWN = {each.name: each.name for each in fields(BusCounters) if each.name != "fr
     "bad_form": "framing.refused",
 }
 OWN_BUS_COUNTERS = tuple(_OWN)
-"""Names of what a bus counts, for people and other programs."""
+"""Names of the counts of a bus, for people and other programs."""
 read_own = attrgetter(*_OWN.values())
 """The counts of a ``BusCounters``, in the order of ``OWN_BUS_COUNTERS``."""
 
@@ -86,9 +86,9 @@ _PAUSE_NS = NS_PER_S // 4
 
 
 class Samples:
-    """Frames of one bus, the newest few of each kind, with different identifiers.
+    """The newest few unused frames of one bus, of each reason, with different identifiers.
 
-    However many come, at most four a second of each kind are looked at.
+    At most four frames a second of each reason are looked at.
 
     Attributes:
         rows: (SAMPLES,) :data:`skinware.samples.SAMPLE`.
@@ -100,14 +100,14 @@ class Samples:
         self._taken = [0] * (len(Unused) + 1)
 
     def wants(self, why: Unused) -> bool:
-        """Whether it is time to look at frames of a kind again."""
+        """Return whether it is time to look at frames with a reason again."""
         return now_ns() >= self.next_ns[why]
 
     def take(self, why: Unused, wire: npt.NDArray[Any]) -> None:
-        """Keep one of these frames, if it is time to, and one has an identifier that was not kept yet.
+        """Keep one of these frames if it is time, and one has a new identifier.
 
         Args:
-            why: they were not used.
+            why: the reason why they were not used.
             wire: (n,) rows of a batch (:func:`skinware_drivers.bus.wire_dtype`).
         """
         if not len(wire) or not self.wants(why):
@@ -121,7 +121,7 @@ class Samples:
             self._keep(kept, why, int(row["identifier"]), int(row["length"]), row["payload"].tobytes())
 
     def note(self, why: Unused, identifier: int, payload: bytes) -> None:
-        """Keep one frame that comes alone, if it is time to."""
+        """Keep one frame if it is time."""
         if self.wants(why):
             self.next_ns[why] = now_ns() + _PAUSE_NS
             kept = self.rows.reshape(len(Unused), SAMPLES_OF_A_KIND)[why - 1]

@@ -1,4 +1,4 @@
-"""What is attached to a bus: patches of modules of channels, with the keys by which frames name them."""
+"""Describe the devices on a bus: patches of modules of channels, with the keys by which frames name them."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Module:
     Attributes:
         channels: the sensor on each channel; None: no sensor, its values are dropped.
         key: the number by which frames name it within its patch.
-        kind: hardware-specific, for people and geometry.
+        kind: of hardware, for people and geometry.
         name: within its patch, for people (``triangle 3``); default: its kind, numbered if the patch has several.
-        period_s: nominal time between two of its updates, if it is not that of its frames (or else of the driver): a
+        period_s: nominal time between two of its updates, if it differs from that of its frames or the driver: a
             thermometer that sends once a second is fresh for three seconds.
     """
 
@@ -67,16 +67,16 @@ class Patch:
 
 
 def taxels(count: int, *type_names: str, first_uid: int = 0) -> list[Sensor]:
-    """Channels of ``count`` taxels with one or more axes: all axes of a taxel share its uid."""
+    """Return the channels of ``count`` taxels with one or more axes; all axes of a taxel share its uid."""
     return [Sensor(name, first_uid + i) for i in range(count) for name in type_names or ("pressure",)]
 
 
 @dataclass(frozen=True)
 class SkinTables:
-    """Descriptions of all buses in one piece: the structure, and the way from keys and channels into it.
+    """The descriptions of all buses: the structure, and the way from keys and channels into it.
 
     Attributes:
-        structure: what users see.
+        structure: the tables that programs see.
         patch_key: (bus, key) -> patch.
         module_key: (patch, key) -> module.
         channel_to_sensor: (n_modules, n_channels) int64, sensor of each channel; ``n_sensors`` = none.
@@ -90,21 +90,21 @@ class SkinTables:
     module_period_ns: npt.NDArray[np.int64] = field(repr=False)
 
     def with_buses(self, names: Sequence[str]) -> SkinTables:
-        """The same sensors on buses of other names, or on some of more buses."""
+        """Return the same sensors on buses of other names, or on some of more buses."""
         return replace(self, structure=self.structure.replace(buses=names))
 
     def placed(self, geometry: Geometry) -> SkinTables:
-        """The same sensors at the places that a geometry has for them."""
+        """Return the same sensors with the positions of a geometry."""
         return replace(self, structure=self.structure.placed(geometry))
 
 
 def uid_on_bus(bus: int, uid: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """What the whole driver calls sensors that have these uids on their bus."""
+    """Return the uids in the whole driver of sensors that have these uids on their bus."""
     return uid | np.uint64(bus << _BUS_SHIFT)
 
 
 def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorType]:
-    """The types of all buses, each once.
+    """Return the types of all buses, each once.
 
     Raises:
         StructureError: two buses mean different things by one type.
@@ -124,7 +124,7 @@ def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorTyp
 def assemble(
     buses: Sequence[tuple[str, Sequence[Patch]]], types: Sequence[SensorType], dtype: npt.DTypeLike
 ) -> SkinTables:
-    """Put the patches of all buses into one structure; uid = bus index << 32 | the driver's uid.
+    """Return the patches of all buses in one structure; uid = bus index << 32 | the driver's uid.
 
     Raises:
         StructureError: no sensor at all, two patches or modules of one key, an unknown type, or no possible period.

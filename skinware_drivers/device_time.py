@@ -1,10 +1,10 @@
-"""Stamps of a device's own clock, told in ours: when a sample was taken, and not when its frame got through.
+"""Convert the stamps of a device's own clock to CLOCK_MONOTONIC: when a sample was taken, not when its frame came.
 
-A frame is received some time after it was stamped, never before, and the shortest delay varies little, while USB and
-busy computers add milliseconds to others and half a second to a few. So the line that lies under all points (stamp,
-time of receipt) and as close to them as it can be tells the rate of the device's clock, and its offset up to the
+A frame is received some time after it was stamped, never before. The shortest delay varies little, while USB and busy
+computers add milliseconds to many frames and half a second to a few. So the line that lies under all points (stamp,
+time of receipt), and as close to them as possible, gives the rate of the device's clock, and its offset up to the
 shortest delay (S. B. Moon, P. Skelly, D. Towsley, "Estimation and Removal of Clock Skew from Network Delay
-Measurements", 1999). What comes late does not move it.
+Measurements", 1999). Late frames do not move it.
 """
 
 from __future__ import annotations
@@ -22,39 +22,40 @@ Times = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.floating[Any]]
 
 _PART_NS = NS_PER_S
-"""One point is kept for each such part of the window: the one that came with the least delay."""
+"""One point is kept for each part of the window of this length: the one with the least delay."""
 _RECENT_PARTS = 10
-"""The offset is that of the least delay among the last so many in which anything came: what was held up is known as
-late, also after a pause."""
+"""The offset is the least delay of the last parts in which frames came, so that delayed frames are known as late, also
+after a pause."""
 _LEAST_SPAN_NS = 2 * NS_PER_S
-"""Before that, the device's clock is taken to go as ours."""
+"""Before points span this time, the device's clock is assumed to run like CLOCK_MONOTONIC."""
 _JUMP_NS = NS_PER_S / 20
-"""A stamp that lies so far in the future shows that the device's clock was set."""
+"""A stamp so far in the future shows that the device's clock was set."""
 _FAR_BEHIND_NS = NS_PER_S
-"""If no stamp of a whole part lies less far in the past, the device's clock does not go: what comes late because this
-machine or the line was held up is followed at once by what does not."""
+"""If all stamps of a part lie further in the past, the device's clock stands still: after a delay of the line or of
+this machine, frames without delay follow at once."""
 
 
 class DeviceClock:
     """Brings the stamps of one device onto CLOCK_MONOTONIC.
 
     The resulting times are never after the time of receipt, and never go back. After a restart (a stamp that goes back,
-    or that lies in the future) or a stop (a clock that stands still, or goes far too slowly), all that was known of the
-    clock is discarded. What is received while it stands still gets the time of its receipt.
+    or that lies in the future) or a stop (a clock that stands still, or is far too slow), all that is known of the
+    clock is discarded. While it stands still, frames get the time of their receipt.
 
-    A gap in the stream, or a frame that is late, may be as long as half the time in which the stamps wrap around; the
-    time of receipt tells how often they did meanwhile.
+    A gap in the stream, or the delay of a frame, may be as long as half the time in which the stamps wrap around; the
+    time of receipt determines how often they have wrapped.
 
     Args:
         unit_s: seconds per count.
         modulo: the stamps wrap to 0 here.
-        window_s: how much of the past counts. Shorter follows changes of temperature faster, longer is steadier.
-        maximum_drift: most that the device's clock can be fast or slow, as a fraction.
+        window_s: how much of the past counts: a shorter one follows changes of temperature faster, a longer one is
+            steadier.
+        maximum_drift: largest rate error of the device's clock, as a fraction.
 
     Attributes:
-        restarts: how often the device's clock began anew.
+        restarts: how often the device's clock restarted.
         stops: how often it was found to stand still.
-        repeated: stamps that were equal to the one before.
+        repeated: stamps equal to the one before.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class DeviceClock:
         self._ticks = 0
         self._stamp = -1
         self._received_ns = 0
-        self._told_ns = -(1 << 63)
+        self._last_ns = -(1 << 63)
         self._slope = 0.0
         self._offset_ns = 0.0
         self.restarts: int = 0
@@ -78,11 +79,11 @@ class DeviceClock:
 
     @property
     def drift(self) -> float:
-        """How much slower than ours the device's clock is found to go, as a fraction; 0 until it is known."""
+        """How much slower the device's clock is than CLOCK_MONOTONIC, as a fraction; 0 until it is known."""
         return self._slope
 
     def convert(self, stamps: npt.ArrayLike, received_ns: npt.ArrayLike) -> Times:
-        """When frames were stamped.
+        """Return when frames were stamped.
 
         Args:
             stamps: (n,) whole numbers as the device sent them, in the order in which they were received.
@@ -92,9 +93,9 @@ class DeviceClock:
             (n,) int64, CLOCK_MONOTONIC ns.
         """
         raw, received = np.asarray(stamps).astype(np.int64), np.asarray(received_ns, np.int64)
-        told = received.copy()
+        times_ns = received.copy()
         if not len(raw):
-            return told
+            return times_ns
         is_first = self._stamp < 0
         if is_first:
             self._begin(int(raw[0]), int(received[0]))
@@ -105,19 +106,19 @@ class DeviceClock:
             if number:
                 self._restart(raw, received, step, start)
             while start < stop:
-                start = self._convert_part(raw, received, step, told, start, stop)
+                start = self._convert_part(raw, received, step, times_ns, start, stop)
         self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
-        np.maximum.accumulate(np.maximum(told, self._told_ns), out=told)
-        np.minimum(told, received, out=told)
+        np.maximum.accumulate(np.maximum(times_ns, self._last_ns), out=times_ns)
+        np.minimum(times_ns, received, out=times_ns)
         if self._is_far_behind():
             self.stops += 1
-            self._stamp = -1  # the next one begins anew
-            told = received.copy()
-        self._told_ns = int(told[-1])
-        return told
+            self._stamp = -1  # the next one restarts the clock
+            times_ns = received.copy()
+        self._last_ns = int(times_ns[-1])
+        return times_ns
 
     def _steps(self, raw: Times, received: Times) -> Times:
-        """(n,) counts since the stamp before, with as many turns as fit the time that has passed."""
+        """Return (n,) counts since the stamp before, with as many turns as fit the time that has passed."""
         difference = np.diff(raw, prepend=self._stamp)
         passed = np.diff(received, prepend=self._received_ns) / self._unit_ns
         turns = np.rint((passed - difference) / self._modulo).astype(np.int64)
@@ -134,8 +135,8 @@ class DeviceClock:
         self._begin(int(raw[at]), int(received[at]))
         step[at] = 0
 
-    def _convert_part(self, raw: Times, received: Times, step: Times, told: Times, start: int, stop: int) -> int:
-        """Convert up to a jump into the future; gives where to go on."""
+    def _convert_part(self, raw: Times, received: Times, step: Times, times_ns: Times, start: int, stop: int) -> int:
+        """Convert up to a jump into the future; return where to continue."""
         ticks = self._ticks + np.cumsum(step[start:stop])
         device_ns: Floats = ticks * self._unit_ns
         delay_ns: Floats = (received[start:stop] - self._origin_ns) - device_ns
@@ -145,7 +146,7 @@ class DeviceClock:
             device_ns, delay_ns = device_ns[: int(future[0])], delay_ns[: int(future[0])]
         if stop > start:
             self._learn(received[start:stop], device_ns, delay_ns)
-            told[start:stop] = self._origin_ns + np.rint(device_ns + self._line(device_ns)).astype(np.int64)
+            times_ns[start:stop] = self._origin_ns + np.rint(device_ns + self._line(device_ns)).astype(np.int64)
             self._ticks = int(ticks[stop - start - 1])
         if len(future):
             self._restart(raw, received, step, stop)
@@ -155,7 +156,7 @@ class DeviceClock:
         return self._offset_ns + self._slope * device_ns
 
     def _learn(self, received: Times, device_ns: Floats, delay_ns: Floats) -> None:
-        """Keep the points of least delay, and put the line under them."""
+        """Keep the points of least delay, and fit the line under them."""
         above = delay_ns - self._slope * device_ns
         parts = received // _PART_NS
         edges = np.flatnonzero(np.diff(parts, prepend=parts[:1] - 1))
@@ -172,28 +173,26 @@ class DeviceClock:
         self._offset_ns = min(y - self._slope * x for _, x, y in recent)
 
     def _is_far_behind(self) -> bool:
-        """Whether the newest whole part says that the clock does not go."""
+        """Return whether the newest whole part shows that the clock stands still."""
         if len(self._points) < 2:
             return False
         _, x, y = self._points[-2]
         return y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS
 
     def _fit_slope(self) -> None:
-        whole = list(self._points)[:-1]  # of the newest part, the best may be yet to come
+        whole = list(self._points)[:-1]  # the best point of the newest part may be yet to come
         if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_NS:
             return
         hull: list[tuple[float, float]] = []
         for _, x, y in whole:
-            while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
-                hull.pop()
+            while len(hull) > 1:
+                (x0, y0), (x1, y1) = hull[-2:]
+                if (y1 - y0) * (x - x0) < (x1 - x0) * (y - y0):
+                    break
+                hull.pop()  # it lies on or above the line from the one before to this one
             hull.append((x, y))
         middle = sum(x for _, x, _ in whole) / len(whole)
         right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
         self._slope = min(max(slope, -self._maximum_drift), self._maximum_drift)
-
-
-def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
-    """Whether the second point lies on or above the line from the first to the third."""
-    return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])

@@ -1,8 +1,8 @@
-"""Nominal places of taxels on a hand, for drivers of hands whose makers publish none: grids on fingers and palm.
+"""Nominal positions of taxels on a hand, for hands whose makers publish none: grids on fingers and palm.
 
-They tell a person which taxels are beside each other, and which finger they are on. They are no measurement: lengths of
-fingers, gaps and, where no pitch is published, pitches are typical ones, and all fingers lie in one plane. So the frame
-is called ``hand_nominal``. A geometry that a person gives takes their place.
+They show a person which taxels are neighbours, and on which finger they are. They are not measured: lengths of fingers,
+gaps and unpublished pitches are typical ones, and all fingers lie in one plane. The coordinate frame is therefore
+called ``hand_nominal``. A geometry that a person gives takes their place.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinware.geometry import Geometry, Triple
 
 FRAME = "hand_nominal"
 PITCH_M = 0.002
-"""Of taxels, where nobody publishes it."""
+"""Distance of taxels if the maker publishes none, m."""
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -29,10 +29,10 @@ _TOP_M = {
     "little": (-0.036, 0.070),
     "palm": (0.0, -0.010),
 }
-"""x and y of the upper end of each part of a right hand. Seen on its palm, the fingers up: x is to the right, where
-the thumb is, y up, z out of the palm."""
+"""x and y of the upper end of each part of a right hand, seen on its palm with the fingers up: x points to the right,
+where the thumb is, y up, z out of the palm."""
 _GAP_M = 0.003
-"""Between two grids of a finger."""
+"""Distance of two grids of a finger, m."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Grid:
     """Taxels in rows and columns, row by row from the upper left one, as a person sees the palm with the fingers up.
 
     Attributes:
-        rows: of which the first is nearest to the fingertip.
+        rows: the first one is nearest to the fingertip.
         columns: from left to right.
         pitch_m: distance of neighbours, m.
     """
@@ -57,13 +57,13 @@ class Grid:
         frame: str = FRAME,
         cells: Sequence[int] | None = None,
     ) -> Geometry:
-        """The places of a grid's taxels.
+        """Return the positions of a grid's taxels.
 
         Args:
-            centre_m: of the grid.
-            type_names: types of the sensors that each taxel has (``["pressure"]``, or its axes).
-            uid: of the taxels, row by row; the last ones may be missing.
-            frame: in which they are, if not that of a hand.
+            centre_m: centre of the grid.
+            type_names: types of the sensors of each taxel (``["pressure"]``, or its axes).
+            uid: uids of the taxels, row by row; the last ones may be missing.
+            frame: coordinate frame, if not that of a hand.
             cells: the cell of each taxel, counted row by row; default: they fill the grid in this order.
 
         Raises:
@@ -94,17 +94,17 @@ class Hand:
     """A nominal hand.
 
     Attributes:
-        side: of the body; a left hand is a mirrored right one.
+        side: of the body; a left hand mirrors a right one.
     """
 
     side: Literal["right", "left"] = "right"
 
     def down(self, part: str, grids: Sequence[Grid]) -> list[Triple]:
-        """The centres of grids that follow each other from the upper end of a finger, or of the palm, down.
+        """Return the centres of grids that follow each other from the upper end of a finger, or of the palm, down.
 
         Args:
             part: one of ``FINGERS``, or ``palm``.
-            grids: the first is the uppermost.
+            grids: the first one is uppermost.
 
         Raises:
             ValueError: no such part.

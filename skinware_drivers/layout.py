@@ -1,7 +1,7 @@
-"""The vocabulary in which a driver says what its frames mean. Nothing here runs per frame: see ``decoding``.
+"""The words that declare the meaning of frames. Nothing here runs per frame: see ``decoding``.
 
-A layout is a list of :class:`Frame`. Each says *when* a frame on the wire is one of its kind, whose module it
-belongs to (*key*), and what its bytes are (*values*, *flags*, *sequence*). A :class:`Cycle` says which frames only
+A layout is a list of :class:`Frame`. Each declares *when* a frame on the wire is of its kind, to which module it
+belongs (*key*), and what its bytes are (*values*, *flags*, *sequence*). A :class:`Cycle` declares frames that only
 count together.
 """
 
@@ -17,13 +17,12 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import LONGEST_PERIOD_S, Status
 from skinware_drivers.bus import check_identifier
-from skinware_drivers.conditions import Bits, Byte, Condition, Identifier
-from skinware_drivers.numbering import DeviceTime, SequenceNumber
+from skinware_drivers.fields import Bits, Byte, Condition, DeviceTime, Identifier, SequenceNumber
 
 MOST_FRAMES = 200
-"""Kinds of frame that a driver can tell apart, over all its buses."""
+"""Kinds of frame that a driver can have, over all its buses."""
 MOST_MEMBERS, MOST_IN_ANY_ORDER = 128, 32
-"""Frames of a cycle: in a given order, and in any other."""
+"""Frames that a cycle can have: in a given order, and in any other."""
 _KEY_BITS = 29
 _FEWEST_COUNTS = 4
 
@@ -47,7 +46,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class Values:
-    """Where sensor values are in a payload.
+    """The place of sensor values in a payload.
 
     Attributes:
         offset: first byte.
@@ -63,7 +62,7 @@ class Values:
 
     @property
     def channels(self) -> tuple[int | None, ...]:
-        """Channel of each value."""
+        """Channel of each value, None = dropped."""
         return tuple(range(self.count)) if self.to is None else tuple(self.to)
 
     @property
@@ -86,7 +85,7 @@ class Flag:
         dtype: unsigned numpy dtype with byte order (``">u2"``).
         mask: any of these bits set the status of the whole module. 0: none does.
         each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
-        normal: the word when nothing is to be told: bits count as set where they differ from it.
+        normal: the word that sets no flag: bits count as set where they differ from it.
     """
 
     status: Status
@@ -131,18 +130,18 @@ AnyFlag = Flag | Sentinel | Above | StatusBytes
 
 @dataclass(frozen=True)
 class Expand:
-    """For payloads that ``Values`` cannot describe (run lengths, nibble maps, text): a vectorised function.
+    """A vectorised function that reads payloads which ``Values`` cannot describe: run lengths, nibble maps, text.
 
-    ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
-    the row of ``payload``, the channel, and the value.
+    ``function(payload, length)`` is called with (n, size) uint8 and (n,) uint8 and returns three arrays of equal
+    length: the row of ``payload``, the channel, and the value.
 
-    It gets whatever comes over the wire, also garbage. A frame for which it raises, or returns a value that the dtype
-    cannot hold, is counted as bad content and not shown.
+    It is called with anything that comes over the wire, also garbage. A frame for which it raises, or returns a value
+    that the dtype cannot hold, is counted as bad content and not shown.
 
     Attributes:
         function: see above.
-        to: the channels that it can return; None: any. Where other frames fill the same module, it says which sensors
-            this kind of frame keeps fresh.
+        to: the channels that it can return; None: any. If other frames fill the same module, it determines which
+            sensors this kind of frame keeps fresh.
     """
 
     function: Callable[
@@ -160,13 +159,13 @@ class Frame:
         name: for the cycle and for messages.
         when: conditions that must all hold; none: every frame of the bus with an 11-bit identifier is of this kind.
         length: correct payload lengths; frames of other lengths are counted and not shown.
-        values: where the values are, in one run or in several.
+        values: the places of the values, in one run or in several.
         patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
             None: the bus has one patch.
         module: bit field that names the module within the patch; or the key of the only module that it is of; None:
             the patch has one module.
-        flags: what sets status bits.
-        sequence: sequence number, if there is one that the frames of a cycle do not share (see :class:`Cycle`).
+        flags: rules that set status bits.
+        sequence: sequence number that the frames of a cycle do not share (see :class:`Cycle`).
         time: the device's own time, if the frame has it.
         period_s: nominal time between two of these frames of a module, if it is longer than the driver's: their sensors
             are stale after three of these periods.
@@ -190,14 +189,14 @@ class Frame:
 
     @property
     def runs(self) -> Sequence[Values]:
-        """The runs of values; none of a frame that is expanded."""
+        """The runs of values; empty for a frame that is expanded."""
         if isinstance(self.values, Expand):
             return ()
         return (self.values,) if isinstance(self.values, Values) else self.values
 
     @property
     def module_byte(self) -> Bits | None:
-        """The field of the payload that names the module, if it is not the identifier that does."""
+        """The field of the payload that names the module; None: the identifier names it."""
         return self.module if isinstance(self.module, Bits) and self.module.byte is not None else None
 
     @property
@@ -210,8 +209,8 @@ class Frame:
 class Cycle:
     """Frames that together are one coherent update of a module; it is shown only if all of them arrived.
 
-    With a ``counter``, frames of different cycles are never joined. Without one, only order and time tell cycles
-    apart: see :doc:`/explanation/layout` for what they can tell, and what they cannot.
+    With a ``counter``, frames of different cycles are never joined. Without one, only order and time separate cycles:
+    see :doc:`/explanation/layout` for the cases in which that fails.
 
     Attributes:
         members: names of the frames, in order.
@@ -220,9 +219,9 @@ class Cycle:
         order: ``given``: in the order of ``members``; ``any``: each once; ``ends_with``: any order, but the last
             member last.
         maximum_age_s: longest time from the first to the last of them. Two cycles must not fit into it: it is shorter
-            than a period (``any``: half a period), or so many periods as the counter has values.
-        counter: the number that all frames of a cycle have in common and that changes with each cycle of the module
-            (or patch). One field that all members have, or one for each member.
+            than a period (``any``: half a period), or than as many periods as the counter has values.
+        counter: the number that all frames of a cycle share, and that changes with each cycle of the module (or
+            patch): one field that all members have, or one for each member.
         period_s: nominal time from one cycle to the next, of the modules that are the fastest; default: the driver's.
     """
 
@@ -247,10 +246,10 @@ class Cycle:
 
     @property
     def reach_s(self) -> float:
-        """What must be shorter than ``turn`` periods, or two cycles fit into ``maximum_age_s``.
+        """The time that must be shorter than ``turn`` periods, or two cycles fit into ``maximum_age_s``, s.
 
-        In a given order, the frame that came last must be from the end of a cycle and the first from the beginning
-        of one, which are a period apart or more. In any order, it can be the end of one and the beginning of the next.
+        In a given order, the last frame must be from the end of a cycle and the first from the beginning of one, which
+        are a period apart or more. In any order, they can be the end of one cycle and the beginning of the next.
         """
         return 2 * self.maximum_age_s if self.order == "any" else self.maximum_age_s
 
@@ -262,10 +261,10 @@ class Layout:
     Attributes:
         frames: kinds of frame.
         cycle: of some of them; None: each is shown by itself.
-        more_cycles: of others of them, where not all modules send the same frames.
+        more_cycles: of others of them, if not all modules send the same frames.
 
     Raises:
-        ConfigurationError: what it says cannot be decoded; the message names the frame.
+        ConfigurationError: the layout cannot be decoded; the message names the frame.
     """
 
     frames: Sequence[Frame]
@@ -279,7 +278,7 @@ class Layout:
         for frame in self.frames:
             _check_frame(frame)
         if len({(frame.time.unit_s, frame.time.turn) for frame in self.frames if frame.time is not None}) > 1:
-            raise ConfigurationError("the frames of a device tell the time of one clock: give one unit and one modulo")
+            raise ConfigurationError("the times of a device's frames come from one clock: give one unit and one modulo")
         taken: set[str] = set()
         for cycle in self.cycles:
             members = list(cycle.members)
@@ -297,7 +296,7 @@ class Layout:
 
     @property
     def cycles(self) -> Sequence[Cycle]:
-        """All of them; empty without one."""
+        """All cycles; empty without one."""
         return (*(() if self.cycle is None else (self.cycle,)), *self.more_cycles)
 
     @property

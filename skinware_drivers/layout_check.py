@@ -1,4 +1,4 @@
-"""Whether a layout fits the skin that it is for, and the rate at which that sends: what only both together can tell."""
+"""Check that a layout fits the patches and the period of its driver."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinware_drivers.layout import Cycle, Frame, Layout, Packed, Values
 from skinware_drivers.native.compiling import check_values
 
 _DTYPES = ("u1", "i2", "u2", "i4", "f4")
-"""What a driver's dtype can be, the smallest first."""
+"""Dtypes that a driver can have, the smallest first."""
 
 
 def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, period_s: float) -> None:
@@ -21,12 +21,12 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
 
     Args:
         layout: of one bus.
-        patches: what is on that bus.
+        patches: on that bus.
         tables: made of them.
         period_s: nominal time between two updates of a module.
 
     Raises:
-        ConfigurationError: it does not fit; the message says what to do.
+        ConfigurationError: it does not fit; the message says how to change it.
     """
     for cycle in layout.cycles:
         _check_age(cycle, cycle.period_s or period_s)
@@ -55,7 +55,7 @@ def _check_age(cycle: Cycle, period_s: float) -> None:
     most = "half of that" if cycle.order == "any" else "that"
     raise ConfigurationError(
         f"cycle of {', '.join(cycle.members)}: two cycles fit into maximum_age_s = {cycle.maximum_age_s:g}, and their"
-        f" frames could not be told apart ({fits}): make it shorter than {most}, say half as long"
+        f" frames could not be distinguished ({fits}): make it shorter than {most}, say half as long"
         + ("" if cycle.turn > 1 else "; or say where its frames have a `counter`")
     )
 
@@ -82,7 +82,7 @@ def _check_dtype(frame: Frame, values: Values, dtype: np.dtype[np.generic]) -> N
 
 
 def _holds(dtype: np.dtype[np.generic], sent: str | Packed) -> bool:
-    """Whether every value that can be sent is one that the dtype has (as float32, at least nearly)."""
+    """Return whether the dtype has every value that can be sent (float32: at least nearly)."""
     if not isinstance(sent, Packed) and np.dtype(sent).kind not in "iu":
         return np.can_cast(sent, dtype, "safe")
     if dtype.kind == "f":

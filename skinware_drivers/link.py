@@ -1,4 +1,4 @@
-"""A driver's conversation with the devices on one bus, in coroutines, while the data keeps flowing."""
+"""Handshakes of a driver with the devices on one bus, in coroutines, while data keeps flowing."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05
 _SEND_TIMEOUT_S = 0.5
 _LATE_NS = 5 * NS_PER_S
 DEFAULT_PACE_PER_MS = 4.0
-"""Half of what a CAN bus of 1 Mbit/s can carry: the devices' own frames need the other half."""
+"""Half of the frames that a CAN bus of 1 Mbit/s can carry; the devices' own frames need the other half."""
 AT_ONCE = 8
-"""Frames that may be sent without a pause, if none was sent for a while; reception waits for no more than these."""
+"""Frames that may be sent without a pause if none was sent for a while; reception waits for these at most."""
 
 
 class Reply(NamedTuple):
@@ -45,10 +45,10 @@ class Reply(NamedTuple):
 
 
 class Match(NamedTuple):
-    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
+    """The frames that are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
 
-    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) counts whatever the mask. Where questions
-    of other programs begin as the answers do, ``shortest`` tells them apart: the bytes that an answer has at least.
+    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) always counts. If questions of other
+    programs begin like the answers, ``shortest`` excludes them: the least number of bytes of an answer.
     """
 
     value: int
@@ -58,24 +58,24 @@ class Match(NamedTuple):
 
     @property
     def filter(self) -> Filter:
-        """Lets all frames through whose identifiers fit."""
+        """The filter that lets all frames with fitting identifiers through."""
         return Filter(self.value, self.mask | EXTENDED_FLAG)
 
     def fits(self, frame: Reply) -> bool:
-        """Whether a frame is such an answer."""
+        """Return whether a frame is such an answer."""
         value, mask = self.filter
         is_from_there = frame.identifier & mask == value
         return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest
 
 
 class _Overdue(NamedTuple):
-    """A question in lock step that was given up.
+    """A question in lock step whose timeout has passed.
 
     Attributes:
         answer: to it.
         due_ns: when the answer should have come.
-        until_ns: until when an answer may still come.
-        on_late: called with how late the answer came, s.
+        until_ns: until when the answer may still come.
+        on_late: called with the delay of the answer, s.
     """
 
     answer: Match
@@ -85,7 +85,7 @@ class _Overdue(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """By what :meth:`Link.listen` distinguishes frames."""
+    """The properties by which :meth:`Link.listen` distinguishes frames."""
 
     identifier: int
     first_byte: int
@@ -93,10 +93,10 @@ class Heard(NamedTuple):
 
 
 class Link:
-    """One bus for a driver's handshakes. Everything runs in the runner's event loop; there are no threads.
+    """One bus for a driver's handshakes. Everything runs in the runner's event loop, without threads.
 
     Frames that are not data of the layout are offered to handshakes that wait for answers. Frames are sent at a limited
-    pace, so that reception and everything else continues meanwhile.
+    pace, so that reception continues meanwhile.
 
     Args:
         bus: the bus.
@@ -131,11 +131,11 @@ class Link:
 
     @property
     def is_awaiting(self) -> bool:
-        """Whether a question is open. Who follows frames, perhaps indefinitely, has asked none."""
+        """Whether a question is open; ``follow`` asks none."""
         return self._questions > 0 or self._expected is not None
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:
-        """Send one frame; waits while a question in lock step is open (:meth:`ask`), or the interface's queue is full.
+        """Send one frame, once no question in lock step is open (:meth:`ask`) and the interface's queue has room.
 
         Raises:
             BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
@@ -155,7 +155,9 @@ class Link:
         loop = asyncio.get_running_loop()
         deadline_s, retry_s = loop.time() + timeout_s, _FIRST_RETRY_S
         while True:
-            await self._keep_pace()
+            self._free_at_s = max(self._free_at_s, loop.time() - AT_ONCE * self._gap_s) + self._gap_s
+            if (wait_s := self._free_at_s - loop.time()) > 0:  # keep the pace
+                await asyncio.sleep(wait_s)
             try:
                 self._bus.send(identifier, payload)
                 return
@@ -166,16 +168,8 @@ class Link:
             await asyncio.sleep(min(retry_s, left_s))
             retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
 
-    async def _keep_pace(self) -> None:
-        """Wait until one more frame may be sent."""
-        loop = asyncio.get_running_loop()
-        self._free_at_s = max(self._free_at_s, loop.time() - AT_ONCE * self._gap_s) + self._gap_s
-        wait_s = self._free_at_s - loop.time()
-        if wait_s > 0:
-            await asyncio.sleep(wait_s)
-
     def narrow(self, layout: Layout) -> None:
-        """From now on only frames of this layout, and what somebody waits for, need be received."""
+        """From now on, receive only frames of this layout and awaited ones, if the bus can leave out the others."""
         if self._bus.narrows:
             self._wanted = filters_of(layout)
             self._tell_bus()
@@ -218,12 +212,12 @@ class Link:
     async def request(
         self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
     ) -> Reply:
-        """Send one frame and wait for the first answer to it; older frames do not count.
+        """Send one frame and return the first answer to it; older frames do not count.
 
-        It is sent up to ``tries`` times, for lines that lose something now and then; it must do no harm twice.
+        It is sent up to ``tries`` times, for lines that lose frames; sending it twice must do no harm.
 
         Raises:
-            HandshakeTimeout: no answer in time.
+            HandshakeTimeout: no answer came within ``timeout_s``.
             BusSendError: as ``send``.
         """
         with self._waiting((reply,), is_question=True) as queue:
@@ -249,17 +243,17 @@ class Link:
     ) -> bool:
         """Send one frame and wait for an answer that may be data; nothing else is sent on this bus meanwhile.
 
-        It waits until every ``request`` and ``collect`` has ended. For questions that are asked again and again, see
+        The frame is sent once every ``request`` and ``collect`` has ended. For repeated questions, see
         :class:`skinware_drivers.polling.Poll`.
 
         Args:
             identifier: of the frame.
             payload: of the frame.
-            answer: which frames answer it.
-            timeout_s: when the answer should have come.
-            extra_s: how much longer to wait for it.
-            on_late: called with how long after ``timeout_s`` the answer came, s (0 or less: it was read late): while it
-                is waited for, or up to five seconds later, unless the question was asked again.
+            answer: the frames that answer it.
+            timeout_s: time in which the answer should come.
+            extra_s: time to wait for it after that.
+            on_late: called with the time from ``timeout_s`` to a late answer, s (0 or less: it was only read late),
+                up to five seconds later, unless the question was asked again.
 
         Returns:
             Whether an answer came within ``timeout_s`` and ``extra_s``.
@@ -302,7 +296,7 @@ class Link:
         return came.is_set()
 
     async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
-        """Send one frame and gather all answers that come within ``duration_s``.
+        """Send one frame and return all answers that come within ``duration_s``.
 
         Raises:
             BusSendError: as ``send``.
@@ -313,7 +307,7 @@ class Link:
         return [queue.get_nowait() for _ in range(queue.qsize())]
 
     async def listen(self, duration_s: float) -> Counter[Heard]:
-        """Send nothing and count what is on the bus for a time (frames of declared modules excepted)."""
+        """Send nothing, and return counts of the frames on the bus, except those of declared modules."""
         heard: Counter[Heard] = Counter()
         self._heard = heard
         self._tell_bus()
@@ -326,23 +320,23 @@ class Link:
 
     @contextmanager
     def follow(self, *matches: Match) -> Iterator[asyncio.Queue[Reply]]:
-        """Hear every frame that matches, in order of arrival, in a queue."""
+        """Put every frame that matches into a queue, in order of arrival; a context manager."""
         with self._waiting(matches) as queue:
             yield queue
 
     async def sleep(self, duration_s: float) -> None:
-        """Let time pass; the bus keeps being read."""
+        """Let time pass while the bus is read."""
         await asyncio.sleep(duration_s)
 
     @property
     def is_listening(self) -> bool:
-        """Whether frames that are none of the layout's matter to anybody: ``offer`` wants to be called."""
+        """Whether ``offer`` must be called: frames that are not of the layout are awaited."""
         self._forget_late()
         return bool(self._waiters or self._late or self._heard is not None)
 
     @property
     def awaited(self) -> Sequence[Filter]:
-        """What lets those frames through that matter to anybody; nothing if ``is_listening`` is false."""
+        """Filters that let the awaited frames through; none if ``is_listening`` is false."""
         self._forget_late()
         if self._heard is not None:
             return (Filter(0, 0),)
@@ -351,7 +345,7 @@ class Link:
 
     @property
     def expects_data(self) -> bool:
-        """Whether a question is open, or was given up, whose answer may be data: ``hear`` wants to be called."""
+        """Whether ``hear`` must be called: a question is open, or overdue, whose answer may be data."""
         return self._expected is not None or bool(self._overdue)
 
     def hear(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> None:
@@ -376,9 +370,9 @@ class Link:
             self._late.popleft()
 
     def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for.
+        """Give frames of this bus to the handshakes that wait (called by the runner); return the rows that fit none.
 
-        An answer that comes too late, after its question was given up, is still none of a stranger.
+        A late answer fits its question for a few seconds after the timeout.
         """
         if not len(rows) or not self.is_listening:
             return rows

@@ -1,4 +1,4 @@
-"""Drivers and emulators by name: those that packages have registered, and those in a file of somebody's own."""
+"""Load drivers and emulators by name: registered by packages, or in a file of one's own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import skinware
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import check_name
-from skinware_drivers.options.texts import SOURCE_SUFFIX, is_file, nearest_name
+from skinware_drivers.options.declared import SOURCE_SUFFIX, is_file, nearest_name
 
 _OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__file__))
 _PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first
@@ -28,11 +28,11 @@ class Kind(NamedTuple):
     """A kind of class that can be loaded.
 
     Attributes:
-        word: what people call it: ``driver``.
+        word: its name for people: ``driver``.
         group: of entry points, in which packages register theirs.
-        base: what its authors subclass, for people.
-        fits: whether a class is of this kind.
-        instead: what to do where a file has none, for people: the end of a sentence.
+        base: name of the class that authors subclass, for people.
+        fits: returns whether a class is of this kind.
+        instead: advice if a file has none, for people: the end of a sentence.
     """
 
     word: str
@@ -43,17 +43,18 @@ class Kind(NamedTuple):
 
 
 def load(kind: Kind, name: str) -> type[Any]:
-    """The class of a name.
+    """Return the class of a name.
 
-    A file's folder is put behind all others in which Python looks for modules: those beside the file can be imported
-    by it, and none of them hides an installed one.
+    A file's folder is put behind all others in which Python looks for modules: the file can import modules beside it,
+    and none of them hides an installed one.
 
     Args:
         kind: of class.
         name: under which it is registered, or path of a file that ends in ``.py`` and defines one such class.
 
     Raises:
-        ConfigurationError: there is none, or it cannot be loaded; the message says why, and where in somebody's code.
+        ConfigurationError: there is none, or it cannot be loaded; the message has the reason, and the place in the
+            author's code.
     """
     if is_file(name):
         return _class_in(name, kind)
@@ -77,12 +78,12 @@ def registered(group: str) -> dict[str, EntryPoint]:
 
 @cache
 def _selection(_path: tuple[str, ...]) -> Callable[..., EntryPoints]:
-    """Selects from the entry points of all packages on Python's path: a file of each is read, once."""
+    """Return the selection from the entry points of all packages on Python's path; their files are read once."""
     return entry_points().select
 
 
 def short_name(name: str) -> str:
-    """What people are shown of a name: of a file only what it is called, without folder and ending."""
+    """Return a name as people see it: a file without its folder and ending."""
     return os.path.basename(name).removesuffix(SOURCE_SUFFIX) if is_file(name) else name
 
 
@@ -105,7 +106,7 @@ def _class_in(name: str, kind: Kind) -> type[Any]:
 
 
 def _module_of(name: str, kind: Kind) -> ModuleType:
-    """The module in a file, under the name that it has for the modules beside it, too; it is imported once."""
+    """Return the module in a file; it has the name by which modules beside it import it, and is imported once."""
     path = os.path.abspath(name)
     if not os.path.isfile(path):
         raise ConfigurationError(f"{kind.word} {name}: there is no such file")
@@ -124,13 +125,13 @@ def _module_of(name: str, kind: Kind) -> ModuleType:
 
 
 def _is_theirs(file: str) -> bool:
-    """Whether a file of a traceback is neither Python's nor ours."""
+    """Return whether a file of a traceback belongs neither to Python nor to this package."""
     return not file.startswith(("<", *_OURS)) and (file.startswith(_INSTALLED) or not file.startswith(_PYTHONS))
 
 
 @contextmanager
 def _blamed(what: str, is_theirs: Callable[[str], bool]) -> Iterator[None]:
-    """Say what went wrong meanwhile in somebody's code, and where: in the last of the files that are theirs."""
+    """Report what fails in an author's code, with the last place in the author's own files."""
     try:
         yield
     except (Exception, SystemExit) as error:

@@ -1,4 +1,4 @@
-"""Makes driver packages from the templates that come with this package.
+"""Make driver packages from the templates that come with this package.
 
 A template is the file itself, with ``$name`` (of the driver and the package) and ``$Class`` (of the adapter) in it;
 ``$$`` is a dollar sign.
@@ -22,7 +22,7 @@ from skinware_drivers.registry import DRIVERS
 from skinware_drivers.virtual.hardware import EMULATORS
 
 LONGEST_NAME = 20
-"""Lines of the templates stay short enough with it."""
+"""With it, the lines of the templates stay short enough."""
 
 _COMMON = {
     "gitignore": ".gitignore",
@@ -41,10 +41,10 @@ _OF_TRANSPORT = {
 
 
 def check_name(name: str) -> None:
-    """Hold a name against everything that a driver, a Python package and their users need of it.
+    """Check that a name can be that of a driver and of a Python package.
 
     Raises:
-        ConfigurationError: it cannot be; the message says why, and where possible which one could.
+        ConfigurationError: it cannot; the message has the reason, and a better name if possible.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         better = re.sub(r"\W+|_+", "_", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name), flags=re.ASCII).strip("_").lower()
@@ -64,18 +64,18 @@ def check_name(name: str) -> None:
 
 
 def make_package(name: str, transport: str, where: Path) -> list[Path]:
-    """Make the package in the folder ``where / name``, all of it or nothing.
+    """Make the package in the folder ``where / name``, completely or not at all.
 
     Args:
         name: of the driver, the package and the folder.
         transport: ``can``, ``serial``, ``modbus``, ``tcp`` or ``virtual``.
-        where: folder that gets the new one.
+        where: folder in which the new folder is made.
 
     Returns:
         The files, relative to the new folder.
 
     Raises:
-        ConfigurationError: the folder is there already.
+        ConfigurationError: the folder exists already.
         SkinwareError: it cannot be written.
     """
     folder = where / name
@@ -86,22 +86,17 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
     made = []
     try:
         unfinished.mkdir()
-        for source, target in ((part, file) for part in ("common", transport) for file in _files(part).items()):
-            path = Path(Template(target[1]).substitute(words))
-            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
-            (unfinished / path).write_text(_template(source, target[0]).substitute(words))
-            made.append(path)
+        templates = files("skinware_drivers") / "templates"
+        for folder_of, named in (("common", _COMMON), (transport, _OF_TRANSPORT)):
+            for template, file in named.items():
+                path = Path(Template(file).substitute(words))
+                text = (templates / folder_of / f"{template}.template").read_text()
+                (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
+                (unfinished / path).write_text(Template(text).substitute(words))
+                made.append(path)
         unfinished.rename(folder)
     except OSError as error:
         raise SkinwareError(f"cannot make {folder}: {error.strerror}") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)  # there is none if all went well
     return made
-
-
-def _files(part: str) -> dict[str, str]:
-    return _COMMON if part == "common" else _OF_TRANSPORT
-
-
-def _template(part: str, name: str) -> Template:
-    return Template((files("skinware_drivers") / "templates" / part / f"{name}.template").read_text())

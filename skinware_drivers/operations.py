@@ -1,4 +1,4 @@
-"""What user programs may ask a driver to do: methods of its adapter, or of its bus, that are marked as operations."""
+"""Operations that programs may call: methods of a driver's adapter, or of its bus, that are marked as such."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Operation:
 
     Attributes:
         method: coroutine function (adapter, link, patches, ...).
-        sets_up: it sets its patches up anew: doubts about their values end.
-        looks: it only looks and changes nothing.
-        alone: it is for ``skin-config`` on a bus without a running driver, which would not know what happened.
+        sets_up: it sets its patches up again, so that doubts about their values end.
+        looks: it changes nothing.
+        alone: it is only for ``skin-config`` on a bus without a running driver.
     """
 
     method: Callable[..., Any]
@@ -40,12 +40,12 @@ def operation(*, sets_up: bool = False, looks: bool = False, alone: bool = False
             \"\"\"Take the present values as zero.\"\"\"
 
     Programs call it with ``reader.call("tare", samples=20)``; the docstring's first line describes it to them. It is
-    called once per bus, with the patches on it that are meant: all, unless the program says ``bus=`` or ``patch=``
-    (their names). What it returns must be something that JSON can hold; what it raises is told to the program.
+    called once per bus, with the patches that are meant: all of the bus, or those that ``bus=`` and ``patch=`` name.
+    Its result must be something that JSON can hold; the program gets its result, or the error that it raises.
 
     Args:
-        sets_up: it sets its patches up anew: doubts about their values end.
-        looks: it changes nothing, so nobody need be asked first, and patches need not be known.
+        sets_up: it sets its patches up again, so that doubts about their values end.
+        looks: it changes nothing, so that no confirmation is needed, and no known patch.
         alone: a running driver does not offer it; ``skin-config`` does, on a bus without one.
     """
 
@@ -57,7 +57,7 @@ def operation(*, sets_up: bool = False, looks: bool = False, alone: bool = False
 
 
 def operations_of(adapter: type[Any], *, alone: bool = False) -> dict[str, Operation]:
-    """The operations of an adapter class by name, sorted.
+    """Return the operations of an adapter class by name, sorted.
 
     Args:
         adapter: the class.
@@ -69,10 +69,10 @@ def operations_of(adapter: type[Any], *, alone: bool = False) -> dict[str, Opera
 
 
 def check_arguments(method: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Whether a method of an adapter takes these arguments beside the link and the patches.
+    """Check that a method of an adapter takes these arguments beside the link and the patches.
 
     Raises:
-        TypeError: it does not; the message says what it takes.
+        TypeError: it does not; the message has the arguments that it takes.
     """
     parameters = list(inspect.signature(method).parameters.values())[_OWN_PARAMETERS:]
     try:

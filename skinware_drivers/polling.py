@@ -20,23 +20,23 @@ from skinware_drivers.link import Match
 
 
 class Notice(enum.Enum):
-    """What a device reports about itself, besides its data."""
+    """A report of a device about itself, beside its data."""
 
     RESTARTED = "restarted"
-    """It lost its configuration: ``revive`` is called for it, and for it alone."""
+    """The device lost its configuration: ``revive`` is called for it alone."""
     CHANGED = "changed"
-    """It is not what it was described as (another device was plugged in, new firmware): ``join`` is called."""
+    """The device differs from its description (another device, new firmware): ``join`` is called."""
     LOST = "lost"
-    """It is not there, or not in a state to send: stale, until data comes."""
+    """The device is absent, or cannot send: stale, until data comes."""
     SUSPECT = "suspect"
-    """It reports an error: all its values are suspect, until it is sound or was set up anew."""
+    """The device reports an error: all its values are suspect until it is sound, or was set up again."""
     SOUND = "sound"
     """The error is over."""
 
 
 @dataclass(frozen=True)
 class Poll:
-    """A request that is sent periodically, so that a device answers with data.
+    """A request that is sent periodically; the device answers with data.
 
     Without ``answer`` it is sent every ``period_s``, whatever comes back. With ``answer`` it is sent *in lock step*:
     nothing else is sent on this bus until the answer has arrived, or ``timeout_s`` has passed.
@@ -45,11 +45,11 @@ class Poll:
         identifier: of the frame.
         payload: of the frame.
         period_s: time from one to the next, s.
-        answer: which frames answer it; they may be data.
-        timeout_s: how long to wait for it, s; default: ``period_s``.
+        answer: the frames that answer it; they may be data.
+        timeout_s: time to wait for the answer, s; default: ``period_s``.
 
     Raises:
-        ConfigurationError: a period or timeout that is not above 0, or a timeout without an answer.
+        ConfigurationError: the period or timeout is not above 0, or there is a timeout without ``answer``.
     """
 
     identifier: int
@@ -69,12 +69,12 @@ class Poll:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return f"poll {identifier_text(self.identifier)}"
 
     @property
     def patience_s(self) -> float:
-        """How long its answer is waited for, s."""
+        """Time to wait for its answer, s."""
         return self.timeout_s or self.period_s
 
 
@@ -83,10 +83,10 @@ def check_polls(polls: Sequence[Poll], wire_s: Callable[[Poll], float]) -> str:
 
     Args:
         polls: those of one bus.
-        wire_s: how long question and answer of one take on the line at least, s; 0 where that is not known.
+        wire_s: returns the least time that question and answer take on the line, s; 0 if it is not known.
 
     Returns:
-        What is doubtful about them, for people; empty if nothing is.
+        Doubts about them, for people; empty if there are none.
 
     Raises:
         ConfigurationError: one cannot be answered before its timeout.
@@ -121,13 +121,12 @@ def _ms(time_s: float) -> str:
 
 
 class Watch:
-    """Sees every update of all buses and marks doubtful values that no single frame shows as such.
+    """Looks at the updates of all buses and marks doubtful values that no single frame shows.
 
     Attributes:
         module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
-        module_untouched: (n_modules,) bool, modules of which nothing shows yet that they live; for people, their values
-            count as fresh.
-        sees_all: ``look`` is called with all updates; it may be set to False as soon as that is not needed any more.
+        module_untouched: (n_modules,) bool, modules that have not shown yet that they live; their values are fresh.
+        sees_all: whether ``look`` is called with all updates; set it to False when that is no longer needed.
     """
 
     sees_all: bool = False
@@ -138,17 +137,17 @@ class Watch:
         self.module_untouched: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
 
     def look(self, updates: Updates) -> None:
-        """Called with updates that were just shown, if the wire may have flagged one of them, or it ``sees_all``.
+        """Look at updates that were just shown; called if one of them may have a flag, or the watch ``sees_all``.
 
-        Of an update, what has no sensor (``updates.sensors`` is ``n_sensors``) has no meaning.
+        Values without a sensor (``updates.sensors`` is ``n_sensors``) have no meaning.
         """
 
     def suspect(self, patch: int) -> None:
-        """Called when a patch reports an error."""
+        """Mark all modules of a patch as suspect; called when the patch reports an error."""
         self.module_status[self.tables.structure.module_patch == patch] |= np.uint8(Status.SUSPECT)
 
     def forget(self, patch: int) -> None:
-        """Called when a patch was set up anew, or reports no error any more: what was held against it is over."""
+        """End all doubts about a patch; called when it was set up again, or reports that its error is over."""
         self.module_status[self.tables.structure.module_patch == patch] = 0
 
 
@@ -158,13 +157,13 @@ _MOST_NAMES = 6
 
 
 class ZeroWatch(Watch):
-    """Knows which modules have sent nothing but 0 since they were first heard: not touched yet, or dead.
+    """Marks modules that have sent only 0 since they were first heard: not touched yet, or dead.
 
-    Their values are good and fresh: hands whose taxels rest at exactly 0 are usual. What is known is published as
-    :attr:`skinware.DriverSnapshot.module_untouched`. After the first other value, a module counts as alive for good.
+    Their values are good and fresh: the taxels of many hands rest at exactly 0. The marks are published as
+    :attr:`skinware.DriverSnapshot.module_untouched`. After its first other value, a module counts as alive.
 
     Attributes:
-        patience_s: for how long 0 comes before the log names a module.
+        patience_s: time in which only 0 must come before the log names a module.
     """
 
     patience_s: float = 10.0
@@ -174,11 +173,11 @@ class ZeroWatch(Watch):
         n_modules = tables.structure.n_modules
         self._is_dark: npt.NDArray[np.bool_] = np.ones(n_modules, bool)
         self._since_ns: npt.NDArray[np.int64] = np.zeros(n_modules, np.int64)  # 0: not heard yet
-        self._is_told: npt.NDArray[np.bool_] = np.zeros(n_modules, bool)
+        self._is_named: npt.NDArray[np.bool_] = np.zeros(n_modules, bool)
         self.sees_all = True
 
     def look(self, updates: Updates) -> None:
-        """See which modules sent another value than 0."""
+        """Unmark modules that sent another value than 0."""
         time_ns, whole = int(updates.newest_ns.max()), updates.module[updates.whole]
         self._since_ns[whole] = np.where(self._since_ns[whole] == 0, time_ns, self._since_ns[whole])
         lit = ((updates.values != 0) & (updates.sensors < self.tables.structure.n_sensors)).any(axis=1)
@@ -188,18 +187,18 @@ class ZeroWatch(Watch):
         self.sees_all = bool(self._is_dark.any())
 
     def forget(self, patch: int) -> None:
-        """The patch was set up again: its modules have to show again that they live."""
+        """End all doubts about a patch; its modules must show again that they live."""
         super().forget(patch)
         modules = self.tables.structure.module_patch == patch
-        self._is_dark[modules], self._since_ns[modules], self._is_told[modules] = True, 0, False
+        self._is_dark[modules], self._since_ns[modules], self._is_named[modules] = True, 0, False
         self.module_untouched[modules] = False
         self.sees_all = True
 
     def _name(self, time_ns: int) -> None:
         has_waited = self.module_untouched & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
-        untold = np.flatnonzero(has_waited & ~self._is_told)
-        if len(untold) and (has_waited == self.module_untouched).all():  # not one by one
-            self._is_told[untold] = True
-            names = [self.tables.structure.module_names[module] for module in untold[:_MOST_NAMES].tolist()]
-            more = f" and {len(untold) - len(names)} more" if len(untold) > len(names) else ""
+        unnamed = np.flatnonzero(has_waited & ~self._is_named)
+        if len(unnamed) and (has_waited == self.module_untouched).all():  # not one by one
+            self._is_named[unnamed] = True
+            names = [self.tables.structure.module_names[module] for module in unnamed[:_MOST_NAMES].tolist()]
+            more = f" and {len(unnamed) - len(names)} more" if len(unnamed) > len(names) else ""
             log.info("nothing but 0 has come from %s%s so far: not touched yet, or dead", "; ".join(names), more)

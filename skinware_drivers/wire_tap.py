@@ -1,4 +1,4 @@
-"""Keeps what goes over a wire, while somebody wants it, until it is fetched. C puts things in, too."""
+"""Keep frames and bytes that go over a wire, while a program records them, until they are fetched. C adds some, too."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from skinware.wire import (
 )
 
 _ROOM = 1 << 20
-"""Bytes that wait to be fetched."""
+"""Bytes that can wait to be fetched."""
 _CLASSIC_PAYLOAD, _FD_PAYLOAD = 8, 64
 _PLACES = np.arange(_FD_PAYLOAD)
 _SIZE = PIECE.fields["size"][1] if PIECE.fields is not None else 0
 
 
 class Kept(ctypes.Structure):
-    """``struct tap``: what is kept, and how much had no room."""
+    """``struct tap`` of C: the memory, and the number of frames or bytes for which it had no room."""
 
     _fields_ = [
         ("bytes", ctypes.c_void_p),
@@ -41,7 +41,7 @@ class Kept(ctypes.Structure):
 
 
 class WireTap:
-    """What goes over one wire, as pieces (:mod:`skinware.wire`). Closed at first: nothing is kept."""
+    """Keeps the frames and bytes of one wire as pieces (:mod:`skinware.wire`); at first it is closed and keeps none."""
 
     def __init__(self) -> None:
         self._kept = Kept()
@@ -53,12 +53,12 @@ class WireTap:
 
     @property
     def address(self) -> int:
-        """Of the ``struct tap``, for C; 0 while closed."""
+        """Address of the ``struct tap``, for C; 0 while closed."""
         return 0 if self._memory is None else ctypes.addressof(self._kept)
 
     @property
     def lost(self) -> int:
-        """Frames, or bytes, for which there was no room since it was opened."""
+        """Frames or bytes that had no room since it was opened."""
         return int(self._kept.lost)
 
     def open(self) -> None:
@@ -67,12 +67,12 @@ class WireTap:
             self._kept = Kept(self._memory.ctypes.data, _ROOM, 0, 0)
 
     def close(self) -> None:
-        """Keep nothing, and forget what was kept. Idempotent."""
+        """Discard all pieces, and keep no more. Idempotent."""
         self._memory = None
         self._kept = Kept()
 
     def fetch(self) -> Iterator[memoryview]:
-        """What was kept, in batches of at most ``BATCH_BYTES``, and forgotten then: to be copied at once."""
+        """Yield the pieces in batches of at most ``BATCH_BYTES``, and discard them: copy each batch at once."""
         if self._memory is None:
             return
         data, begin, end = self._memory[: self._kept.size].data, 0, 0
@@ -89,12 +89,12 @@ class WireTap:
     def keep_rows(
         self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], is_fd: npt.NDArray[np.bool_] | None = None
     ) -> None:
-        """Keep frames of a batch; none of one with longer frames than CAN has.
+        """Keep frames of a batch, unless its frames can be longer than those of CAN.
 
         Args:
             wire: (n,) of :func:`skinware_drivers.bus.wire_dtype`.
             time_ns: (n,) int64.
-            is_fd: (n,) bool, which are CAN FD, where their flags need not say so.
+            is_fd: (n,) bool, which are CAN FD, if their flags may not show it.
         """
         known = wire.dtype["payload"].shape[0]
         if known > _FD_PAYLOAD:
@@ -115,21 +115,21 @@ class WireTap:
                 rows["flags"][is_fd[some]] |= IS_FD
             rows["flags"][rows["length"] > known] |= IS_CUT
             rows["length"] = np.minimum(rows["length"], known)
-            # behind a short frame there is what was there before
+            # behind a short frame there are bytes of earlier frames
             rows["payload"][_PLACES[: rows["payload"].shape[1]] >= rows["length"][:, np.newaxis]] = 0
             rows["reserved"] = 0
 
     def keep_frame(
         self, time_ns: int, identifier: int, payload: bytes, *, flags: int = 0, is_sent: bool = False
     ) -> None:
-        """Keep one CAN frame; none that is longer than CAN has them.
+        """Keep one frame, unless it is longer than those of CAN.
 
         Args:
             time_ns: when it was received or sent.
             identifier: with the flags of linux/can.h.
-            payload: of it.
-            flags: of CAN FD; with more than 8 bytes it always is FD.
-            is_sent: by the driver.
+            payload: of the frame.
+            flags: of CAN FD; more than 8 bytes are always FD.
+            is_sent: whether the driver sent it.
         """
         form = CLASSIC if len(payload) <= _CLASSIC_PAYLOAD else FD
         into = self._begin(form, 1, is_sent) if len(payload) <= _FD_PAYLOAD else None
@@ -141,7 +141,7 @@ class WireTap:
             rows[0] = (identifier, len(payload), flags, 0, np.frombuffer(padded, np.uint8))
 
     def keep_bytes(self, time_ns: int, data: bytes, *, is_sent: bool = False) -> None:
-        """Keep bytes of a serial line that were read, or written, together."""
+        """Keep bytes of a serial line that were read or written together."""
         for begin in range(0, len(data), MOST_BYTES):
             some = data[begin : begin + MOST_BYTES]
             into = self._begin(BYTES, len(some), is_sent)
@@ -150,7 +150,7 @@ class WireTap:
                 into[8:] = np.frombuffer(some.ljust(len(into) - 8, b"\0"), np.uint8)
 
     def _begin(self, form: int, count: int, is_sent: bool) -> npt.NDArray[np.uint8] | None:
-        """Begin a piece: where its times and contents go; None if nothing is kept, or there is no room."""
+        """Begin a piece, and return the place of its times and contents; None: closed, or no room."""
         if self._memory is None:
             return None
         kept, size = self._kept, size_of(form, count)

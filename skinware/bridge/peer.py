@@ -89,15 +89,11 @@ class Diagnosis:
     def __init__(self, why_not: Callable[[], str], report: Callable[[str], None], jobs: Jobs) -> None:
         self._why_not, self._report, self._jobs = why_not, report, jobs
         self._is_running = False
-        self._next_ns = now_ns() + _PATIENCE_NS
-
-    def postpone(self) -> None:
-        """Wait as long as at the start: another bridge may serve the robot."""
-        self._next_ns = now_ns() + _PATIENCE_NS
+        self.next_ns: int = now_ns() + _PATIENCE_NS
 
     def look(self, time_ns: int) -> None:
-        if time_ns >= self._next_ns and not self._is_running:
-            self._is_running, self._next_ns = True, time_ns + _PATIENCE_NS
+        if time_ns >= self.next_ns and not self._is_running:
+            self._is_running, self.next_ns = True, time_ns + _PATIENCE_NS
             threading.Thread(target=self._run, name="skinware bridge diagnosis", daemon=True).start()
 
     def _run(self) -> None:
@@ -295,7 +291,7 @@ class Peer:
     def _lose(self, why: str) -> None:
         if self.is_connected:
             self.is_connected, self.since_ns = False, now_ns()
-            self._diagnosis.postpone()
+            self._diagnosis.next_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve the robot
             self._changed("lost")
             self.on_event({"event": "disconnected", "robot": self.keys.robot, "why": why})
 

@@ -1,7 +1,7 @@
-"""Readers make themselves known: a locked file each, which only its reader writes and nobody maps.
+"""Readers make themselves known: a locked file each, which only its reader writes, and which is not mapped.
 
 A file is the CRC-32 of what follows (8 hex digits), a space, one JSON object, spaces up to 2048 bytes. A file
-that nobody holds the lock of belongs to a dead reader, and whoever looks and may removes it.
+whose lock is not held belongs to a dead reader; a program that looks and has the right removes it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _READ_ATTEMPTS = 5
 
 
 class ReaderRecord(msgspec.Struct):
-    """What a reader tells of itself.
+    """The figures that a reader publishes.
 
     Attributes:
         service: which service it reads.
@@ -81,7 +81,7 @@ class Announcement:
             self._make()
 
     def write(self, record: ReaderRecord) -> None:
-        """Tell the present figures, in a file that is there if there is a place for it (``keep``)."""
+        """Write the present figures, if there is a place for the file (``keep``)."""
         self.keep()
         if self._descriptor is None or self._descriptor.fd < 0:
             return
@@ -110,7 +110,7 @@ class Announcement:
 
 
 def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
-    """What the readers that are alive say of themselves, in order of service and pid; see :func:`sweep`."""
+    """Yield the records of living readers, in order of service and pid; see :func:`sweep`."""
     for fd in _living(namespace):
         record = None
         with contextlib.suppress(OSError):  # whatever it is, a reader made no such file
@@ -120,7 +120,7 @@ def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
 
 
 def is_wished(namespace: Namespace, what: str) -> bool:
-    """Whether somebody who lives announces ``what`` in the place of a service's name: a wish to those who publish."""
+    """Return whether a living program announces ``what`` in the place of a service's name: a wish to writers."""
     for path in namespace.reader_files(_MOST_FILES):
         if path.name.startswith(f"{what}."):
             with contextlib.suppress(OSError):
@@ -162,7 +162,7 @@ def _living(namespace: Namespace) -> Iterator[int]:
 
 
 def _open(path: Path) -> int:
-    """A descriptor of a file that anybody may have put there, and that need be none."""
+    """Return a descriptor of a file that anybody may have put there, and that need be none."""
     return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
@@ -178,7 +178,7 @@ def _read(fd: int) -> ReaderRecord | None:
 
 
 def _printable(record: ReaderRecord) -> ReaderRecord:
-    """Whoever may announce a reader must not command the terminals of those who look."""
+    """Make the texts harmless for the terminals of programs that show them."""
     for name in ("service", "program", "kind"):
         text: str = getattr(record, name)
         if not text.isprintable():

@@ -1,7 +1,7 @@
 """The bytes of a service's file: header, column table, static columns, ring of slots.
 
-Version 1.0, little-endian. The same major number means that a reader of this version can read the file. Everything
-here is public: docs/reference/shared-memory.md tells it byte by byte, and what a later version may change.
+Version 1.0, little-endian. The same major number means that a reader of this version can read the file. All of it
+is public: docs/reference/shared-memory.md specifies it byte by byte, and what a later version may change.
 
 =========  ====================================================================================
 offset     what

@@ -104,7 +104,7 @@ class Word:
     def wait(self, expected: int, timeout_ns: int) -> None:
         """Sleep until the word is woken, differs from ``expected``, or the time is up; may return early.
 
-        The caller looks at the memory again in any case, so the reason of the return is not told. The GIL is free
+        The caller looks at the memory again in any case, so no reason is returned. The GIL is free
         meanwhile, and a signal ends the wait, so that its Python handler runs.
         """
         self._expected.value = expected

@@ -27,7 +27,7 @@ def try_lock(fd: int) -> bool:
 
 
 def is_locked(fd: int) -> bool:
-    """Whether somebody else holds the exclusive lock; takes no lock itself, a read-only descriptor will do."""
+    """Return whether somebody else holds the exclusive lock; takes no lock itself, a read-only descriptor will do."""
     reply = fcntl.fcntl(fd, fcntl.F_OFD_GETLK, _TO_READ)
     lock_type: int = _FLOCK.unpack(reply[: _FLOCK.size])[0]
     return lock_type == fcntl.F_WRLCK
@@ -88,7 +88,7 @@ class Descriptor(ForkGuard):
 
 
 UNKNOWN, ENDED = -1, -2
-"""What stands in the place of a descriptor of a process, in C too: nothing can be known of it, or it has ended."""
+"""Values in the place of a process' descriptor, in C too: nothing can be known of it, or it has ended."""
 
 
 class Process(NamedTuple):
@@ -166,7 +166,7 @@ def _pid_namespace() -> int:
 
 
 def _proc_is_ours() -> bool:
-    """Whether ``/proc`` has the pids of this process' namespace: ``unshare --pid`` alone leaves that of its parent."""
+    """Return whether ``/proc`` has the pids of this process' namespace; ``unshare --pid`` alone keeps the parent's."""
     try:
         return os.readlink("/proc/self") == str(os.getpid())
     except OSError:

@@ -40,7 +40,7 @@ def check_name(name: str, what: str) -> str:
 class Namespace:
     """A folder under /dev/shm, owned by the one user who runs its drivers.
 
-    Everybody in the folder's group may read the services and announce readers; nobody else sees anything.
+    Everybody in the folder's group may read the services and announce readers; other accounts see nothing.
 
     Args:
         name: default: environment variable ``SKINWARE_NAMESPACE``, else ``default``.
@@ -59,7 +59,7 @@ class Namespace:
 
     @classmethod
     def of(cls, namespace: Namespace | str | None) -> Namespace:
-        """A namespace itself, or the one of a name; None: the environment's."""
+        """Return a namespace itself, or the one of a name; None: the environment's."""
         return namespace if isinstance(namespace, Namespace) else cls(namespace)
 
     def create(self, group: str | None = None) -> None:
@@ -93,7 +93,7 @@ class Namespace:
             )
 
     def exists(self) -> bool:
-        """Whether any driver or service ever ran here since the machine was started."""
+        """Return whether any driver or service ever ran here since the machine was started."""
         return self.path.is_dir()
 
     def check(self) -> int:
@@ -128,11 +128,11 @@ class Namespace:
         return info.st_uid
 
     def services(self) -> list[str]:
-        """Names of the services that have published here, living or dead, sorted; [] if there is no folder."""
+        """Return names of the services that have published here, living or dead, sorted; [] if there is no folder."""
         return sorted(self.service_inodes())
 
     def service_inodes(self) -> dict[str, int]:
-        """The number of the file of every service that has published here, living or dead."""
+        """Return the number of the file of every service that has published here, living or dead."""
         try:
             with os.scandir(self.path) as entries:
                 return {entry.name[:-5]: entry.inode() for entry in entries if entry.name.endswith(".ring")}
@@ -153,19 +153,19 @@ class Namespace:
         return "calm" if self.name == "default" else f"{self.name}-calm"
 
     def ring_path(self, service: str) -> Path:
-        """The file that readers of a service map."""
+        """Return the file that readers of a service map."""
         return self.path / f"{service}.ring"
 
     def lock_path(self, service: str) -> Path:
-        """The file whose lock is the ownership of a service's name."""
+        """Return the file whose lock is the ownership of a service's name."""
         return self.path / f"{service}.lock"
 
     def socket_path(self, service: str) -> Path:
-        """Where a service takes requests."""
+        """Return where a service takes requests."""
         return self.path / f"{service}.sock"
 
     def reader_files(self, most: int | None = None) -> Iterator[Path]:
-        """The announcements of readers.
+        """Yield the announcements of readers.
 
         Args:
             most: look at no more of them; default: at all.

@@ -28,7 +28,7 @@ _HEADER_WORDS = file_layout.SLOT.itemsize // 8
 
 
 class FrameSource(Protocol):
-    """What a frame is of: a generation that is read live, or one that was recorded."""
+    """The generation of a sample: one that is read live, or one that was recorded."""
 
     context: object
 
@@ -147,12 +147,12 @@ else:
 
 
 def slots_of(segment: Segment) -> list[memoryview]:
-    """The bytes of every slot, its header and its columns, in place."""
+    """Return the bytes of every slot, its header and its columns, in place."""
     layout = segment.layout
     starts = range(layout.slot_offset, layout.slot_offset + layout.slot_count * layout.slot_stride, layout.slot_stride)
     return [segment.data.data[start : start + layout.slot_stride] for start in starts]
 
 
 def slot_headers_of(segment: Segment) -> list[memoryview]:
-    """The 8-byte words of every slot's header, in place."""
+    """Return the 8-byte words of every slot's header, in place."""
     return [slot.cast("Q")[:_HEADER_WORDS] for slot in slots_of(segment)]

@@ -183,7 +183,7 @@ class RingReader(Generic[SampleT]):
         return times
 
     def view(self) -> SampleT | None:
-        """The newest frame in place, without a copy; ask ``frame.valid`` after using it."""
+        """Return the newest frame in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(COPY_ATTEMPTS):
             wanted = self.latest
             if wanted == 0:

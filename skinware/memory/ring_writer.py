@@ -72,9 +72,9 @@ class RingWriter:
     def begin(
         self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
     ) -> dict[str, npt.NDArray[Any]]:
-        """The columns of the next slot, to be filled; they hold an old frame.
+        """Return the columns of the next slot, to be filled; they hold an old frame.
 
-        Until ``commit``, readers of that old frame are told that it is gone.
+        Until ``commit``, readers of that old frame find that it is gone.
 
         Args:
             from_last: copy the newest frame into it first, for writers that change parts only.
@@ -103,7 +103,7 @@ class RingWriter:
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
                 machine booted) it counts as 0, and in ``WriterStatistics.before_boot``. More than 0.2 s in the future
-                it stays as it is, is fresh for nobody, and counts in ``WriterStatistics.ahead``.
+                it stays as it is, is fresh for no reader, and counts in ``WriterStatistics.ahead``.
             flags: bits for the service's own use.
 
         Returns:

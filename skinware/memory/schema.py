@@ -1,6 +1,6 @@
-"""What the columns of a service look like to its users: dtypes with fields, shapes, units; told by the service itself.
+"""Describe the columns of a service: dtypes with fields, shapes, units.
 
-The file's column table knows plain numbers and bytes only. What goes beyond it stands in a static column ``schema``,
+The file's column table knows plain numbers and bytes only. More stands in a static column ``schema``,
 as JSON: ``{"description": TEXT, "columns": {NAME: {"dtype": D, "shape": [...], "unit": TEXT, "description": TEXT}},
 "tables": {NAME: D}}``, the tables being static columns whose rows are structures, with D a dtype code (``"<f8"``) or a
 list of ``[name, D]`` or ``[name, D, shape]`` for a structure, as numpy's ``.npy`` format has it.
@@ -61,7 +61,7 @@ class Schema:
 
     @staticmethod
     def of(columns: Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]], description: str) -> Schema:
-        """A schema from what a person wrote.
+        """Return a schema from what a person wrote.
 
         Raises:
             ConfigurationError: a dtype or shape that cannot be shared.
@@ -82,7 +82,7 @@ class Schema:
         return {name: (_table_dtype(c.dtype), math.prod(c.shape)) for name, c in self.columns.items()}
 
     def for_file(self, static: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-        """The static column that says what the column table cannot; none if it can say everything.
+        """Return the static column that says what the column table cannot; none if it can say everything.
 
         Args:
             static: the other static columns.
@@ -117,7 +117,7 @@ class _SchemaText(msgspec.Struct):
 
 
 def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
-    """The schema of an attached file.
+    """Return the schema of an attached file.
 
     Raises:
         BadServiceFile: its schema contradicts its column table, or cannot be read.
@@ -158,7 +158,7 @@ def _shape(given: int | tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _table_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The dtype itself where the column table knows it; otherwise as many bytes."""
+    """Return the dtype itself where the column table knows it; otherwise as many bytes."""
     return dtype if dtype.names is None and dtype.subdtype is None else np.dtype(f"V{dtype.itemsize}")
 
 
@@ -167,7 +167,7 @@ def _descr(dtype: np.dtype[Any]) -> Any:
 
 
 def _tuples(descr: Any) -> Any:
-    """What JSON made lists of becomes tuples again, as numpy wants it."""
+    """Make tuples of the lists of JSON, as numpy needs them."""
     if isinstance(descr, list):
         return [(_name(f[0]), _tuples(f[1]), *(tuple(shape) for shape in f[2:])) for f in descr]
     return descr

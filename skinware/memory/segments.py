@@ -50,7 +50,7 @@ class Segment:
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
         maker: answers a reader whether the process that made it has ended.
-        inode: (device, inode), which tells generations of one name apart.
+        inode: (device, inode), another for each generation of a name.
         schema: what the columns of the slots look like to users.
     """
 
@@ -92,7 +92,7 @@ class Segment:
         return self.data[offset : offset + dtype.itemsize * count].view(dtype)
 
     def writer_lives(self) -> bool:
-        """Whether the lock of this generation is held, and the process that made it has not ended.
+        """Return whether the lock of this generation is held, and the process that made it has not ended.
 
         Both are needed: a child that C forked keeps the lock of a dead parent, and a pid says nothing in another pid
         namespace.
@@ -167,7 +167,7 @@ def _note_holder(fd: int, path: Path) -> None:
 
 
 def _holder_has_ended(fd: int) -> bool:
-    """Whether the process that took a lock has ended, so that a child of it holds the lock."""
+    """Return whether the process that took a lock has ended, so that a child of it holds the lock."""
     noted = os.pread(fd, _HOLDER.size, _COUNT.size)
     return len(noted) == _HOLDER.size and has_ended(Process(*_HOLDER.unpack(noted)))
 
@@ -175,8 +175,8 @@ def _holder_has_ended(fd: int) -> bool:
 def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
     """Put a free lock in the place of one that a child of a dead owner holds; the count in it is kept.
 
-    Two that do so at once are told apart as after any removal of the file: the owner notices within a second that its
-    lock is gone (``Ownership.keep_files``).
+    Where two programs do so at once, the owner notices within a second that its lock is gone, as after any removal
+    (``Ownership.keep_files``).
     """
     path = namespace.lock_path(name)
     if current_inode(path) != _inode(held.fd):
@@ -193,7 +193,7 @@ def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
 
 
 def previous(namespace: Namespace, name: str) -> Segment | None:
-    """The generation that a dead writer left, None if none is left that anybody can be attached to."""
+    """Return the generation that a dead writer left, None if none is left that anybody can be attached to."""
     try:
         return attach(namespace, name, writable=True)
     except (ServiceNotFound, BadServiceFile):
@@ -229,7 +229,7 @@ def create(
     period_ns: int,
     published_before: int,
 ) -> Segment:
-    """Make a new generation, which nobody sees before it is published. The caller owns the name.
+    """Make a new generation, which stays invisible until it is published. The caller owns the name.
 
     Raises:
         ConfigurationError: slots, columns or a kind that the format cannot hold.
@@ -299,7 +299,7 @@ def discard(segment: Segment) -> None:
 
 
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
-    """A writable map through an open file of its own.
+    """Return a writable map through an open file of its own.
 
     ``mmap`` keeps a duplicate of its descriptor; of the locked one, that would hold the lock for as long as any
     array lives, and in forked children too.
@@ -364,7 +364,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
 
 
 def _cannot(path: Path, what: str, error: OSError) -> BadServiceFile | NamespaceError:
-    """The error for a file that the system does not open or map: the file's fault, or a limit of this program."""
+    """Return the error for a file that cannot be opened or mapped: its own fault, or a limit of this program."""
     if error.errno in (EMFILE, ENFILE):
         return NamespaceError(f"{path} cannot be {what}: no more file descriptors (raise the limit, ulimit -n)")
     if error.errno == ENOMEM:
@@ -373,7 +373,7 @@ def _cannot(path: Path, what: str, error: OSError) -> BadServiceFile | Namespace
 
 
 def recorded(head: bytes, name: str) -> Segment:
-    """A generation of which only the head is there (:attr:`Segment.head`): all but its slots and its writer.
+    """Return a generation of which only the head is there (:attr:`Segment.head`): all but its slots and its writer.
 
     Args:
         head: its bytes.
@@ -393,7 +393,7 @@ def recorded(head: bytes, name: str) -> Segment:
 
 
 def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """The head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
+    """Return the head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
 
     Args:
         segment: the generation.

@@ -12,7 +12,7 @@ BUCKETS = file_layout.HISTOGRAM_BUCKETS
 
 
 def bucket_of(value_ns: int) -> int:
-    """The bucket of a histogram that a time falls into."""
+    """Return the bucket of a histogram that a time falls into."""
     return min(value_ns.bit_length(), BUCKETS - 1) if value_ns > 0 else 0
 
 
@@ -61,7 +61,7 @@ class Histogram(msgspec.Struct):
         self.counts[bucket_of(value_ns)] += 1
 
     def quantile_ns(self, fraction: float) -> int | None:
-        """A bound that this fraction of the times does not exceed (up to twice the true one); None without any."""
+        """Return a bound that this fraction of the times does not exceed (up to twice the true one); None: no times."""
         wanted, seen = fraction * self.total, 0
         for bucket, count in enumerate(self.counts):
             seen += count
@@ -71,7 +71,7 @@ class Histogram(msgspec.Struct):
 
 
 class WriterStatistics(msgspec.Struct):
-    """What a writer counts in one generation of its service.
+    """Figures that a writer counts in one generation of its service.
 
     Attributes:
         published: frames.

@@ -22,7 +22,7 @@ _take_now = native.core().quick.skinware_native_take_now
 _take_next = native.core().waiting.skinware_native_take_next
 
 NEWEST, NEWER, NEXT = 0, 1, 2
-"""What is taken: what is newest, even if it was taken before; something newer; or the next sample in order."""
+"""Kinds of takes: the newest sample, even if it was taken before; a newer one; or the next one in order."""
 _NEWS, _NO_NEWS = 1, 0  # what take.c returns
 _NEVER_NS = (1 << 63) - 1
 _COUNTS_COME_LATE = not getattr(sys, "_is_gil_enabled", lambda: True)()  # those of other threads

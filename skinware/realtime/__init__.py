@@ -9,11 +9,9 @@
         ...
 """
 
-from skinware.realtime._clock import NS_PER_S, WAIT_SLICE_NS, Periodic, boot, now_ns, period_ns
-from skinware.realtime._cpus import cpus_from_text
-from skinware.realtime._kernel import Refusal
+from skinware.realtime._clock import NS_PER_S, TURN_S, WAIT_SLICE_NS, Periodic, boot, now_ns, period_ns, short_turns
+from skinware.realtime._kernel import Refusal, cpus_from_text
 from skinware.realtime._profile import Profile
-from skinware.realtime._turns import TURN_S, short_turns
 
 __all__ = [
     "NS_PER_S",

@@ -1,9 +1,11 @@
-"""CLOCK_MONOTONIC in int64 ns, and loops that keep absolute deadlines."""
+"""CLOCK_MONOTONIC in int64 ns, loops that keep absolute deadlines, and short turns of the interpreter beside them."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
@@ -20,7 +22,7 @@ def now_ns() -> int:
 
 
 def boot() -> str:
-    """Which start of the machine CLOCK_MONOTONIC counts from: a number that no other start has."""
+    """Return which start of the machine CLOCK_MONOTONIC counts from: a number that no other start has."""
     return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
 
 
@@ -79,3 +81,24 @@ class Periodic:
         while self.wait():
             yield count
             count += 1
+
+
+TURN_S = 1e-4
+_before_s: list[float] = []
+
+
+@contextmanager
+def short_turns() -> Iterator[None]:
+    """Let no thread keep the interpreter for longer than ``TURN_S`` when another wants it; Python's default is 5 ms.
+
+    Beside a thread that computes, whoever lets go of the interpreter waits that long for it: a reader after each sleep,
+    a driver dozens of times for a batch (numpy lets go for arrays of some length, and so do system calls). That is too
+    long for a ring of 8 slots at 1 kHz, or the receive buffer of a fast bus (docs/benchmarks.md). It holds for the
+    whole process, until the last one has ended.
+    """
+    _before_s.append(sys.getswitchinterval())
+    sys.setswitchinterval(min(TURN_S, _before_s[-1]))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(_before_s.pop())

@@ -1,17 +1,18 @@
-"""What the kernel is asked for on behalf of a loop. A lack of rights is no error here: it comes back in words."""
+"""Ask the kernel for what a loop needs. A lack of rights is no error here: it comes back in words."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import pwd
+import re
 import resource
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from errno import EINVAL, EPERM
 from pathlib import Path
 
-from skinware.realtime._cpus import cpus_as_text
+from skinware.errors import ConfigurationError
 
 # the same numbers on x86-64, aarch64 and riscv64; mlockall(2), prctl(2), capabilities(7)
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -40,7 +41,7 @@ class Refusal:
 
 
 def is_fifo() -> bool:
-    """Whether this thread runs under SCHED_FIFO."""
+    """Return whether this thread runs under SCHED_FIFO."""
     return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 
 
@@ -95,7 +96,7 @@ def set_cpus(cpus: Collection[int]) -> Refusal | None:
 
 
 def set_timer_slack(slack_ns: int) -> None:
-    """How late timers of this thread may be; a SCHED_FIFO thread has none, whatever is set."""
+    """Return how late timers of this thread may be; a SCHED_FIFO thread has none, whatever is set."""
     if _libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
@@ -125,3 +126,38 @@ def _own_status(key: str) -> str:
         if line.startswith(f"{key}:"):
             return line.partition(":")[2].strip()
     raise LookupError(f"/proc/self/status has no {key}")
+
+
+_ITEM = re.compile(r"\s*(\d{1,5})\s*(?:-\s*(\d{1,5})\s*)?", re.ASCII)
+_ONLINE = Path("/sys/devices/system/cpu/online")
+
+
+def cpus_from_text(text: str) -> tuple[int, ...]:
+    """CPU numbers from ``1,2`` or ``0-3``, in rising order, each once.
+
+    Raises:
+        ConfigurationError: the text is no such list.
+    """
+    cpus: set[int] = set()
+    for item in text.split(","):
+        match = _ITEM.fullmatch(item)
+        if match is None:
+            raise ConfigurationError(f"CPUs {text!r}: give numbers from 0 with commas, as 1,2 or 0-3")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ConfigurationError(f"CPUs {text!r}: the range {item.strip()} does not go upwards")
+        cpus.update(range(first, last + 1))
+    return tuple(sorted(cpus))
+
+
+def cpus_as_text(cpus: Iterable[int]) -> str:
+    """CPU numbers in rising order with commas."""
+    return ",".join(str(cpu) for cpu in sorted(cpus))
+
+
+def online_cpus() -> tuple[int, ...]:
+    """All CPUs that are switched on, also those that nothing runs on unless it asks (``isolcpus``)."""
+    try:
+        return cpus_from_text(_ONLINE.read_text())
+    except OSError:  # a container without /sys
+        return tuple(range(os.cpu_count() or 1))

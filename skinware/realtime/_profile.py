@@ -1,4 +1,4 @@
-"""What keeps a loop on time: scheduling policy, locked memory, CPUs, timer slack, and no garbage collection."""
+"""Keep a loop on time: scheduling policy, locked memory, CPUs, timer slack, and no garbage collection."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Literal, Self
 
 from skinware.errors import ConfigurationError, RealtimeRefused
 from skinware.realtime import _kernel
-from skinware.realtime._cpus import cpus_as_text, online_cpus
+from skinware.realtime._kernel import cpus_as_text, online_cpus
 
 log = logging.getLogger("skinware.realtime")
 
@@ -58,7 +58,7 @@ class Profile:
 
     @classmethod
     def normal(cls, *, cpus: Iterable[int] = ()) -> Self:
-        """The kernel's ordinary scheduling with exact timers and frozen garbage: needs no rights.
+        """Return the kernel's ordinary scheduling with exact timers and frozen garbage: needs no rights.
 
         Raises:
             ConfigurationError: a CPU that is not there.
@@ -76,7 +76,7 @@ class Profile:
 
     @classmethod
     def from_text(cls, text: str, *, cpus: Iterable[int] = ()) -> Self:
-        """A profile as people write it: ``normal`` or ``fifo:PRIORITY``.
+        """Return a profile as people write it: ``normal`` or ``fifo:PRIORITY``.
 
         Raises:
             ConfigurationError: the text is neither, or the priority or a CPU cannot be.

@@ -6,7 +6,7 @@ from skinware.service._ownership import Columns
 from skinware.service._reader import ServiceReader
 from skinware.service._server import Request, RequestServer
 from skinware.service._taking import Position
-from skinware.service._writer import ServiceWriter
+from skinware.service._writer import ServiceWriter, Writer
 
 __all__ = [
     "Column",
@@ -18,4 +18,5 @@ __all__ = [
     "Schema",
     "ServiceReader",
     "ServiceWriter",
+    "Writer",
 ]

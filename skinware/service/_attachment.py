@@ -1,4 +1,4 @@
-"""Which generation of a service is at hand, and what can be known and asked of its writer."""
+"""Attach to the present generation of a service, and ask its writer."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Attachment(Generic[SampleT]):
 
     @property
     def writer_statistics(self) -> WriterStatistics:
-        """What the writer of the generation that is being read tells of itself."""
+        """Figures of the writer of the generation that is being read."""
         return read_statistics(self._ring.segment.data)
 
     @property
@@ -80,7 +80,7 @@ class Attachment(Generic[SampleT]):
 
     @property
     def kind(self) -> str:
-        """What the service's columns mean: ``driver``, ``data``."""
+        """Meaning of the service's columns: ``driver``, ``data``."""
         return bytes(self._ring.segment.header["kind"]).decode()
 
     @property
@@ -93,10 +93,10 @@ class Attachment(Generic[SampleT]):
         return self._ring.missed_periods
 
     def rate_hz(self) -> float | None:
-        """How often the writer publishes, from the times of the frames that the ring holds.
+        """Return how often the writer publishes, from the times of the frames that the ring holds.
 
-        None where they are too few to tell: after its start a writer may publish two frames at once and then wait.
-        After it was held up, it publishes what has waited at once; then the times of the data tell.
+        None where they are too few: after its start a writer may publish two frames at once and then wait.
+        A writer that was held up publishes what has waited at once; then the times of the data count.
         """
         times = self._ring.publication_times_ns()
         span_ns = times[-1] - times[0] if times else 0
@@ -112,7 +112,7 @@ class Attachment(Generic[SampleT]):
         return round(rate_hz, 3)
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
-        """The static columns of the generation that is being read, read-only."""
+        """Return the static columns of the generation that is being read, read-only."""
         return self._ring.segment.static_columns()
 
     def call(self, operation: str, /, *, timeout_s: float = 5.0, **arguments: Any) -> Any:
@@ -148,7 +148,7 @@ class Attachment(Generic[SampleT]):
             raise
 
     def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
-        """What ``call`` can ask for: descriptions by name.
+        """Return the operations that ``call`` can ask for: descriptions by name.
 
         Raises:
             RequestTimeout, RequestRefused, PeerGone, Closed: as ``call``.
@@ -162,7 +162,7 @@ class Attachment(Generic[SampleT]):
         return RingReader(segment, self.frame_class, self._describe(segment))
 
     def _describe(self, _attached: segments.Segment) -> object:
-        """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
+        """Return the ``context`` of frames (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
     def _attach_within(self, timeout_s: float | None) -> RingReader[SampleT]:
@@ -218,7 +218,7 @@ class Attachment(Generic[SampleT]):
             self._moved = True
 
     def _successor_lives(self) -> bool:
-        """Whether the writer of a generation with another structure lives."""
+        """Return whether the writer of a generation with another structure lives."""
         if not self._moved:
             return False
         try:

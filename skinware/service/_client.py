@@ -48,7 +48,7 @@ class PendingRequest:
         self._answer: Answer | RequestError | None = None
 
     def done(self) -> bool:
-        """Whether ``result`` comes at once."""
+        """Return whether ``result`` comes at once."""
         self._client.listen(0.0)
         return self._answer is not None
 
@@ -166,7 +166,7 @@ class RequestClient(ForkGuard):
             packet = msgspec.json.encode(Ask(number, CANCEL))
             connection.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except BlockingIOError:
-            pass  # its answer will find nobody
+            pass  # its answer will be dropped
         except OSError:
             self._lose()
 

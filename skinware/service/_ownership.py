@@ -1,4 +1,4 @@
-"""Owning a service's name: its generations, its files, and what readers are told of its state."""
+"""Own a service's name: its generations, its files, and its state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger("skinware.service")
 _FILE_CHECK_NS = NS_PER_S
 
 Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
-"""Of every array of a frame, by name: dtype and length, or dtype and shape, or all that is known of it."""
+"""Every array of a frame, by name: dtype and length, dtype and shape, or a :class:`Column`."""
 
 
 class Ownership:
@@ -37,7 +37,7 @@ class Ownership:
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.
-        published_before: frames that were published under the name before; None: as the files tell.
+        published_before: frames that were published under the name before; None: the count in the files.
 
     Raises:
         NameInUse: a running writer has this name.
@@ -105,7 +105,7 @@ class Ownership:
         return self._ring.native_address
 
     def column_offsets(self) -> dict[str, int]:
-        """Where each column begins, bytes from the beginning of a slot."""
+        """Return where each column begins, bytes from the beginning of a slot."""
         return {name: offset for name, (_, _, offset) in self._ring.segment.slot_formats().items()}
 
     @property
@@ -113,7 +113,7 @@ class Ownership:
         return self._paused
 
     def pause(self) -> None:
-        """Publish nothing until ``resume``; readers and requesters are told. From any thread.
+        """Publish nothing until ``resume``; readers and requesters notice it. From any thread.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -128,34 +128,8 @@ class Ownership:
         """
         self._set_paused(False)
 
-    def restructure(
-        self,
-        columns: Columns,
-        static: Mapping[str, npt.NDArray[Any]] | None = None,
-        *,
-        rate_hz: float | None = None,
-        skip: int = 0,
-    ) -> None:
-        """Go on under the same name with other columns, as a new generation; readers are told.
-
-        Args:
-            columns: as for a new writer.
-            static: as for a new writer.
-            rate_hz: the nominal rate from now on; None: as before.
-            skip: frames before its first one that are left out; readers count them as lost.
-
-        Raises:
-            ConfigurationError: columns that the format cannot hold; the old generation then goes on.
-            NamespaceError: shared memory is full; the old generation then goes on.
-            Closed: this writer was closed, or belongs to the process before a fork.
-        """
-        self._require_open()
-        schema = Schema.of(columns, self._schema.description)
-        period_ns = self._period_ns if rate_hz is None else round(NS_PER_S / rate_hz)
-        self._succeed(schema, static or {}, period_ns, skip)
-
     def request_server(self) -> RequestServer:
-        """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
+        """Return the socket that requests come by, for event loops: readable when ``requests`` has something to say.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -163,8 +137,9 @@ class Ownership:
         """
         self._require_open()
         if self._server is None:
-            described = {name: _first_line(function) for name, function in self._operations.items()}
-            self._server = RequestServer(self.namespace, self.name, described)
+            described = {name: inspect.getdoc(function) or "" for name, function in self._operations.items()}
+            first_lines = {name: text.partition("\n")[0] for name, text in described.items()}
+            self._server = RequestServer(self.namespace, self.name, first_lines)
             self._server.paused = self._paused
             if self._period_ns:
                 self._server.fit_into(self._period_ns)
@@ -248,14 +223,23 @@ class Ownership:
             except BaseException:
                 segments.discard(segment)
                 raise
-            self._ring, self._schema, self._static, self._period_ns = ring, schema, dict(static), period_ns
+            self._ring, self._static = ring, dict(static)
             self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
             if previous is not None:
                 previous.mark(file_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
                 previous.close()
 
-    def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int, skip: int = 0) -> None:
+    @property
+    def _period_ns(self) -> int:
+        return int(self._ring.segment.header["period_ns"])
+
+    def _succeed(
+        self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], rate_hz: float | None = None, skip: int = 0
+    ) -> None:
+        """Go on with another generation."""
+        self._require_open()
         own = self._ring.segment
+        period_ns = self._period_ns if rate_hz is None else round(NS_PER_S / rate_hz)
         self._begin_generation(schema, static, period_ns, own, own.published + skip)
 
     def _set_paused(self, paused: bool) -> None:
@@ -271,7 +255,7 @@ class Ownership:
             raise Closed(f"the writer of {self.name!r} was closed, or belongs to the process before a fork")
 
     def _make_removed_files(self) -> None:
-        if _removed(self._name_lock.fd):
+        if os.fstat(self._name_lock.fd).st_nlink == 0:
             self.namespace.create(self._group)
             try:
                 name_lock = segments.take_name(self.namespace, self.name)
@@ -280,15 +264,7 @@ class Ownership:
                 raise
             self._name_lock.close()
             self._name_lock = name_lock
-        if _removed(self._ring.segment.descriptor.fd):
-            self._succeed(self._schema, self._static, self._period_ns)
+        if os.fstat(self._ring.segment.descriptor.fd).st_nlink == 0:
+            self._succeed(self._ring.segment.schema, self._static)
         if self._server is not None:
             self._server.keep()
-
-
-def _removed(fd: int) -> bool:
-    return os.fstat(fd).st_nlink == 0
-
-
-def _first_line(function: Callable[..., object]) -> str:
-    return (inspect.getdoc(function) or "").partition("\n")[0]

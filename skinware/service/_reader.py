@@ -1,17 +1,20 @@
-"""A reader's end of a service."""
+"""The reader's end of a service: for programs, and for loops of this package over many services."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import Self
+from typing import Any, Self
 
-from skinware.errors import Overrun
+from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring_reader import RingReader
 from skinware.memory.take import NEWER, NEXT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
+from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
@@ -50,15 +53,15 @@ class ServiceReader(Taking[SampleT]):
     def lost(self) -> int:
         """Frames that were published since the first one that was taken, and that were not taken.
 
-        Those of generations that came and went meanwhile are counted too: each file tells how many were published under
-        the name before it. Only where somebody removed the namespace's files in between, that number is unknown.
+        Those of generations that came and went meanwhile are counted too: each file has the number of frames that
+        were published under the name before it. It is unknown only if the namespace's files were removed in between.
         """
         self._settle()
         return self._accounts.record.lost
 
     @property
     def statistics(self) -> ReaderRecord:
-        """What this reader has counted so far: frames, losses, times; what ``skin-info`` shows of it."""
+        """Frames, losses and times that this reader has counted so far; ``skin-info`` shows them."""
         self._settle()
         return self._accounts.record
 
@@ -88,7 +91,7 @@ class ServiceReader(Taking[SampleT]):
         max_age_s: float | None = None,
         timeout_s: float | None = 5.0,
     ) -> SampleT:
-        """The newest frame, as a private copy.
+        """Return the newest frame, as a private copy.
 
         Args:
             newer_than: wait for a frame that is newer than this one; any frame of a later generation is.
@@ -115,7 +118,7 @@ class ServiceReader(Taking[SampleT]):
         """The newest frame in place, with no copy, for as long as the block lasts.
 
         The writer may overwrite it meanwhile: ``frame.valid`` says whether it still is whole, and the end of the block
-        asks once more. What was computed in the block counts only if that did not raise.
+        asks once more. Use the results of the block only if that did not raise.
 
         It counts as taken if it is still valid at the end.
 
@@ -178,9 +181,9 @@ class ServiceReader(Taking[SampleT]):
     def in_order(self, *, timeout_s: float | None = None) -> Iterator[SampleT]:
         """Every frame, one after the other, as long as this program keeps up within the ring's slots.
 
-        For recorders and tests; a control loop wants the newest (``frames``). What was overwritten before its turn
-        is counted in ``lost``. Other threads of this process keep the interpreter for 0.1 ms at the most, for
-        as long as the loop lives.
+        For recorders and tests; a control loop wants the newest (``frames``). Frames that were overwritten before
+        their turn are counted in ``lost``. As long as the loop lives, other threads of this process keep the
+        interpreter for 0.1 ms at the most.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
@@ -239,3 +242,113 @@ class ServiceReader(Taking[SampleT]):
 
 def _in_ns(timeout_s: float | None) -> int:
     return _ENDLESS_NS if timeout_s is None else round(timeout_s * NS_PER_S)
+
+
+def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
+    """Return the futex that every publication wakes, and its present value; take it before looking for what is new."""
+    ring = reader._ring  # noqa: SLF001
+    return ring.wake_word, ring.wake_count
+
+
+class Tap(ServiceReader[SampleT]):
+    """A reader whose owner looks for new generations and for the dead, and waits for many readers at once."""
+
+    @property
+    def moved_on(self) -> bool:
+        """Whether the writer closed the generation at hand or went over to another; a killed one leaves no mark."""
+        return bool(self._ring.state & GENERATION_ENDED)
+
+    @property
+    def head(self) -> bytes:
+        """Bytes of the file that is being read, up to its slots."""
+        return self._ring.segment.head
+
+    @property
+    def inode(self) -> tuple[int, int]:
+        """Device and number of the file that is being read."""
+        return self._ring.segment.inode
+
+    @property
+    def period_ns(self) -> int:
+        """The writer's nominal period, 0 if it has none."""
+        return self._ring.period_ns
+
+    @property
+    def slack_ns(self) -> int:
+        """How long it takes the writer to go round its ring at its nominal rate, 0 if it has none."""
+        return self._ring.period_ns * self._ring.slot_count
+
+    def ring_in_c(self) -> RingReader[SampleT]:
+        if not self._turns_in_c:
+            self._leave_to_c()
+        return self._ring
+
+    def report(self) -> None:
+        """Count the samples taken in C and announce them, if that is due."""
+        if now_ns() >= self._accounts.due_ns:
+            self._settle()
+            self._accounts.end_turn(None)
+
+    @property
+    def last_taken(self) -> Position | None:
+        return self._last
+
+    def begin_in_order(self, *, with_first: bool) -> None:
+        """Read in order from now on.
+
+        Args:
+            with_first: begin with the first frame of the generation at hand, otherwise with the one that is its newest
+                now. Samples that are overwritten before they are taken are lost.
+        """
+        self._accounts.begin_loop("in order")
+        self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
+
+    def next_in_order(self) -> SampleT | None:
+        """Return the frame after the last one taken, over generations; None if it is not there yet. Never wait.
+
+        Raises:
+            StructureChanged, Overrun, Closed: as ``in_order``.
+        """
+        try:
+            return self._read_in_order(0)
+        except ServiceTimeout:
+            return None
+
+    def newest(self) -> SampleT:
+        """Return a copy of the newest frame of the generation at hand.
+
+        Raises:
+            ServiceTimeout: nothing was published yet.
+            Overrun: the writer is too fast for this number of slots.
+        """
+        return self._newest_now(self._ring.copy, True)
+
+    def newest_acquired_ns(self) -> int:
+        """``acquired_ns`` of the newest frame.
+
+        Raises:
+            Overrun: it was overwritten meanwhile, or nothing was published yet.
+        """
+        return self._acquisitions()[-1][1]
+
+    def nearest(self, time_ns: int) -> SampleT:
+        """Return a copy of the frame in the ring whose ``acquired_ns`` is nearest to a time.
+
+        Raises:
+            Overrun: it was overwritten meanwhile, or nothing was published yet.
+        """
+        sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
+        frame = self._ring.copy(sequence)
+        if frame is None:
+            raise Overrun(f"service {self.name!r}: frame {sequence} was overwritten before it was copied")
+        before = self._last
+        taken = self._newest_now(lambda: frame, True)
+        if before is not None and before > taken.position:  # it came before, and is not lost again
+            self._last = before
+        return taken
+
+    def _acquisitions(self) -> list[tuple[int, int]]:
+        times = self._ring.acquisition_times_ns()
+        if not times:
+            raise Overrun(f"service {self.name!r}: no frame could be read")
+        return times

@@ -61,7 +61,7 @@ class Request:
     Attributes:
         operation: what is asked for.
         arguments: by name.
-        cancelled: nobody waits for the answer any more.
+        cancelled: the answer is no longer wanted.
     """
 
     def __init__(self, server: RequestServer, peer: _Peer, ask: Ask) -> None:
@@ -109,7 +109,7 @@ class RequestServer(ForkGuard):
     Attributes:
         paused: requests are refused, but those of ``while_paused``.
         while_paused: names of operations that are carried out also then.
-        why_no_others: told to who asks for an operation that is not declared; empty: nothing is.
+        why_no_others: part of the answer to a request for an operation that is not declared; may be empty.
         turn_ns: how long one turn may take; at most one packet is begun before it is over and ends after it.
 
     Raises:
@@ -171,7 +171,7 @@ class RequestServer(ForkGuard):
         return -1 if self._epoll.closed else self._epoll.fileno()
 
     def take(self, timeout_s: float = 0.0, *, at_most: int | None = None) -> list[Request]:
-        """The requests that have arrived, as many as fit into one turn.
+        """Return the requests that have arrived, as many as fit into one turn.
 
         Args:
             timeout_s: longest wait for one.
@@ -198,7 +198,7 @@ class RequestServer(ForkGuard):
         return [request for request in found if not request.cancelled]
 
     def answer(self, peer: _Peer, number: int, answer: Answer | None) -> None:
-        """Send an answer, once; None: nobody waits for it."""
+        """Send an answer, once; None: it is not wanted."""
         if peer.open.pop(number, None) is None or answer is None:
             return
         packet = msgspec.json.encode(answer)
@@ -211,7 +211,7 @@ class RequestServer(ForkGuard):
             self._drop(peer)
 
     def close(self) -> None:
-        """Take no more requests; those that wait are told by the hang-up. Idempotent."""
+        """Take no more requests; the hang-up ends those that wait. Idempotent."""
         if not self._epoll.closed:
             with contextlib.suppress(FileNotFoundError):
                 if os.lstat(self._path).st_ino == self._inode:  # not the socket of somebody who came after us
@@ -310,7 +310,7 @@ class RequestServer(ForkGuard):
 
 
 class _Turn:
-    """What may still be done in one turn."""
+    """The rest of one turn: time and bytes."""
 
     def __init__(self, turn_ns: int) -> None:
         self.bytes_left = _TURN_BYTES

@@ -1,20 +1,108 @@
-"""Which frame of a service is taken next: waited for, and counted with those that were lost before it."""
+"""Take the frames of a service: wait for them, and count them and those that were lost."""
 
 from __future__ import annotations
 
+import os
+import sys
+import time
 from collections.abc import Callable
 
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
+from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Sample, SampleT
-from skinware.memory.ring_reader import RingReader
-from skinware.memory.take import NEXT
+from skinware.memory.ring_reader import RingReader, Turns
+from skinware.memory.take import NEXT, Turn
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._attachment import GENERATION_ENDED, Attachment
-from skinware.service.messages import Accounts
+
+_ANNOUNCE_EVERY_NS = NS_PER_S // 4
 
 Position = tuple[int, int]
 """(generation, sequence) of a frame."""
+
+
+class Accounts:
+    """Counts at the moments at which a reader is in no hurry: it notes times before it sleeps, and adds them up later.
+
+    With more readers than processors, what one does before it sleeps makes the next one's frame older.
+
+    Args:
+        namespace, service: what is read.
+        announce: let others see it, from its first frame or wait on.
+    """
+
+    def __init__(self, namespace: Namespace, service: str, announce: bool) -> None:
+        program = os.path.basename(sys.argv[0] or sys.executable)
+        self._record = ReaderRecord(service, os.getpid(), program, "on demand")
+        self._namespace, self._announce_it = namespace, announce
+        self._announcement: Announcement | None = None
+        self._announced_ns = self._announced_frames = 0
+        self._in_loop = False
+        self._turns: list[Turn] = []
+        self._cpu_ns = 0
+
+    @property
+    def record(self) -> ReaderRecord:
+        self._add_up()
+        return self._record
+
+    def begin_loop(self, kind: str) -> None:
+        """Return the reader reads in a loop from now on, whose turns are timed."""
+        self._record.kind = kind
+        self._in_loop = True
+
+    def taken(self, lost: int) -> None:
+        self._record.frames += 1
+        if lost:
+            self._record.lost += lost
+
+    @property
+    def due_ns(self) -> int:
+        return self._announced_ns + _ANNOUNCE_EVERY_NS
+
+    def settle(self, turns: Turns) -> None:
+        self._record.frames += turns.frames
+        self._record.lost += turns.lost
+        self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
+
+    def end_turn(self, turn: tuple[int, int] | None) -> None:
+        """Note the turn that ends now, if there is one; add up and announce now and then."""
+        time_ns = now_ns()
+        if turn is not None:
+            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
+        if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
+            self._add_up()
+            self._announce(time_ns)
+
+    def _add_up(self) -> None:
+        record = self._record
+        turns, self._turns = self._turns, []
+        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
+            age_ns = taken_ns - acquired_ns
+            record.age.add(age_ns)
+            record.age_ms = round(age_ns / 1e6, 3)
+            if cpu_ns:
+                record.wall.add(ended_ns - taken_ns)
+                if 0 < self._cpu_ns <= cpu_ns:
+                    record.cpu.add(cpu_ns - self._cpu_ns)
+                self._cpu_ns = cpu_ns
+
+    def _announce(self, time_ns: int) -> None:
+        record = self._record
+        if self._announced_ns:
+            passed_ns = time_ns - self._announced_ns
+            record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
+        if self._announce_it:
+            if self._announcement is None:
+                self._announcement = Announcement(self._namespace, record.service)
+            self._announcement.write(record)
+        self._announced_ns, self._announced_frames = time_ns, record.frames
+
+    def close(self) -> None:
+        self._announce_it = False
+        if self._announcement is not None:
+            self._announcement.close()
 
 
 class Taking(Attachment[SampleT]):
@@ -38,7 +126,7 @@ class Taking(Attachment[SampleT]):
             before = self._ring.segment
             taken = before.published_before + self._last[1]
             published = ring.segment.published_before
-            if published < taken:  # the count began anew: somebody removed the lock's file
+            if published < taken:  # the count began again: the lock's file was removed
                 published = before.published
             self._accounts.record.lost += published - taken
             self._last = (ring.generation, 0)
@@ -118,7 +206,7 @@ class Taking(Attachment[SampleT]):
         return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
 
     def _lags(self) -> bool:
-        """Whether the generation that is being read has newer frames, though there may be another one already."""
+        """Return whether the generation at hand has newer frames, though there may be another one already."""
         last = self._last
         return last is not None and last < (self._ring.generation, self._ring.latest)
 
@@ -142,7 +230,7 @@ class Taking(Attachment[SampleT]):
         )
 
     def _newest_now(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
-        """The newest frame without a wait, so that this is the moment to count it."""
+        """Return the newest frame without a wait, so that this is the moment to count it."""
         frame = self._taken(self._whole(take), alive)
         self._end_turn()
         return frame

@@ -19,61 +19,11 @@ from skinware.service.messages import ACQUIRE
 _LONGEST_WAIT_S = 1.0
 
 
-class ServiceWriter(Ownership):
-    """Publishes a service; each service has one writer. It never waits for a reader.
+class Writer(Ownership):
+    """Publish the samples of a service; it never waits for a reader."""
 
-    Args:
-        name: unique in the namespace, 1 to 47 letters, digits, ``_`` or ``-``.
-        columns: the arrays of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
-            unit and a description. A dtype may be a structure.
-        static: arrays that are written once, for readers, besides the frames.
-        namespace: default: the one of ``SKINWARE_NAMESPACE``.
-        kind: of the service (``data``, ``driver``).
-        slots: frames that the ring holds, 2 to 64; default: those of a second at ``rate_hz``, but at least 8, at most
-            64, and not more than 16 MiB; 8 where there is no rate.
-        rate_hz: nominal rate, told to readers; None for no fixed rate.
-        group: group whose members may read; an existing namespace must have the same.
-        description: of the service, for people.
-        operations: what programs may ask for besides a frame: name to function, called in the writer's own loop
-            (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
-        published_before: frames that were published under this name before, for who passes frames on and counts as
-            their origin does; None: as the files of the name tell.
-
-    Raises:
-        NameInUse: a running writer has this name.
-        NamespaceError: the namespace cannot be used, or shared memory is full.
-        ConfigurationError: a bad name, slot count or column.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        columns: Columns,
-        static: Mapping[str, npt.NDArray[Any]] | None = None,
-        *,
-        namespace: Namespace | str | None = None,
-        kind: str = "data",
-        slots: int | None = None,
-        rate_hz: float | None = None,
-        group: str | None = None,
-        description: str = "",
-        operations: Mapping[str, Callable[..., object]] | None = None,
-        published_before: int | None = None,
-    ) -> None:
-        super().__init__(
-            name,
-            namespace,
-            schema=Schema.of(columns, description),
-            static=static or {},
-            kind=kind,
-            slots=slots,
-            period_ns=round(NS_PER_S / rate_hz) if rate_hz else 0,
-            group=group,
-            operations=operations or {},
-            published_before=published_before,
-        )
-        self.missed_periods: int = 0
-        self._stopping = False
+    missed_periods: int = 0
+    _stopping = False
 
     def begin(
         self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
@@ -158,7 +108,7 @@ class ServiceWriter(Ownership):
                     yield from self._one_frame(waiting, from_last)
 
     def requests(self, timeout_s: float = 0.0) -> list[Request]:
-        """What programs ask for, for writers with a loop of their own; each wants its ``reply`` or ``fail``.
+        """Return the requests of programs, for writers with a loop of their own; each needs ``reply`` or ``fail``.
 
         ``acquire`` asks for a frame whose acquisition begins now or later: publish it, then reply with
         ``position=writer.position``. The first call makes the socket (:meth:`request_server`).
@@ -225,7 +175,7 @@ class ServiceWriter(Ownership):
                 raise
 
     def _one_frame(self, waiting: list[Request], from_last: bool) -> Iterator[dict[str, npt.NDArray[Any]]]:
-        """A frame of a loop, which may be paused or closed from another thread at any moment."""
+        """Yield a frame of a loop, which may be paused or closed from another thread at any moment."""
         acquired_ns = now_ns()
         try:
             columns = self.begin(from_last=from_last)
@@ -267,3 +217,81 @@ class ServiceWriter(Ownership):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r} in {self.namespace.name!r}, sequence {self.sequence}>"
+
+
+class ServiceWriter(Writer):
+    """Publishes a service; each service has one writer. It never waits for a reader.
+
+    Args:
+        name: unique in the namespace, 1 to 47 letters, digits, ``_`` or ``-``.
+        columns: the arrays of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
+            unit and a description. A dtype may be a structure.
+        static: arrays that are written once, for readers, besides the frames.
+        namespace: default: the one of ``SKINWARE_NAMESPACE``.
+        kind: of the service (``data``, ``driver``).
+        slots: frames that the ring holds, 2 to 64; default: those of a second at ``rate_hz``, but at least 8, at most
+            64, and not more than 16 MiB; 8 where there is no rate.
+        rate_hz: nominal rate, for readers; None for no fixed rate.
+        group: group whose members may read; an existing namespace must have the same.
+        description: of the service, for people.
+        operations: what programs may ask for besides a frame: name to function, called in the writer's own loop
+            (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
+        published_before: frames that were published under this name before, for a program that passes frames on
+            and counts as their origin does; None: the count in the files of the name.
+
+    Raises:
+        NameInUse: a running writer has this name.
+        NamespaceError: the namespace cannot be used, or shared memory is full.
+        ConfigurationError: a bad name, slot count or column.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        columns: Columns,
+        static: Mapping[str, npt.NDArray[Any]] | None = None,
+        *,
+        namespace: Namespace | str | None = None,
+        kind: str = "data",
+        slots: int | None = None,
+        rate_hz: float | None = None,
+        group: str | None = None,
+        description: str = "",
+        operations: Mapping[str, Callable[..., object]] | None = None,
+        published_before: int | None = None,
+    ) -> None:
+        super().__init__(
+            name,
+            namespace,
+            schema=Schema.of(columns, description),
+            static=static or {},
+            kind=kind,
+            slots=slots,
+            period_ns=round(NS_PER_S / rate_hz) if rate_hz else 0,
+            group=group,
+            operations=operations or {},
+            published_before=published_before,
+        )
+
+    def restructure(
+        self,
+        columns: Columns,
+        static: Mapping[str, npt.NDArray[Any]] | None = None,
+        *,
+        rate_hz: float | None = None,
+        skip: int = 0,
+    ) -> None:
+        """Go on under the same name with other columns, as a new generation; readers notice it.
+
+        Args:
+            columns: as for a new writer.
+            static: as for a new writer.
+            rate_hz: the nominal rate from now on; None: as before.
+            skip: samples before its first one that are left out; readers count them as lost.
+
+        Raises:
+            ConfigurationError: columns that the format cannot hold; the old generation then goes on.
+            NamespaceError: shared memory is full; the old generation then goes on.
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
+        self._succeed(Schema.of(columns, self._ring.segment.schema.description), static or {}, rate_hz, skip)

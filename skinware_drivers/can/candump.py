@@ -1,11 +1,11 @@
-"""Write the CAN frames of a batch as text (:func:`skinware.candump.candump_line`)."""
+"""Write the CAN frames of a batch as text (:func:`skinware.wire.candump_line`)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from skinware.candump import candump_line
+from skinware.wire import candump_line
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 
 _FD_BYTES = 8
@@ -35,7 +35,7 @@ class TextFrame:
         """Return the line of the frame, without its end.
 
         Args:
-            channel: name of the interface; see :func:`skinware.candump.channel_name`.
+            channel: name of the interface; see :func:`skinware.wire.channel_name`.
         """
         identifier = self.identifier | (EXTENDED_FLAG if self.extended else 0)
         return candump_line(self.time_us, channel, identifier, self.fd, self.payload)

@@ -42,8 +42,8 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         BusNotAvailable: the bus cannot be opened, or went away.
         BusError: no frame came for ``timeout_s``.
     """
-    from skinware.candump import channel_name
     from skinware.realtime import now_ns
+    from skinware.wire import channel_name
     from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.can.candump import text_frames
     from skinware_drivers.registry import make_bus

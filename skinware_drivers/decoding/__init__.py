@@ -1,1 +1,1 @@
-"""Frames to updates: layouts compiled to lookup tables, and applied to whole batches of frames."""
+"""Decode frames into updates: layouts are compiled to lookup tables and applied to whole batches."""

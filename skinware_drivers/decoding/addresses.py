@@ -16,7 +16,7 @@ _FLAGS = EXTENDED_FLAG | REMOTE_FLAG
 
 
 def filters_of(layout: Layout) -> list[Filter]:
-    """What lets all frames of a layout through, as few as there can be; no remote frames."""
+    """Return the fewest filters that let all frames of a layout through, but no remote frames."""
     found = []
     for frame in layout.frames:
         value, mask = (EXTENDED_FLAG if frame.extended else 0), _FLAGS
@@ -30,32 +30,32 @@ def filters_of(layout: Layout) -> list[Filter]:
 
 
 def fewest(filters: Iterable[Filter]) -> list[Filter]:
-    """Filters that let the same frames through as these, with none that others make needless."""
+    """Return filters that let the same frames through as these, without redundant ones."""
     left = {Filter(value & mask, mask) for value, mask in filters}
     while True:
-        joined = {_join(one, other) for one in left for other in left if _differ_in_one_bit(one, other)}
+        joined = set()
+        for one in left:
+            for other in left:
+                differ = one.value ^ other.value
+                if one.mask == other.mask and differ.bit_count() == 1:
+                    joined.add(Filter(one.value & ~differ, one.mask & ~differ))
         every = left | joined
-        fewer = {one for one in every if not any(_covers(other, one) for other in every if other != one)}
+        fewer = {
+            one
+            for one in every
+            # another one is wider, and lets it through
+            if not any(
+                other != one and other.mask & one.mask == other.mask and one.value & other.mask == other.value
+                for other in every
+            )
+        }
         if fewer == left:
             return sorted(left)
         left = fewer
 
 
-def _covers(wide: Filter, narrow: Filter) -> bool:
-    return wide.mask & narrow.mask == wide.mask and narrow.value & wide.mask == wide.value
-
-
-def _differ_in_one_bit(one: Filter, other: Filter) -> bool:
-    return one.mask == other.mask and (one.value ^ other.value).bit_count() == 1
-
-
-def _join(one: Filter, other: Filter) -> Filter:
-    mask = one.mask & ~(one.value ^ other.value)
-    return Filter(one.value & mask, mask)
-
-
 STANDARD_IDENTIFIERS = 1 << 11
-_FIELD_BITS = 29  # of a patch's or module's key
+_FIELD_BITS = 29  # of the key of a patch or module
 
 Indices = npt.NDArray[np.int64]
 
@@ -63,26 +63,26 @@ Indices = npt.NDArray[np.int64]
 class Addresses:
     """The address book of all buses of a driver.
 
-    A *slot* stands for all identifiers of a bus that mean the same; ``nobody`` is that of all others.
+    A *slot* stands for all identifiers of a bus with the same meaning; ``foreign`` is the slot of all others.
 
     Args:
         frames: all kinds of frame.
-        kinds_of_bus: for each bus, the numbers of those that it carries.
+        kinds_of_bus: for each bus, the numbers of the kinds that it carries.
         tables: what is attached to the buses.
 
     Attributes:
         entry: (n_slots,) int64: 0 to n_modules - 1: a module; then n_patches entries for "some module of this patch";
-            then one for "none of ours".
+            then one for foreign frames.
         candidates: (n_slots,) uint16, row of ``sets``.
-        sets: (n_sets, n_kinds) bool: kinds that a frame can be.
+        sets: (n_sets, n_kinds) bool: kinds that a frame can be of.
     """
 
     def __init__(self, frames: Sequence[Frame], kinds_of_bus: Sequence[Sequence[int]], tables: SkinTables) -> None:
         self._tables = tables
         self._n_modules = tables.structure.n_modules
-        self.nobody: int = len(kinds_of_bus) * STANDARD_IDENTIFIERS
-        entries = [self._n_modules + tables.structure.n_patches] * (self.nobody + 1)
-        possible: list[tuple[int, ...]] = [()] * (self.nobody + 1)
+        self.foreign: int = len(kinds_of_bus) * STANDARD_IDENTIFIERS
+        entries = [self._n_modules + tables.structure.n_patches] * (self.foreign + 1)
+        possible: list[tuple[int, ...]] = [()] * (self.foreign + 1)
         self.forms: list[_Form] = []
         for bus, kinds in enumerate(kinds_of_bus):
             for number in kinds:
@@ -110,13 +110,13 @@ class Addresses:
         slots: Indices = bus * np.int64(STANDARD_IDENTIFIERS) + identifier
         if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
             rows = np.flatnonzero(identifier >= STANDARD_IDENTIFIERS)
-            slots[rows] = self.nobody
+            slots[rows] = self.foreign
             for form in self.forms:
                 form.look_up(bus[rows], identifier[rows].astype(np.int64), slots, rows)
         return slots
 
     def modules_of(self, kind: int, frame: Frame) -> list[int]:
-        """The modules that frames of a kind can be of.
+        """Return the modules that frames of a kind can be of.
 
         Args:
             kind: its number.
@@ -166,7 +166,7 @@ class _Field:
 
 
 class _Form:
-    """29-bit identifiers of one bus that are built alike."""
+    """29-bit identifiers of one bus with the same conditions and keys."""
 
     def __init__(self, bus: int, frame: Frame, tables: SkinTables, first_slot: int) -> None:
         self.bus = bus
@@ -206,7 +206,7 @@ class _Form:
 
 
 def bits_of(identifier: int, bits: Bits | int | None) -> int:
-    """A bit field of an identifier, 0 without one; or the constant that stands for it."""
+    """Return a bit field of an identifier, 0 without one; or the constant in its place."""
     if isinstance(bits, int):
         return bits
     return 0 if bits is None else identifier >> bits.shift & ((1 << bits.width) - 1)
@@ -218,7 +218,7 @@ def _sorted(slots: dict[int, int]) -> tuple[Indices, Indices]:
 
 
 def _of_one_address(frames: Sequence[Frame], numbers: Iterable[int]) -> list[tuple[int, ...]]:
-    """Kinds of frame, those together whose identifiers are built alike."""
+    """Return the kinds of frame, grouped by the conditions and keys of their identifiers."""
     alike: dict[tuple[object, ...], list[int]] = {}
     for number in numbers:
         frame = frames[number]

@@ -3,7 +3,7 @@
 The kind and the module of every frame are looked up (``compiled``), the members of a cycle are paired (``pairing``),
 and their payloads are read (``frame_kind``). The updates are shown (``skin_state``) when the publisher decides it.
 
-Nothing on the wire raises here. What cannot be used is counted.
+Nothing on the wire raises here. Frames that cannot be used are counted.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledLayouts
-from skinware_drivers.decoding.device_stamps import DeviceStamps
+from skinware_drivers.decoding.device_numbers import DeviceStamps, Sequences
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.decoding.pairing import CompiledCycle
-from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.layout import Byte, Layout
-from skinware_drivers.numbering import SequenceNumber
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -42,7 +41,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Decoder:
-    """What is known of a skin, and the frames that change it.
+    """The state of a skin, and the decoding that changes it.
 
     The arrays are shared with C, which decodes in a running driver; ``decode`` does the same in numpy.
 
@@ -59,7 +58,7 @@ class Decoder:
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
 
     Raises:
-        ConfigurationError: the buses have more kinds of frame than can be told apart.
+        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(
@@ -90,23 +89,23 @@ class Decoder:
             self._carried = None
 
     def decode(self, batch: FrameBatch, interrupted: Sequence[int] = ()) -> tuple[Updates, Indices]:
-        """Find the updates of a batch; count what is wrong with the frames of our modules.
+        """Return the updates of a batch, and count its wrong frames.
 
         Args:
             batch: the frames.
-            interrupted: buses of which it is known that they have lost frames since the last batch: what waits for
-                partners on them is not joined with what came since.
+            interrupted: buses that are known to have lost frames since the last batch: frames that wait for partners on
+                them are not joined with new ones.
 
         Returns:
-            The updates in order of their time, to be shown by ``state.show``; and the rows that belong to no module:
-            whoever knows that nobody waits for them has them counted (``count_unknown``).
+            The updates in order of their time, to be shown by ``state.show``; and the rows that belong to no module, to
+            be counted by ``count_unknown`` unless a handshake awaits them.
         """
         first, last = batch.start, batch.stop
         bus, payload = batch.bus[first:last], batch.wire["payload"][first:last]
         entry, kind, wrong = self.name(batch)
-        new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
+        new = slice(max(0, batch.headroom - first), None)  # those before have their times from the batch before
         time_ns = batch.time_ns[first:last][new]
-        self.device_stamps.tell(kind[new], entry[new], payload[new], time_ns)
+        self.device_stamps.apply(kind[new], entry[new], payload[new], time_ns)
         self._keep_after_boot(bus[new], time_ns)
         is_module = entry < self._n_modules
         is_foreign = ~is_module
@@ -124,7 +123,10 @@ class Decoder:
         for cycle in self.compiled.cycles:
             parts += self._pair(batch, cycle, entry, is_module, kind, severed)
         if not parts:
-            return self._no_updates(), foreign + first
+            empty, none = np.zeros((0, self.compiled.width), np.int64), np.zeros(0, np.int64)
+            groups = np.zeros((0, self.compiled.most_groups), np.int64)
+            nothing = Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
+            return nothing, foreign + first
         updates = Updates.join([part for part, _ in parts])
         newest_ns = updates.newest_ns
         if len(parts) > 1:
@@ -134,16 +136,16 @@ class Decoder:
         return updates, foreign + first
 
     def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:
-        """Tell whose the frames of a batch are, and what; count those of our modules that are wrong.
+        """Find the module and the kind of the frames of a batch, and count wrong frames.
 
         Returns:
-            (n,) module of each, ``n_modules`` or more: of none; (n,) number of its kind, 255: none; and the wrong rows.
+            (n,) module of each, ``n_modules`` or more: none; (n,) number of its kind, 255: none; and the wrong rows.
         """
         wire, bus = batch.wire[batch.start : batch.stop], batch.bus[batch.start : batch.stop]
         payload = wire["payload"]
         slots = self.compiled.addresses.slots(bus, wire["identifier"])
         entry = self.compiled.addresses.entry[slots]
-        kind, wrong = self._tell_kinds(slots, entry, wire, bus)
+        kind, wrong = self._find_kinds(slots, entry, wire, bus)
         for number, compiled in enumerate(self.compiled.kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
@@ -151,7 +153,7 @@ class Decoder:
         return entry, kind, wrong
 
     def forget(self, patch: int) -> None:
-        """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""
+        """Forget the sequence numbers, the rhythm and the clock of a patch that has restarted."""
         self.sequences.forget(patch)
         self.device_stamps.forget(patch)
         for cycle in self.compiled.cycles:
@@ -165,7 +167,7 @@ class Decoder:
         np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
     def _keep_after_boot(self, bus: npt.NDArray[np.uint16], time_ns: Indices) -> None:
-        """Stamps from before this machine booted (a clock that was set) become the earliest ones, and are counted."""
+        """Count stamps from before this machine booted (a clock that was set), and replace them by the earliest."""
         early = time_ns < _EARLIEST_NS
         if early.any():
             time_ns[early] = _EARLIEST_NS
@@ -178,13 +180,10 @@ class Decoder:
                 if samples.wants(why):
                     samples.take(why, wire[rows[bus[rows] == ordinal]])
 
-    def _tell_kinds(
+    def _find_kinds(
         self, slots: Indices, entry: Indices, wire: npt.NDArray[np.void], bus: npt.NDArray[np.uint16]
     ) -> tuple[Bytes, Indices]:
-        """(n,) kind of each frame, 255 = none; and the rows that are ours and of no kind or of a wrong length.
-
-        Those are counted here.
-        """
+        """Return (n,) kind of each frame, 255: none; and rows of ours with no kind or a wrong length, after a count."""
         n_buses, payload = len(self.state.bus_counters), wire["payload"]
         length = np.minimum(wire["length"], self.compiled.length_ok.shape[1] - 1)
         ours = entry < self._n_modules + self._n_patches
@@ -222,7 +221,7 @@ class Decoder:
         return known
 
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
-        """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
+        """Return (n,) the last kind whose conditions hold, and whose length is right if it is checked; 255: none."""
         kind = np.full(len(slots), NO_KIND, np.uint8)
         candidates = self.compiled.addresses.candidates[slots]
         for number, frame in enumerate(self.compiled.frames):
@@ -239,7 +238,7 @@ class Decoder:
     def _pair(
         self, batch: FrameBatch, cycle: CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
     ) -> list[tuple[Updates, Indices]]:
-        """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
+        """Return the whole cycles and the orphans of a batch; keep rows that may become whole for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
         pairs = cycle.find(entry, kind, wire["payload"], time_ns, is_module, severed)
         if len(pairs.waiting):
@@ -256,23 +255,23 @@ class Decoder:
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
 
     def _count_haste(self, soon: Indices, whole: Indices) -> None:
-        """A patch whose frames always come too soon is not shown at all: say why, once.
+        """Count frames that come too soon: a patch that always sends such frames is not shown, and a warning says why.
 
         Args:
-            soon: modules whose frames did.
+            soon: modules whose frames came too soon.
             whole: modules of which whole cycles came.
         """
         haste = self.haste
         haste += np.bincount(self._module_patch[soon], minlength=self._n_patches)
         haste[self._module_patch[whole]] = np.minimum(haste[self._module_patch[whole]], 0)
-        self.tell_of_haste()
+        self.warn_of_haste()
 
-    def tell_of_haste(self) -> None:
+    def warn_of_haste(self) -> None:
         for patch in np.flatnonzero(self.haste > _MUCH_HASTE).tolist():
             self.haste[patch] = _NEVER_AGAIN
             log.warning(
-                "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
-                " apart and are not shown; give the driver the right period (period_ms, period_s); logged once",
+                "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be"
+                " distinguished and are not shown; give the driver the right period (period_ms, period_s); logged once",
                 self.tables.structure.patch_name[patch].decode(),
             )
 
@@ -308,7 +307,7 @@ class Decoder:
     def _count_unreadable(
         self, batch: FrameBatch, rows: Indices, module: Indices, unreadable: Indices, whole: Flags
     ) -> Flags:
-        """(n,) which updates are still whole, without those frames; their partners are orphans now."""
+        """Return (n,) which updates are still whole without those frames; their partners become orphans."""
         spoilt, n_frames = np.unique(unreadable, return_counts=True)
         bus = batch.bus[batch.start + rows[unreadable, 0]]
         self.state.bus_counters[:, 2] += np.bincount(bus, minlength=len(self.state.bus_counters))
@@ -325,8 +324,3 @@ class Decoder:
         if sequence is not None and len(module):
             for counter, found in enumerate(self.sequences.compare(sequence, payload, module), start=3):
                 self.state.patch_counters[:, counter] += found
-
-    def _no_updates(self) -> Updates:
-        empty, none = np.zeros((0, self.compiled.width), np.int64), np.zeros(0, np.int64)
-        groups = np.zeros((0, self.compiled.most_groups), np.int64)
-        return Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)

@@ -1,4 +1,4 @@
-"""One kind of frame, compiled: from payloads to values and flags, for whole batches."""
+"""Read values and flags from the payloads of one kind of frame, for whole batches."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ Words = npt.NDArray[np.uint64]
 
 
 class FrameKind:
-    """What the frames of one kind say, and whose they are.
+    """One kind of frame, compiled.
 
     Attributes:
         frame: the declaration.
         channels: (width,) int64, channel of each value; -1 = dropped.
-        carries: the channels of which its frames can have values.
-        module_by_byte: (n_patches, keys) module that a payload byte names, None if the identifier does.
+        carries: the channels for which its frames can have values.
+        module_by_byte: (n_patches, keys) module that a payload byte names; None: the identifier names it.
     """
 
     def __init__(self, frame: Frame, tables: SkinTables) -> None:
         self.frame = frame
-        self._told = False
+        self._is_logged = False
         self._dtype = tables.structure.dtype
         n_channels = tables.channel_to_sensor.shape[1]
         self._n_modules = tables.structure.n_modules
@@ -53,7 +53,7 @@ class FrameKind:
         self.carries: frozenset[int] = frozenset(self.channels[self.channels >= 0].tolist() if to is None else to)
 
     def name_modules(self, entry: Indices, payload: Bytes) -> Indices:
-        """(n,) entries in which "some module of this patch" became the module that the payload names."""
+        """Return (n,) entries in which "some module of this patch" is replaced by the module that the payload names."""
         bits = self.frame.module_byte
         if self.module_by_byte is None or bits is None or bits.byte is None:
             return entry
@@ -62,7 +62,7 @@ class FrameKind:
         return np.where(found >= 0, found, entry)
 
     def read(self, payload: Bytes) -> npt.NDArray[Any]:
-        """(n, width) values of n frames, in the frame's own dtype, if it says where they are.
+        """Return (n, width) values of n frames, in the frame's own dtype.
 
         Args:
             payload: (n, size) uint8.
@@ -71,7 +71,7 @@ class FrameKind:
         return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1)
 
     def expand(self, expand: Expand, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], Flags, Indices]:
-        """The values of n frames, if a function of the driver's author tells them.
+        """Return the values of n frames that a function of the driver's author reads.
 
         Args:
             expand: the frame's.
@@ -87,20 +87,20 @@ class FrameKind:
             return values, found, np.zeros(0, np.int64)
         try:
             values, found = self._expand(expand, payload, length)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever it stumbles over
-            if not self._told:
-                self._told = True
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - it costs only the frame
+            if not self._is_logged:
+                self._is_logged = True
                 log.error(
                     "frame %r: its Expand function raised %s: %s (%s:%d); frames for which it does are not shown, and"
                     " counted as bad content; logged once",
                     self.frame.name,
                     type(error).__name__,
-                    str(error),  # whoever keeps the record does not keep what the traceback refers to
+                    str(error),  # so that a kept record refers to no frame of the traceback
                     *traceback.extract_tb(error.__traceback__)[-1][:2],
                 )
         else:
             return values, found, np.zeros(0, np.int64)
-        # the others need not suffer from it
+        # the other frames are read one by one
         for row in range(len(payload)):
             one = slice(row, row + 1)
             try:
@@ -128,7 +128,7 @@ class FrameKind:
     def flag(
         self, payload: Bytes, length: Bytes, raw: npt.NDArray[Any], status: Bytes, columns: slice, channels: Indices
     ) -> None:
-        """Set the status bits that n frames ask for.
+        """Set the status bits of n frames.
 
         Args:
             payload: (n, size) uint8.
@@ -140,8 +140,12 @@ class FrameKind:
         """
         words: dict[tuple[int, str, int], tuple[Indices, Words]] = {}  # several flags share one
         for flag in self.frame.flags:
-            if isinstance(flag, Sentinel | Above):
-                status[:, columns] |= np.where(_hit(flag, raw), np.uint8(flag.status), np.uint8(0))
+            if isinstance(flag, Above):
+                status[:, columns] |= np.where(raw > flag.limit, np.uint8(flag.status), np.uint8(0))
+                continue
+            if isinstance(flag, Sentinel):
+                is_none = np.isnan(raw) if flag.value != flag.value else raw == flag.value
+                status[:, columns] |= np.where(is_none, np.uint8(flag.status), np.uint8(0))
                 continue
             if isinstance(flag, StatusBytes):
                 end = flag.offset + raw.shape[1]
@@ -165,16 +169,8 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
     return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
 
 
-def _hit(flag: Sentinel | Above, raw: npt.NDArray[Any]) -> Flags:
-    if isinstance(flag, Above):
-        above: Flags = raw > flag.limit
-        return above
-    equal: Flags = np.isnan(raw) if flag.value != flag.value else raw == flag.value
-    return equal
-
-
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, Words]:
-    """The frames in which a flag's word is there and not normal (few, as a rule), and in which bits it is not."""
+    """Return the frames in which a flag's word is present and not normal (usually few), and the bits that differ."""
     dtype = np.dtype(flag.dtype)
     end = flag.offset + dtype.itemsize
     if end > payload.shape[1]:
@@ -209,7 +205,7 @@ def _unpack(data: Bytes, count: int, packed: Packed) -> Indices:
 
 
 class Assembly:
-    """The frames that together make one update of a module, and where their values go.
+    """The frames that together make one update of a module, and the sensors of their values.
 
     Args:
         kinds: the frames, in the order of the cycle.
@@ -244,19 +240,18 @@ class Assembly:
         values: npt.NDArray[Any],
         status: Bytes,
     ) -> tuple[Indices, Indices]:
-        """Read n updates.
+        """Read the values and flags of n updates.
 
         Args:
             wire: the batch.
             rows: (n, members) rows of it.
             module: (n,) module of each.
-            orphans: those of the n that are not whole: they go nowhere and flag nothing.
+            orphans: those of the n that are not whole: their values have no sensor and no flag.
             values: (n, width), filled in.
             status: (n, width) uint8, all zero; flags are set in it.
 
         Returns:
-            (n, width) int64: the sensor that each value belongs to; and for each frame that cannot be read after
-            all, the update that it belongs to.
+            (n, width) int64: the sensor of each value; and for each frame that cannot be read, its update.
         """
         sensors = self.destination[module]
         unreadable = orphans[:0]

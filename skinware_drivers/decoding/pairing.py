@@ -1,39 +1,125 @@
-"""Join the frames of a cycle to updates, in order or by a counter."""
+"""Join the frames of a cycle into updates, in order or by a counter; without a counter, by their punctuality."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
-from skinware_drivers.decoding.punctuality import Punctuality
-from skinware_drivers.decoding.sequences import read_numbers
 from skinware_drivers.description import SkinTables
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.layout import Cycle, Frame
-from skinware_drivers.numbering import SequenceNumber
 
 Indices = npt.NDArray[np.int64]
 Places = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 Groups = npt.NDArray[np.uint16]
+Bytes = npt.NDArray[np.uint8]
+
+_NEVER_NS = -(1 << 62)
+_MARGIN = 8
+"""One part in so many of the time by which a frame may be early or late is left for the spacing inside a cycle."""
+
+
+class Judgement(NamedTuple):
+    """How frames come, compared with those of their kind before.
+
+    Attributes:
+        soon: (m,) bool: within the maximum age of the one before.
+        held_up: (m,) bool: too late for that.
+        doubtful: (m,) bool: held up, or after one that was lost.
+        spacing_ns: (m,) int64, time since the frame of the same kind before.
+    """
+
+    soon: Flags
+    held_up: Flags
+    doubtful: Flags
+    spacing_ns: Indices
+
+
+class Punctuality:
+    """When each kind of frame of each module came last, and how long after the one before.
+
+    Two halves of different cycles come within the maximum age of each other only if the first was held up by at least a
+    period minus that age. So each frame is judged by the time since the frame of its kind before:
+
+    * within the maximum age: the sender catches up, and two of its cycles fit into that age;
+    * about a period: in time, up to the delay that such a half would need;
+    * about two or more periods: frames before were lost, or this one was held up;
+    * otherwise: this one was held up.
+
+    Frames are a cycle if none comes soon or was held up, and at least one comes in time. (If the order is not given,
+    all must come in time: there, the end of a cycle and the beginning of the next look like one.)
+
+    Args:
+        cycle: of the frames.
+        period_s: nominal time from one cycle of a module to the next; a module may always be slower.
+        n_modules: number of modules.
+    """
+
+    def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
+        self._n = len(cycle.members)
+        self.all_as_they_should = cycle.order != "given"
+        self.period_ns = round(period_s * NS_PER_S)
+        self.reach_ns = round(cycle.reach_s * NS_PER_S)
+        self.margin_ns = (self.period_ns - self.reach_ns) // _MARGIN
+        self.soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self.margin_ns
+        self.last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
+        self.spacings_ns = np.full(n_modules * self._n, self.period_ns, np.int64)
+
+    def judge(self, kind: Indices, time_ns: Indices) -> Judgement:
+        """Judge frames.
+
+        Args:
+            kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
+            time_ns: (m,) stamps.
+        """
+        order = np.argsort(kind, kind="stable")
+        kind, time_ns = kind[order], time_ns[order]
+        follows = np.flatnonzero(kind[1:] == kind[:-1]) + 1
+        before_ns, usual_ns = self.last_ns[kind], self.spacings_ns[kind]
+        before_ns[follows] = time_ns[follows - 1]
+        spacing_ns = time_ns - before_ns
+        spacing_ns[before_ns == _NEVER_NS] = self.period_ns
+        usual_ns[follows] = spacing_ns[follows - 1]
+        soon = spacing_ns <= self.soon_ns
+        late = spacing_ns >= 2 * np.maximum(usual_ns, self.period_ns) - self.reach_ns - self.margin_ns
+        held_up = late
+        if not self.all_as_they_should and late.any():
+            beside_ns = np.abs((spacing_ns + self.period_ns // 2) % self.period_ns - self.period_ns // 2)
+            held_up = late & (2 * beside_ns >= self.period_ns - self.reach_ns)
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
+
+    def remember(self, kind: Indices, time_ns: Indices, spacing_ns: Indices) -> None:
+        """Remember frames that came in this order and are not judged again."""
+        self.spacings_ns[kind] = spacing_ns
+        self.last_ns[kind] = time_ns
+
+    def forget(self, modules: Indices) -> None:
+        kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
+        self.last_ns[kinds] = _NEVER_NS
+        self.spacings_ns[kinds] = self.period_ns
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """What became of the members of a cycle in one batch.
+    """The members of a cycle in one batch: whole cycles, orphans, and frames that wait.
 
     Attributes:
         rows: (n, members) rows of whole cycles, in the order of the members; or all the same row, of an orphan: a
             frame that will never be part of a cycle. In order of arrival of the last row of each.
         whole: (n,) bool, which of them are whole.
-        late: first rows of cycles that took too long, or came out of the device's rhythm (their rows are orphans too).
+        late: first rows of cycles that took too long, or broke the device's rhythm (their rows are orphans too).
         waiting: rows that may become a cycle with what comes next, ascending.
-        soon: rows that came too soon after those before them to be told from them (orphans too).
+        soon: rows that came too soon after those before them to be distinguished (orphans too).
     """
 
     rows: Indices
@@ -47,9 +133,9 @@ class Pairing:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: what makes one.
+        cycle: its declaration.
         places: (256,) place in the cycle of each kind of frame; ``n`` = not a member.
-        punctuality: for cycles without a counter, what tells them apart; None: nothing does but order and age.
+        punctuality: separates cycles without a counter; None: only order and age do.
     """
 
     def __init__(self, cycle: Cycle, places: Places, punctuality: Punctuality | None = None) -> None:
@@ -65,9 +151,9 @@ class Pairing:
         """Find the members of cycles that follow each other without another frame of their group in between.
 
         Args:
-            shared: (m,) what the members of a cycle have in common, where ``is_module``: the module; with a counter,
-                the module and its number together.
-            group: (m,) what frames must follow each other in: the patch, or the module.
+            shared: (m,) equal for the members of a cycle, where ``is_module``: the module; with a counter, the module
+                and its number together.
+            group: (m,) the patch, or the module, in which frames must follow each other.
             kind: (m,) kind of each frame.
             time_ns: (m,) stamps.
             is_module: (m,) bool: the frame is one of a known module.
@@ -122,7 +208,7 @@ class Pairing:
         return Pairs(rows, by_arrival < len(last), order[late], np.sort(order[waiting]), order[soon & is_orphan])
 
     def _find_begun(self, shared: Indices, place: Places) -> Flags:
-        """(m,) bool: right before a member stand all those that come before it in the given order."""
+        """Return (m,) bool: all members that precede this one in the given order stand right before it."""
         at = np.arange(len(place))
         follows = np.zeros(len(place), bool)
         follows[1:] = (place[1:] == place[:-1] + 1) & (shared[1:] == shared[:-1])
@@ -130,7 +216,7 @@ class Pairing:
         return (place < self._n) & (at - place >= chain)
 
     def _trust(self, starts: Indices, out_of_time: Flags, doubtful: Flags) -> tuple[Indices, Indices]:
-        """Of the cycles that begin there, those that can be trusted; and those whose frames came out of time."""
+        """Divide cycles, given by their first rows, into trusted ones and those whose frames came out of time."""
         out, doubts = (np.append(0, np.cumsum(flags)) for flags in (out_of_time, doubtful))
         untrusted = out[starts + self._n] > out[starts]
         untrusted |= doubts[starts + self._n] - doubts[starts] == self._n
@@ -139,10 +225,10 @@ class Pairing:
     def _find_cycles(
         self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags
     ) -> tuple[Indices, Indices]:
-        """First rows of runs of n frames that are a whole cycle, in an order that is not given; they can overlap.
+        """Return first rows of runs of n frames that are a whole cycle, if the order is not given; they can overlap.
 
         Returns:
-            Those that can be trusted; and those whose frames came out of time.
+            Trusted ones, and those whose frames came out of time.
         """
         n = self._n
         m = max(0, len(shared) - n + 1)
@@ -166,7 +252,7 @@ class Pairing:
         return np.array(chosen, np.int64)
 
     def _still_hoping(self, shared: Indices, place: Places, ends: Indices, used: npt.NDArray[np.bool_]) -> Indices:
-        """Rows at the end of each group that may become a cycle with what comes next, in an order that is not given."""
+        """Return rows at the end of each group that may become a cycle with the next frames, in any order."""
         n = self._n
         ends = ends[(place[ends] < n) & ~used[ends]]
         if not len(ends):
@@ -188,8 +274,6 @@ class Pairing:
         return np.flatnonzero(keep)
 
 
-Bytes = npt.NDArray[np.uint8]
-
 _COUNTER_BITS = 32
 _COUNTER_MASK = (1 << _COUNTER_BITS) - 1
 
@@ -198,7 +282,7 @@ class CompiledCycle:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: what makes one.
+        cycle: its declaration.
         frames: all kinds of frame.
         members: the numbers of its members among them, in order.
         assembly: reads them.
@@ -208,7 +292,7 @@ class CompiledCycle:
     Attributes:
         members: as given.
         assembly: as given.
-        sequence: of which member the sequence numbers are compared, and where they are; None: none has one.
+        sequence: the member whose sequence numbers are compared, and their place; None: there are none.
     """
 
     def __init__(
@@ -263,6 +347,6 @@ class CompiledCycle:
         return self.pairing.find(shared, self.group_of_entry[entry], kind, time_ns, is_module, severed)
 
     def forget(self, modules: Indices) -> None:
-        """These modules have restarted: their rhythm begins anew."""
+        """Forget the rhythm of modules that have restarted."""
         if self.punctuality is not None:
             self.punctuality.forget(modules)

@@ -1,4 +1,4 @@
-"""What is known of the skin right now, and the updates that change it."""
+"""The state of a skin, and the updates that change it."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from skinware.status import Status
 from skinware_drivers.description import SkinTables
 
 BUS_COUNTERS = ("unknown", "bad_length", "bad_content", "before_boot")
-"""Per bus: identifiers that are none of ours, wrong payload lengths, known identifiers with unknown content; frames
-stamped before this machine booted."""
+"""Per bus: frames with foreign identifiers, wrong lengths, or unknown contents; frames stamped before this machine
+booted."""
 PATCH_COUNTERS = ("updates", "orphans", "late", "sequence_lost", "sequence_repeated", "sequence_back")
-"""Per patch: module updates decoded; frames without their partners; of those, cycles whose frames came too late, or out
-of the device's rhythm; what sequence numbers skipped; how often one came again, and how often they went back (out of
-order, or a restart)."""
+"""Per patch: updates of modules; frames without partners; cycles whose frames came too late, or out of the device's
+rhythm; sequence numbers that were skipped, were repeated, or went back (out of order, or a restart)."""
 _PROMPT = 1.5
 """The longest period of a group that frames wait for, in periods of the driver."""
 
 
 @dataclass(slots=True)
 class Updates:
-    """New values of modules, in order of arrival; they hold no reference to the frames that they came from.
+    """New values of modules, in order of arrival; they hold no reference to their frames.
 
     Attributes:
         module: (n,) int64.
-        groups: (n, most) int64, update groups that each belongs to; ``n_groups``: none. The first stands for it.
+        groups: (n, most) int64, update groups of each; ``n_groups``: none. The first stands for the update.
         whole: (n,) bool; False: only a part was heard (an orphan), which shows nothing.
-        sensors: (n, width) int64, where the values go; ``n_sensors`` = nowhere.
+        sensors: (n, width) int64, the sensors of the values; ``n_sensors``: none.
         values: (n, width) of the structure's dtype.
-        status: (n, width) uint8, what the wire said of each.
+        status: (n, width) uint8, status bits from the wire.
         oldest_ns: (n,) int64, oldest stamp of the frames of each.
         newest_ns: (n,) int64, newest stamp of them.
         flagged: False: ``status`` is all zero.
@@ -58,7 +57,7 @@ class Updates:
         return self.groups[:, 0]
 
     def take(self, which: slice | npt.NDArray[Any]) -> Updates:
-        """Some of them."""
+        """Return some of the updates."""
         return Updates(
             self.module[which],
             self.groups[which],
@@ -73,7 +72,7 @@ class Updates:
 
     @staticmethod
     def join(parts: Sequence[Updates]) -> Updates:
-        """All of several, one after the other."""
+        """Return the updates of several objects, one after the other."""
         if len(parts) == 1:
             return parts[0]
         return Updates(
@@ -90,14 +89,14 @@ class Updates:
 
 
 class SkinState:
-    """What is known of the skin; copied into the ring at publication.
+    """Values, status and times of a skin; copied into the ring at publication.
 
-    Arrays have one element more than there are sensors, groups or patches: values that belong nowhere go there, which
-    is cheaper than to sort them out.
+    The arrays have one element more than there are sensors, groups or patches, for values without a sensor: that is
+    cheaper than to sort them out.
 
     Attributes:
         all_values: (n_sensors + 1,) of the structure's dtype.
-        all_status: (n_sensors + 1,) uint8, what the wire said of each sensor.
+        all_status: (n_sensors + 1,) uint8, status bits from the wire.
         all_group_time_ns: (n_groups + 1,) int64, oldest stamp among the frames shown for an update group; 0: never.
         all_updated: (n_groups + 1,) bool, shown since the last publication.
         all_touched: (n_groups + 1,) bool, heard since then, if only in part.
@@ -167,7 +166,7 @@ class SkinState:
         self._prompt_patch[:-1] = np.where(self.is_prompt, self.group_patch, self._structure.n_patches)
 
     def show(self, updates: Updates) -> None:
-        """Show updates. Of several for one module, the last one stays."""
+        """Show updates; if there are several of one module, the last one stays."""
         if not len(updates):
             return
         shown = np.where(updates.whole[:, None], updates.groups, self._structure.n_groups)
@@ -180,8 +179,3 @@ class SkinState:
         self.all_touched[updates.groups] = True
         self.all_patch_time_ns[self._prompt_patch[shown[:, 0]]] = updates.newest_ns
         self.newest_ns = max(self.newest_ns, int(updates.newest_ns[-1]))
-
-    def begin_frame(self) -> None:
-        """Forget what was shown since the last publication."""
-        self.updated[:] = False
-        self.touched[:] = False

@@ -1,4 +1,4 @@
-"""A decoder's layouts and tables, told to C."""
+"""Write the layouts and tables of a decoder into structs for C."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
 from skinware_drivers.decoding.pairing import CompiledCycle
+from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
 from skinware_drivers.native import structs
-from skinware_drivers.numbering import SequenceNumber
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _PACKED = len(_TYPES)
@@ -27,7 +27,7 @@ def check_values(frame: Frame) -> None:
     """Refuse values that the data path cannot read together.
 
     Raises:
-        ConfigurationError: the message says what to do.
+        ConfigurationError: the message has a remedy.
     """
     dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
     kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
@@ -44,7 +44,7 @@ def check_values(frame: Frame) -> None:
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
-    """Fill in what a plan says of frames and updates.
+    """Fill in the part of a plan that is about frames and updates.
 
     Raises:
         ConfigurationError: a frame has values that C does not read.
@@ -58,7 +58,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.value_type, plan.value_bytes = _type(structure.dtype)[0], structure.dtype.itemsize
     plan.width = compiled.width
 
-    plan.nobody = addresses.nobody
+    plan.nobody = addresses.foreign
     plan.entry, plan.candidates = arrays.at(addresses.entry), arrays.at(addresses.candidates)
     plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(compiled.payload_names)
     plan.n_forms, plan.forms = arrays.structs(structs.Form, (_form(form, arrays) for form in addresses.forms))
@@ -88,7 +88,9 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
             kind = kinds[member]
             kind.assembly, kind.place, kind.column = number, place, columns.start
             kind.cycle = number - len(assemblies) if number >= len(assemblies) else -1
-            _place_runs(kind, columns.start)
+            # columns of runs count from the beginning of the update, not of their frame
+            for run in (structs.Run * kind.n_runs).from_address(kind.runs):
+                run.column += columns.start
     plan.n_kinds, plan.kinds = arrays.structs(structs.Kind, kinds)
     plan.n_cycles, plan.cycles = arrays.structs(
         structs.Cycle,
@@ -113,7 +115,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
 
 
 def compile_batch(batch: FrameBatch, arrays: structs.Arrays) -> structs.Batch:
-    """A batch as it is now, whose memory ``arrays`` keep."""
+    """Return a batch as it is now; ``arrays`` keep its memory."""
     return structs.Batch(
         wire=arrays.at(batch.wire),
         time_ns=arrays.at(batch.time_ns),
@@ -129,7 +131,7 @@ def compile_batch(batch: FrameBatch, arrays: structs.Arrays) -> structs.Batch:
 
 
 def _type(dtype: Any) -> tuple[int, int]:
-    """Number of a dtype, and whether its bytes come in the other order."""
+    """Return the number of a dtype, and whether its bytes are swapped."""
     found = np.dtype(dtype)
     return _TYPES.index(found.str[1:]), found.str[0] == ">"
 
@@ -165,7 +167,10 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         (structs.ByteCondition(c.offset, c.mask, c.value) for c in frame.when if isinstance(c, Byte)),
     )
     kind.n_runs, kind.runs = arrays.structs(structs.Run, _runs(frame))
-    values = decoder.tables.structure.dtype if isinstance(frame.values, Expand) else _common(frame)
+    values = decoder.tables.structure.dtype
+    if not isinstance(frame.values, Expand):
+        dtypes = (np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs)
+        values = np.result_type(*dtypes)
     kind.n_flags, kind.flags = arrays.structs(structs.Flag, (_flag(flag, values, arrays) for flag in frame.flags))
     bits, table = frame.module_byte, compiled.module_by_byte
     if bits is not None and bits.byte is not None and table is not None:
@@ -173,10 +178,6 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         kind.key_mask, kind.n_keys, kind.module_by_key = (1 << bits.width) - 1, table.shape[1], arrays.at(table)
     kind.sequence = _number(frame.sequence)
     return kind
-
-
-def _common(frame: Frame) -> np.dtype[Any]:
-    return np.result_type(*(np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs))
 
 
 def _runs(frame: Frame) -> list[structs.Run]:
@@ -190,13 +191,6 @@ def _runs(frame: Frame) -> list[structs.Run]:
             runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
         column += run.count
     return runs
-
-
-def _place_runs(kind: structs.Kind, column: int) -> None:
-    """Columns of runs count from the beginning of the update, not of their frame."""
-    runs = (structs.Run * kind.n_runs).from_address(kind.runs)
-    for run in runs:
-        run.column += column
 
 
 def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:

@@ -1,4 +1,4 @@
-"""A driver's configuration file: TOML into checked structs; an unknown key is refused with the nearest right one.
+"""Read a driver's configuration file: TOML into checked structs; the nearest name is suggested for an unknown key.
 
 ::
 
@@ -28,13 +28,13 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
 from skinware.toml_text import Keys, TomlText, wrong_value
-from skinware_drivers.options.texts import is_file, nearest_name, options_from_strings
+from skinware_drivers.options.declared import is_file, nearest_name, options_from_strings
 
 T = TypeVar("T", bound=msgspec.Struct)
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One bus: its name (as ``--bus`` takes it), and driver options that hold for it alone."""
+    """One bus: its name (as ``--bus`` takes it), and the options that apply to it alone."""
 
     name: str
     options: dict[str, Any] = {}
@@ -48,13 +48,13 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole file.
 
     Attributes:
-        driver: name of one that is registered, or a file ``./my_skin.py`` with one, by its path from this file on.
-        wait: for a bus to appear, if there is none at the start.
-        publish: when frames are published: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
-        latency_ms: the longest that frames may wait so that more are taken with them, 0 to 1000; None for the default.
+        driver: name of a registered driver, or a file ``./my_skin.py``, relative to this file.
+        wait: if no bus is available at the start, wait for one.
+        publish: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
+        latency_ms: longest time that frames may wait so that more are taken with them, 0 to 1000; None: the default.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
-        geometry: file with the places of the sensors, by its path from this file on; empty: they are not published.
+        geometry: file with the positions of the sensors, relative to this file; empty: they are not published.
     """
 
     driver: str = ""
@@ -70,21 +70,21 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bus: tuple[BusConfig, ...] = ()
 
     def __post_init__(self) -> None:
-        # refused here, the message names the file
+        # refused here, so that the message names the file
         Profile.from_text("normal" if self.realtime is None else self.realtime, cpus=self.cpus)
 
 
 class ConfigFile:
-    """A configuration file, or none; its mistakes are told with file, line and key.
+    """A configuration file, or none; errors name file, line and key.
 
     Args:
-        path: of the file; None: everything has its default.
+        path: of the file; None: all settings have their defaults.
 
     Attributes:
-        settings: what it says.
+        settings: its contents.
 
     Raises:
-        ConfigurationError: not there, not TOML, or a key or value that is wrong.
+        ConfigurationError: there is no such file, it is no TOML, or a key or value is wrong.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -113,13 +113,13 @@ class ConfigFile:
         given: Mapping[str, str] | None = None,
         usual: Mapping[str, Any] | None = None,
     ) -> T:
-        """A driver's options for one bus: what is given as text beats the bus' own, they beat the common ones.
+        """Return a driver's options for one bus: given texts override the bus' own options, these the common ones.
 
         Args:
             struct: the driver's ``Options``.
-            bus_name: as it stands in the file.
-            given: ``key=value`` texts, say of a command line.
-            usual: what holds where nothing else does, instead of the defaults.
+            bus_name: as in the file.
+            given: texts by name of option, as of a command line.
+            usual: values that replace the defaults.
 
         Raises:
             ConfigurationError: an unknown option or a wrong value.
@@ -154,7 +154,7 @@ class ConfigFile:
 
 
 class _Wrong(Exception):
-    """What is wrong, and with which key."""
+    """A mistake, and the key that has it."""
 
     def __init__(self, text: str, keys: Keys) -> None:
         super().__init__(text)

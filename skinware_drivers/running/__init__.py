@@ -1,1 +1,1 @@
-"""A driver at work: buses opened, lost and found again, frames taken, decoded and published at the right moments."""
+"""Run a driver: open its buses, take and decode frames, publish snapshots when they are due."""

@@ -24,24 +24,26 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _STOP_TIMEOUT_S = 0.8
+_CHECK_PAUSE_NS = NS_PER_S // 2
 _NEVER_NS = 1 << 63
 
 
 class BusCondition:
-    """What a bus is doing, and whether frames come; changes are logged.
+    """The state of a bus; changes are logged.
 
     Args:
         name: of the bus, for people.
         bus: the bus.
 
     Attributes:
-        state: what the bus is doing.
-        reason: why, or what is wrong with it although frames come.
+        state: live, silent, down ...
+        reason: of the state, or of trouble although frames come.
         since_ns: when both became so, CLOCK_MONOTONIC ns.
         heard_ns: when the bus last delivered frames.
+        checked_ns: when the bus was last asked whether it is still there.
         speaks_from_ns: from when on its devices send of themselves; before, they only answer.
-        limits: how close the bus is to what it can carry.
-        news: what is logged of it.
+        limits: how close the bus is to its limits.
+        news: logs changes.
     """
 
     def __init__(self, name: str, bus: Bus) -> None:
@@ -51,6 +53,7 @@ class BusCondition:
         self.since_ns: int = now_ns()
         self.heard_ns: int = 0
         self.speaks_from_ns: int = 0 if bus.listen_only else _NEVER_NS
+        self.checked_ns: int = 0
         self._has_spoken = False
         self.limits: BusLimits = BusLimits(name, bus)
         self.news: BusNews = BusNews()
@@ -115,9 +118,9 @@ class BusLine:
     Attributes:
         link: handshakes on it.
         connection: whether it is open.
-        condition: what it is doing.
-        patches: what was found on it, None until it was asked.
-        patch_news: which of its patches fell silent, or are live again.
+        condition: its state.
+        patches: found on it, None until it was asked.
+        patch_news: logs which of its patches fell silent, or are live again.
         suspects: keys of the patches that report errors.
         started: its devices may have begun to send.
         set_up_ns: when all of it was last set up, CLOCK_MONOTONIC ns.
@@ -147,13 +150,13 @@ class BusLine:
 
     @property
     def geometry(self) -> Geometry | None:
-        """Where the sensors on it are: what the bus knows, or else its driver."""
+        """Positions of the sensors on it: those that the bus knows, or else its driver."""
         of_bus = self.bus.geometry
         return self.adapter.geometry if of_bus is None else of_bus
 
     @property
     def losses(self) -> tuple[int, ...]:
-        """Changes whenever frames are known to be lost: dropped, not received by the controller, or not heard."""
+        """Numbers that change whenever frames are known to be lost: dropped, or not received."""
         counters = self.bus.counters
         return counters.lost, counters.overflows, counters.bus_offs, self.connection.opened_ns
 
@@ -218,20 +221,22 @@ class BusLine:
 
     def _check(self) -> None:
         """Ask a bus that is not in order whether it is still there, now and then."""
-        if self.connection.lost.is_set() or not self.connection.is_check_due():
+        time_ns = now_ns()
+        if self.connection.lost.is_set() or time_ns - self.condition.checked_ns < _CHECK_PAUSE_NS:
             return
+        self.condition.checked_ns = time_ns
         try:
             self.bus.check()
         except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)
             self.lose("check", error)
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
-        """Ask what is attached to it, for as long as it takes.
+        """Ask for the patches on the bus until there are some.
 
         Args:
             described: called after every answer, also after an empty one.
         """
-        told, attempts = False, _attempts()
+        is_logged, attempts = False, _attempts()
         while True:
             await asyncio.sleep(attempts.next_s())
             if self.connection.lost.is_set():
@@ -240,20 +245,20 @@ class BusLine:
             try:
                 with hook("describe", self.name):
                     found = are_patches(await self.adapter.describe(self.link))
-                why = "no patch is heard, and nobody may be asked" if self.bus.listen_only else "no patch answers"
+                why = "no patch is heard, and no device may be asked" if self.bus.listen_only else "no patch answers"
             except BusError as error:
                 why = str(error)
                 self._check()
-            self.patches = found or self.patches or ()  # what was known of a bus that was set aside stays
+            self.patches = found or self.patches or ()  # those of a bus that was set aside stay
             await described()
             if found:
                 return
-            if not told:
+            if not is_logged:
                 log.warning("%s: %s; waiting for one to appear", self.name, why)
-                told = True
+                is_logged = True
 
     async def set_up(self) -> None:
-        """Set its devices up and make them send, for as long as it takes."""
+        """Set its devices up and start them, until that succeeds."""
         attempts = _attempts()
         while True:
             await asyncio.sleep(attempts.next_s())
@@ -291,7 +296,7 @@ class BusLine:
         self.condition.become(BusState.GONE, BusReason.REMOVED)
 
     async def set_aside(self, error: Exception) -> None:
-        """Stop its devices and close it, because the driver's own code failed on it; ``reopen`` opens it again."""
+        """Stop its devices and close it after a failure of the driver's own code; ``reopen`` opens it again."""
         with contextlib.suppress(DriverError):  # which failed already
             await self.stop()
         self._drop()
@@ -300,7 +305,7 @@ class BusLine:
         self.condition.news.log(f"{error}; bus {self.name} is set aside, and tried again later")
 
     async def stop(self) -> None:
-        """Make its devices silent, if they may have been told to send and it can be done now.
+        """Stop its devices, if they may send and the bus is open.
 
         Raises:
             DriverError: the driver's own code failed.
@@ -318,14 +323,14 @@ class BusLine:
 
 
 async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
-    """Open what is there, all at once: one that takes its time holds up no other. Those that are not are waited for.
+    """Open all available buses at once: a slow one holds up no other. The others are waited for.
 
     Args:
         lines: all buses of a driver.
-        wait_for_one: also if not one is there.
+        wait_for_one: wait also if none is available.
 
     Raises:
-        BusNotAvailable: not one is there, or this user may not open one.
+        BusNotAvailable: none is available, or this user may not open one.
         ConfigurationError, PlatformError: one can never be opened like this.
     """
     opened = await asyncio.gather(*(line.open() for line in lines), return_exceptions=True)
@@ -342,10 +347,10 @@ async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
 
 
 def are_patches(found: Iterable[object]) -> Sequence[Patch]:
-    """What ``describe`` or ``join`` of an adapter returned.
+    """Return the patches that ``describe`` or ``join`` of an adapter returned.
 
     Raises:
-        TypeError: these are no patches.
+        TypeError: they are no patches.
     """
     patches = []
     for patch in found:

@@ -1,4 +1,4 @@
-"""Where user programs' requests to a running driver are answered."""
+"""Answer the requests of programs to a running driver."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import Ending, hook
-from skinware_drivers.running.publisher import NOBODY_WAITS
+from skinware_drivers.running.publisher import NEVER_NS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -24,14 +24,14 @@ Changed = Callable[[BusLine, Sequence[Patch], bool], object]
 
 
 class RequestDesk:
-    """Carries out operations on the buses, and remembers who waits for a frame.
+    """Carries out operations on the buses, and answers requests for new snapshots.
 
     Args:
-        server: where requests come from.
+        server: of the requests.
         lines: the driver's buses.
         listen_only: nothing may be sent: operations are refused.
-        changed: called after an operation with its bus, its patches, and whether it set them up anew.
-        ending: of the driver, for errors that are no fault of an operation.
+        changed: called after an operation with its bus, its patches, and whether it set them up again.
+        ending: of the driver; errors outside of an operation end it.
     """
 
     def __init__(
@@ -64,15 +64,15 @@ class RequestDesk:
 
     @property
     def wanted_ns(self) -> int:
-        """The oldest data that is new enough for one of those who wait, CLOCK_MONOTONIC ns; far ahead: nobody does."""
-        return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=NOBODY_WAITS)
+        """The oldest data that is new enough for a waiting request, CLOCK_MONOTONIC ns; far ahead: none waits."""
+        return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=NEVER_NS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
-        """A frame was published: answer those who waited for it.
+        """Answer the requests that waited for a snapshot that was published.
 
         Args:
-            oldest_ns: of the data that is new in it, CLOCK_MONOTONIC ns.
-            position: of the frame.
+            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
+            position: of the snapshot.
         """
         answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
         self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
@@ -80,7 +80,7 @@ class RequestDesk:
             request.reply(position=position)
 
     async def close(self) -> None:
-        """Give up what is under way; those who asked see the driver hang up."""
+        """Cancel running operations; their callers see the driver hang up."""
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -102,11 +102,11 @@ class RequestDesk:
             *(self._on_bus(line, patches, request, does[line], arguments) for line, patches in meant),
             return_exceptions=True,
         )
-        failures = [
-            f"{line.name}: {_why(result)}"
-            for (line, _), result in zip(meant, results, strict=True)
-            if isinstance(result, BaseException)
-        ]
+        failures = []
+        for (line, _), result in zip(meant, results, strict=True):
+            if isinstance(result, BaseException):
+                is_known = isinstance(result, BusError | ConfigurationError | ValueError)
+                failures.append(f"{line.name}: {result if is_known else f'{type(result).__name__}: {result}'}")
         if failures:
             request.fail(f"{request.operation}: {'; '.join(failures)}")
         else:
@@ -124,7 +124,7 @@ class RequestDesk:
                 with hook(request.operation, line.name):
                     result = await job.operation.method(job.doer, line.link, patches, **arguments)
             except DriverError as error:
-                if not isinstance(error.__cause__, ValueError):  # which says that the arguments make no sense
+                if not isinstance(error.__cause__, ValueError):  # raised for arguments that make no sense
                     log.warning("%s", str(error))
                 raise error.__cause__ if isinstance(error.__cause__, Exception) else error from None
         try:
@@ -149,7 +149,7 @@ class RequestDesk:
 
 
 class _Job(NamedTuple):
-    """Who does an operation on one bus: the driver's object for it, or the bus itself."""
+    """An operation on one bus, done by the driver's object or by the bus itself."""
 
     doer: object
     operation: Operation
@@ -171,9 +171,3 @@ def offered(lines: Sequence[BusLine]) -> dict[str, Callable[..., Any]]:
     for line in lines:
         declared |= _declared(type(line.bus)) | _declared(type(line.adapter))
     return {name: operation.method for name, operation in sorted(declared.items())}
-
-
-def _why(error: BaseException) -> str:
-    if isinstance(error, BusError | ConfigurationError | ValueError):
-        return str(error)
-    return f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""What belongs to one structure of a driver's skin: tables, decoder, batch, watch and publisher, made together."""
+"""One structure of a driver's skin in service: its tables, decoder, batch, watch and publisher."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import DataPath, PatchState
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import FrameBatch, is_read_natively
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import hook
@@ -63,12 +62,12 @@ class Generation:
 
     Attributes:
         lines: the buses; the list may change, their places do not.
-        decoder: frames to updates.
+        decoder: turns frames into updates.
         watch: marks doubtful modules.
-        publisher: updates to frames in the ring.
-        period_s: nominal time between two updates that the publisher counts on.
-        batch: what buses fill.
-        begun_ns: when it began.
+        publisher: turns updates into snapshots.
+        period_s: nominal time between two updates, for the publisher.
+        batch: filled by the buses.
+        begun_ns: when it began, CLOCK_MONOTONIC ns.
         path: decodes and publishes.
         flows: C reads the buses that it can read (see ``running.flow``).
     """
@@ -105,18 +104,18 @@ class Generation:
         return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:
-        """Return the batch, with nothing in it but frames that wait for their partners."""
+        """Return the batch, empty except for frames that wait for their partners."""
         self.path.empty()
         return self.batch
 
     def digest(self, _batch: FrameBatch) -> None:
-        """Decode the batch, and publish what is due."""
+        """Decode the batch, and publish snapshots that are due."""
         self.update_bus_states(settled=now_ns() >= self._look_ns)
         self.announce_waits()
         self.path.digest(self.interrupted())
 
     def announce_waits(self) -> None:
-        """Say which frames are waited for; before each call of C."""
+        """Set the frames that handshakes wait for; before each call of C."""
         expects_data = any(line.link.expects_data for line in self.lines)
         self.path.announce_waits(expects_data, [wanted for line in self.lines for wanted in line.link.awaited])
 
@@ -125,18 +124,18 @@ class Generation:
             line.link.hear(self.batch, own)
 
     def _offer(self, rows: Rows) -> Rows:
-        """Show rows that are of no module to those who wait; those that nobody waited for."""
+        """Give rows that are of no module to the handshakes that wait; return the rest."""
         by_bus = split_by_bus(self.batch, rows, len(self.lines))
         return np.concatenate([line.link.offer(self.batch, own) for line, own in zip(self.lines, by_bus, strict=True)])
 
     def interrupted(self) -> list[int]:
-        """Buses that are known to have lost frames since this was last asked."""
+        """Return the buses that are known to have lost frames since the last call."""
         losses = {line.ordinal: line.losses for line in self.lines}
         before, self._known_losses = self._known_losses, losses
         return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]
 
     def update_bus_states(self, settled: bool = True) -> None:
-        """Tell the publisher what the buses do.
+        """Publish the states of the buses.
 
         Args:
             settled: look also at buses that were in order the last time.
@@ -167,7 +166,7 @@ class Generation:
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
     def note_patches(self) -> Iterator[PatchChange]:
-        """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
+        """Note changes of the patches' states, and the buses that need care; yield the changes that were logged."""
         now, before = self.publisher.patches.state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]

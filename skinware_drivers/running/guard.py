@@ -1,4 +1,4 @@
-"""What a failure costs, by one rule; and calls that are repeated, or that may hang.
+"""Decide what a failure costs, by one rule; repeat calls, and bear with calls that hang.
 
 * An ``Expand`` function fails: the frame is lost, and counted as bad content (``decoding.frame_kind``).
 * A device fails (``BusError`` or ``OSError`` in a hook): the attempt is repeated, for its patch or its bus.

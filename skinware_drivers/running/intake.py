@@ -1,4 +1,4 @@
-"""Takes frames from all buses of a driver: one epoll, one batch, every bus its share."""
+"""Take frames from all buses of a driver: one epoll, one batch, and a share for every bus."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from skinware_drivers.running.bus_line import BusLine
 
 _TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
 _REST, _REST_WHILE_ASKING, _REST_IN_STEP = 16, 4, 1
-"""After a take: so many times its duration, while more arrives (decision 0006)."""
+"""The rest after a take, as a multiple of its duration; more frames arrive meanwhile (decision 0006)."""
 _SHARE = 0.25
 _SHORTEST_S, _LONGEST_S = 0.001, 0.020
 
 
 def latency_for(period_s: float) -> float:
-    """The longest rest, s, of a driver whose patches send with this period, s: a quarter of it, 1 to 20 ms."""
+    """Return the longest rest, s, for patches that send with this period, s: a quarter of it, 1 to 20 ms."""
     return min(max(_SHARE * period_s, _SHORTEST_S), _LONGEST_S)
 
 
 class Intake:
-    """Wakes up when something has arrived, takes it, and then rests for a moment so that more comes together.
+    """Takes frames when some have arrived, and then rests for a moment so that more are taken together.
 
     Args:
         epoll: in which open buses are registered.
         lines: the buses; the list may change.
-        empty_batch: gives the batch to fill.
-        digest: gets it, filled.
+        empty_batch: returns the batch to fill.
+        digest: called with the filled batch.
         latency_s: the longest rest; may be changed.
-        guard: makes of a callback one that may fail in the event loop.
+        guard: makes a callback safe for the event loop (:meth:`.guard.Ending.guard`).
 
     Attributes:
-        read_until_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
+        read_until_ns: all frames that arrived until then were taken, CLOCK_MONOTONIC ns.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Intake:
             self._rest = None
 
     def take(self) -> Literal["nothing", "all", "some"]:
-        """Take what has arrived, now. ``some``: more is waiting."""
+        """Take the frames that have arrived; ``some``: more are waiting."""
         begun_ns = now_ns()
         for turn in range(_TURNS):
             time_ns = now_ns()
@@ -101,15 +101,15 @@ class Intake:
             asks = any(line.bus.asks for line in self._lines)
             factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
             if asks or any(link.expects_data for link in links):
-                factor = _REST_IN_STEP  # the answer alone is what comes, and then the next question
+                factor = _REST_IN_STEP  # only the answer comes, and then the next question
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> bool:
-        """Fill a batch from those buses that have something.
+        """Fill a batch from the buses that have frames.
 
         Returns:
-            Whether that was all: no bus had more than its share.
+            Whether no bus had more than its share.
         """
         ready = [line for fd in fds if (line := self._line_of(fd)) is not None]
         is_all, self.read_until_ns = True, time_ns

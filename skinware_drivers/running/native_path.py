@@ -1,4 +1,4 @@
-"""The data path in C for one generation: it decodes a batch and publishes what is due."""
+"""The data path in C for one generation: it decodes a batch and publishes snapshots that are due."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ import numpy as np
 
 from skinware.errors import PlatformError
 from skinware.realtime import now_ns
+from skinware.status import PatchState, Status
 from skinware_drivers import native
 from skinware_drivers.bus import Filter, FrameBatch
+from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch, compile_decoder
-from skinware_drivers.running.path_hooks import Listeners, PathHooks
-from skinware_drivers.running.path_plan import SKIPPED, compile_publisher
+from skinware_drivers.running.path_hooks import Listeners, PathHooks, SharedArrays
 from skinware_drivers.running.publisher import Publisher
 
 _real_now_ns = now_ns
+_SKIPPED = OWN_BUS_COUNTERS.index("updates_skipped")
 
 
 class _Calls(NamedTuple):
@@ -63,9 +65,9 @@ class NativePath:
     """Decodes and publishes, on the arrays of a decoder and a publisher.
 
     Args:
-        decoder: what frames mean, and what is known of the skin.
-        publisher: when snapshots are published, and what they say beside values.
-        batch: what buses fill.
+        decoder: compiled layouts, and the state of the skin.
+        publisher: the moments of publication, and the columns beside values.
+        batch: filled by the buses.
     """
 
     def __init__(self, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
@@ -73,7 +75,7 @@ class NativePath:
         self._arrays = arrays = structs.Arrays()
         self._plan, self._words, self._rows = structs.Plan(), structs.Words(), compile_batch(batch, arrays)
         compile_decoder(decoder, self._plan, arrays)
-        self._exchange = compile_publisher(publisher, self._plan, arrays)
+        self._exchange = _compile_publisher(publisher, self._plan, arrays)
         self._hooks = PathHooks(decoder, publisher, batch, self._rows, self._words, self._exchange)
         self._plan.hooks = self._hooks.table()
         self._words.on_request = publisher.on_request
@@ -92,15 +94,15 @@ class NativePath:
 
     @property
     def listeners(self) -> Listeners:
-        """What C calls in other parts of the driver."""
+        """Functions of other parts of the driver that C calls."""
         return self._hooks.listeners
 
     def announce_waits(self, expects_data: bool, awaited: Sequence[Filter]) -> None:
-        """Say which frames are waited for, before a call of C.
+        """Set the frames that coroutines wait for, before a call of C.
 
         Args:
             expects_data: a coroutine waits for a frame that may be data.
-            awaited: let the frames through that a coroutine waits for, of those that are of no module.
+            awaited: filters for awaited frames that are of no module.
         """
         self._words.expects_data = expects_data
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in awaited]
@@ -113,10 +115,10 @@ class NativePath:
         self._batch.start = self._batch.headroom - self._words.carried
 
     def digest(self, interrupted: Sequence[int] = ()) -> None:
-        """Decode the batch, and publish what is due.
+        """Decode the batch, and publish snapshots that are due.
 
         Args:
-            interrupted: buses of which it is known that they have lost frames since the last batch.
+            interrupted: buses that are known to have lost frames since the last batch.
         """
         self.interrupt(interrupted)
         self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
@@ -127,14 +129,14 @@ class NativePath:
             raise MemoryError("no memory for the updates of a driver")
 
     def interrupt(self, buses: Sequence[int]) -> None:
-        """Frames were lost on these buses: what waits for partners there is not joined with what comes now."""
+        """Never join frames that wait for partners on these buses with later ones: frames were lost between them."""
         self._exchange.interrupted[list(buses)] = True
 
     def publish_if_due(self, read_ns: int) -> None:
-        """Publish if the time has come, and nothing speaks against it.
+        """Publish a snapshot if it is due.
 
         Args:
-            read_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
+            read_ns: all frames that arrived until then were taken, CLOCK_MONOTONIC ns.
         """
         self._words.read_ns = max(self._words.read_ns, read_ns)
         self._enter()
@@ -145,7 +147,7 @@ class NativePath:
         """Let frames flow until Python has something to do.
 
         Returns:
-            Why it has: ``flow.c`` has the numbers.
+            The reason, as a number of ``flow.c``.
         """
         self._enter()
         result = int(self._calls.run(self._path, ctypes.byref(flow)))
@@ -153,17 +155,17 @@ class NativePath:
         return result
 
     def leave_soon(self) -> None:
-        """Have ``run`` come back after its first take."""
+        """Let ``run`` return after its first take."""
         self._words.must_leave = True
 
     @property
     def deadline_ns(self) -> int:
-        """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""
+        """The latest time of the next call of ``publish_if_due``, CLOCK_MONOTONIC ns."""
         return int(self._calls.deadline_ns(self._path))
 
     def _enter(self) -> None:
         counts = self._publisher.count_buses()
-        self._exchange.skipped_before[:] = counts[:, SKIPPED]
+        self._exchange.skipped_before[:] = counts[:, _SKIPPED]
         self._words.fixed_ns = 0 if now_ns is _real_now_ns else now_ns()
         self._words.wanted_ns = self._publisher.wanted_ns
         self._words.ring, self._words.sequence = self._publisher.writer.ring_address, self._publisher.writer.sequence
@@ -176,7 +178,45 @@ class NativePath:
         self._exchange.skipped[:] = 0
         if self._words.hastened:
             self._words.hastened = 0
-            self._decoder.tell_of_haste()
+            self._decoder.warn_of_haste()
         error, self._hooks.error = self._hooks.error, None
         if error is not None:
             raise error
+
+
+def _compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs.Arrays) -> SharedArrays:
+    """Fill in the part of a plan that is about publishing; return the arrays that both sides change."""
+    pauses, patches, buses, pace = publisher.pauses, publisher.patches, publisher.buses, publisher.pace
+    exchange = SharedArrays(publisher.watch, len(buses.counters))
+    plan.period_ns, plan.silence_ns, plan.patience_ns = pace.period_ns, pace.silence_ns, pace.patience_ns
+    plan.pause_ns, plan.idle_ns = pace.pause_ns, pace.idle_ns
+    plan.by_cycle, plan.most_at_once = publisher.by_cycle, publisher.writer.slots
+    plan.stale = int(Status.STALE)
+    plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
+    plan.burst_pause_ns = arrays.at(pauses.pause_ns)
+    plan.standing_out_ns, plan.gap_ns = arrays.at(pauses.standing_out_ns), arrays.at(pauses.gap_ns)
+    plan.is_prompt = arrays.at(publisher.state.is_prompt)
+    plan.group_heard_ns, plan.age_limit_ns = arrays.at(patches.group_heard_ns), arrays.at(patches.age_limit_ns)
+    plan.patch_heard_ns, plan.patch_state = arrays.at(patches.heard_ns), arrays.at(patches.state)
+    plan.patch_lives_until_ns = arrays.at(patches.lives_until_ns)
+    plan.module_status = arrays.at(exchange.module_status)
+    plan.module_untouched = arrays.at(exchange.module_untouched)
+    plan.bus_state, plan.bus_reason = arrays.at(buses.state), arrays.at(buses.reason)
+    plan.bus_since_ns, plan.bus_load = arrays.at(buses.since_ns), arrays.at(buses.load)
+    plan.bus_samples, plan.bus_samples_bytes = arrays.at(buses.samples), buses.samples.nbytes
+    plan.latency_ns, plan.data_path = arrays.at(publisher.latency_ns), arrays.at(publisher.data_path)
+    plan.bus_data_path = arrays.at(buses.data_path)
+    counts = publisher.count_buses()
+    plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
+    plan.skipped_column = _SKIPPED
+    for name in ("lost", "frames", "errors", "refused"):
+        setattr(plan, f"{name}_column", OWN_BUS_COUNTERS.index(name))
+    plan.bytes_column = OWN_BUS_COUNTERS.index("bytes_in")
+    plan.skipped, plan.skipped_before = arrays.at(exchange.skipped), arrays.at(exchange.skipped_before)
+    plan.interrupted = arrays.at(exchange.interrupted)
+    plan.sample_next_ns = arrays.at(exchange.sample_next_ns)
+    timing = publisher.timing
+    plan.timing, plan.timing_before_ns = arrays.at(timing.both), arrays.at(timing.before_ns)
+    for name, offset in publisher.writer.column_offsets().items():
+        setattr(plan.columns, name, offset)
+    return exchange

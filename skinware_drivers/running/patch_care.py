@@ -1,4 +1,4 @@
-"""Look after the patches of one bus: silent ones, restarted ones, and frames that no layout takes."""
+"""Look after the patches of one bus: silent ones, restarted ones, and frames that fit no layout."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from skinware.samples import Unused, sample_report, sample_text
 from skinware.status import PatchState
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, identifier_text
-from skinware_drivers.conditions import Byte
 from skinware_drivers.description import Patch
+from skinware_drivers.fields import Byte
 from skinware_drivers.layout import Frame, Layout
 from skinware_drivers.polling import Notice
 from skinware_drivers.running.bus_line import BusLine
@@ -24,15 +24,15 @@ from skinware_drivers.running.guard import Backoff, hook
 from skinware_drivers.running.news import TROUBLESHOOTING
 
 Sample = Mapping[str, Any]
-"""As :func:`skinware.samples.sample_report` tells it."""
+"""A sample of :func:`skinware.samples.sample_report`."""
 
 
 def why_unused(layout: Layout, bus: Bus) -> list[str]:
-    """Reasons, in a few words each; none if nothing is known.
+    """Return likely reasons why no data comes, in a few words each.
 
     Args:
         layout: of this bus.
-        bus: with samples of the frames that were not taken.
+        bus: with samples of the unused frames.
     """
     samples = sample_report(bus.samples.rows)
     reasons = _lengths(layout, samples)
@@ -61,7 +61,7 @@ def _lengths(layout: Layout, samples: Sequence[Sample]) -> list[str]:
 
 
 def _is_of(frame: Frame, sample: Sample) -> bool:
-    """Whether a frame of this kind can be what a sample is of, but for its length."""
+    """Return whether a sample can be a frame of this kind, but for its length."""
     identifier, data = _identifier(sample), bytes.fromhex(sample["data"])
     for condition in frame.when:
         if isinstance(condition, Byte):
@@ -73,7 +73,7 @@ def _is_of(frame: Frame, sample: Sample) -> bool:
 
 
 def _kinds_of_identifier(layout: Layout, samples: Sequence[Sample]) -> Iterator[str]:
-    """Identifiers of 29 bits where all that the layout has are of 11, or the other way round."""
+    """Yield advice for identifiers of 29 bits where all those of the layout have 11, or the other way round."""
     kinds = {frame.extended for frame in layout.frames}
     for sample in samples:
         if sample["why"] != Unused.UNKNOWN.name.lower() or len(kinds) > 1 or sample["extended"] in kinds:
@@ -99,8 +99,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
 _SURE_NS = NS_PER_S
-"""A patch that was live has to be silent for so long beyond its age limit before it may be set up: that moves the
-baseline of hardware that had not restarted."""
+"""A patch that was live must be silent for so long beyond its age limit before it may be set up, which moves the
+baseline of hardware that has not restarted."""
 _DATA_CHECKS_HZ = 100
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
@@ -108,7 +108,7 @@ Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
 
 class _SetUps:
-    """Set-ups of which nothing came, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s."""
+    """Set-ups without effect, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s."""
 
     def __init__(self) -> None:
         self.begun = 0
@@ -132,9 +132,9 @@ class PatchCare:
 
     Args:
         line: the bus.
-        generation: what is in service now, None before anything is.
+        generation: returns the generation in service; None: there is none yet.
         listen_only: nothing may be sent.
-        join: asks for the structure to be looked at again.
+        join: requests another look at the structure.
         beside: starts a task of the driver.
     """
 
@@ -156,7 +156,7 @@ class PatchCare:
         self._knows_only_all = self._revives_all and adapter.probe is Adapter.probe
         self._set_ups: dict[int, _SetUps] = {}  # by patch key, of those that answer and send nothing
         self._set_ups_of_all = _SetUps()
-        self._told = ""
+        self._logged = ""
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
     async def check_data(self) -> None:
@@ -181,9 +181,9 @@ class PatchCare:
             return
         silence_ns = generation.publisher.pace.silence_ns
         if now_ns() - max(line.connection.opened_ns, generation.begun_ns) < 2 * silence_ns:
-            return  # nobody listened, the boards may send: to set them up again would move their baseline
+            return  # unheard boards may send: to set them up again would move their baseline
         states = [PatchState.STALE, PatchState.EXPECTED]
-        if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
+        if now_ns() - line.revived_ns > 2 * silence_ns:  # set up again, without data since
             states.append(PatchState.RESTARTED)
         silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
         if self._knows_only_all:
@@ -195,7 +195,7 @@ class PatchCare:
                 await self._revive(patch, asked_ns)
 
     def _surely_silent(self, patches: Sequence[Patch]) -> list[Patch]:
-        """Those of which nothing came for long enough, while this process attended."""
+        """Return the patches that were silent for long enough, while this process ran."""
         line, generation = self._line, self._generation()
         if generation is None:
             return []
@@ -243,7 +243,7 @@ class PatchCare:
         return True
 
     def _may_set_up_all(self, silent: Sequence[Patch]) -> bool:
-        """Whether the whole bus is to be set up for silent patches: more and more rarely while that disturbs others."""
+        """Return whether to set up the whole bus for silent patches: less and less often while that disturbs others."""
         if not silent:
             self._set_ups_of_all = _SetUps()
             return False
@@ -255,10 +255,10 @@ class PatchCare:
         return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
-        """Hear what devices say of themselves, indefinitely.
+        """Listen to reports of devices about themselves, indefinitely.
 
         Args:
-            pause_s: what to wait after the bus failed.
+            pause_s: returns the pause after a failure of the bus, s.
         """
         adapter = self._line.adapter
         reviving: dict[int, asyncio.Task[None]] = {}
@@ -268,19 +268,19 @@ class PatchCare:
                 try:
                     with hook("attend", self._line.name):
                         await adapter.attend(self._line.link)
-                    await asyncio.Event().wait()  # indefinitely: it may still tell something when it is asked
+                    await asyncio.Event().wait()  # indefinitely: it may still report something when it is asked
                 except BusError as error:
-                    self._tell(str(error))
+                    self._log_trouble(str(error))
                 await asyncio.sleep(pause_s())
         finally:
             adapter.heard_by = None
             for task in reviving.values():
                 task.cancel()
 
-    def _tell(self, text: str) -> None:
-        """What went wrong in attending, once in a row, unless it is that the bus is away."""
-        if text != self._told and not self._line.connection.lost.is_set():
-            self._told = text
+    def _log_trouble(self, text: str) -> None:
+        """Log a failure of ``attend`` once in a row, unless the bus is away."""
+        if text != self._logged and not self._line.connection.lost.is_set():
+            self._logged = text
             log.warning("%s: %s; attending to it again", self._line.name, text)
 
     def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
@@ -307,7 +307,7 @@ class PatchCare:
             reviving[patch.key] = self._beside(self._revive(patch, now_ns()))
 
     async def _revive(self, patch: Patch, asked_ns: int) -> None:
-        """Set one patch up anew; where that means the whole bus, once for all who asked before it began."""
+        """Set one patch up again; if that means the whole bus, once for all requests before it began."""
         line = self._line
         async with line.busy:
             generation = self._generation()

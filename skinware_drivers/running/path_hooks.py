@@ -1,4 +1,4 @@
-"""What C calls back into Python for: what it cannot decide, and what others listen for."""
+"""Functions of Python that C calls, and the arrays for what changes between two calls of C."""
 
 from __future__ import annotations
 
@@ -17,10 +17,27 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.path_plan import SharedArrays
 from skinware_drivers.running.publisher import Publisher
 
 Rows = npt.NDArray[np.int64]
+
+
+class SharedArrays:
+    """Arrays for what changes between two calls of C.
+
+    Attributes:
+        module_status, module_untouched: (n_modules,) uint8, the doubts of the watch about modules.
+        skipped, skipped_before: (n_buses,) int64, updates that were skipped in this call, and before it.
+        interrupted: (n_buses,) bool, buses that have lost frames since the last batch.
+        sample_next_ns: (n_buses, reasons) int64, when the next sample of an unused frame is wanted.
+    """
+
+    def __init__(self, watch: Watch, n_buses: int) -> None:
+        self.module_status = watch.module_status.copy()  # a watch may replace its own
+        self.module_untouched = watch.module_untouched.copy()
+        self.skipped, self.skipped_before = np.zeros((2, n_buses), np.int64)
+        self.interrupted = np.zeros(n_buses, bool)
+        self.sample_next_ns = np.zeros((n_buses, len(Unused) + 1), np.int64)
 
 
 @dataclass
@@ -28,12 +45,12 @@ class Listeners:
     """Functions of the driver's other parts that C calls.
 
     Attributes:
-        hear: gets the new rows of each batch, before anything else, while frames that may be data are expected.
-        offer: gets the rows of frames that are of no module and awaited; returns those that no coroutine waited for.
-        sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
-        lose: gets a bus that went away, and the system's error number.
-        heard: frames came on a bus that is watched.
-        damaged: gets bytes of a serial line in which there is no frame, at most four times a second.
+        hear: called with the new rows of each batch, before anything else, while frames that may be data are expected.
+        offer: called with awaited rows that are of no module; returns those that no coroutine waited for.
+        sort_out: removes rows that are no data frames (bus, first, number); returns the number that is left.
+        lose: called with a bus that went away, and the system's error number.
+        heard: called when frames came on a bus that is watched.
+        damaged: called with bytes of a serial line that contain no frame, at most four times a second.
     """
 
     hear: Callable[[Rows], None] = lambda _rows: None
@@ -49,13 +66,13 @@ class PathHooks:
 
     Args:
         decoder, publisher, batch: of the path.
-        rows, words: the batch and the state of the path as C has them.
-        exchange: what changes between two calls.
+        rows, words: the batch and the state of the path in C.
+        exchange: arrays for what changes between two calls.
 
     Attributes:
         listeners: to be set.
         count_strangers: counts rows of frames that are of no module.
-        error: raised by a hook; to be raised again when C has come back.
+        error: raised by a hook; raised again when C has returned.
     """
 
     def __init__(
@@ -75,31 +92,33 @@ class PathHooks:
         self._update = _update_dtype(decoder)
 
     def table(self) -> structs.Hooks:
-        """What C may call; NULL where there never is anything to do."""
-        has_stamps = self._decoder.device_stamps.are_told
-        looks = getattr(self._publisher.watch.look, "__func__", None) is not Watch.look
-        return structs.Hooks(
-            structs.HEAR(self._guarded(self._on_data)),
-            structs.HEAR(self._guarded(self._on_times)) if has_stamps else structs.HEAR(),
-            structs.OFFER(self._guarded(self._on_offer)),
-            structs.KEEP(self._guarded(self._on_keep)),
-            structs.EXPAND(self._guarded(self._on_expand)),
-            structs.OFFER(self._guarded(self._on_look)) if looks else structs.OFFER(),
-            structs.PUBLISHED(self._guarded(self._on_published)),
-            structs.SORT_OUT(self._guarded(self._on_unusual)),
-            structs.LOSE(self._guarded(self._on_loss)),
-            structs.HEAR(self._guarded(lambda: self.listeners.heard())),
-            structs.DAMAGED(self._guarded(self._on_damage)),
-        )
+        """Return what C may call; NULL where there never is anything to do."""
+        called: dict[str, Callable[..., int | None]] = {
+            "hear": self._on_data,
+            "offer": self._on_offer,
+            "keep": self._on_keep,
+            "expand": self._on_expand,
+            "published": self._on_published,
+            "sort_out": self._on_unusual,
+            "lose": self._on_loss,
+            "heard": lambda: self.listeners.heard(),
+            "damaged": self._on_damage,
+        }
+        if self._decoder.device_stamps.are_sent:
+            called["tell_times"] = self._on_times
+        if getattr(self._publisher.watch.look, "__func__", None) is not Watch.look:
+            called["look"] = self._on_look
+        kinds: dict[str, Any] = {field[0]: field[1] for field in structs.Hooks._fields_}
+        return structs.Hooks(**{name: kinds[name](self._guarded(hook)) for name, hook in called.items()})
 
     def take_from_watch(self) -> None:
-        """Hand over what the watch holds against modules now."""
+        """Copy the doubts of the watch about modules."""
         watch, exchange = self._publisher.watch, self._exchange
         exchange.module_status[:], exchange.module_untouched[:] = watch.module_status, watch.module_untouched
         self._words.sees_all = watch.sees_all
 
     def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
-        """An exception cannot go through C: it is kept, and raised when C has come back."""
+        """Return a hook that keeps its exception until C has returned: an exception cannot go through C."""
 
         def call(*arguments: int) -> int:
             if self.error is not None:
@@ -135,11 +154,11 @@ class PathHooks:
         new = slice(max(batch.start, batch.headroom), batch.stop)
         entry = _view(self._words.entry, batch.capacity, np.int64)[new]
         kind = _view(self._words.kind, batch.capacity, np.uint8)[new]
-        self._decoder.device_stamps.tell(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
+        self._decoder.device_stamps.apply(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
         left = self.listeners.offer(_view(at, n, np.int64).copy())
-        self._words.must_leave = True  # somebody may have what it waited for
+        self._words.must_leave = True  # a coroutine may continue
         self.count_strangers(left.ctypes.data, len(left))
 
     def _on_keep(self, why: int, at: int, n: int) -> None:
@@ -184,13 +203,11 @@ class PathHooks:
 
 def _update_dtype(decoder: Decoder) -> np.dtype[np.void]:
     width, values = decoder.compiled.width, decoder.tables.structure.dtype
-    sensors_at = structs.UPDATE.itemsize
+    sensors_at = ctypes.sizeof(structs.Update)
     values_at = -(-(sensors_at + 4 * width) // 8) * 8
     status_at = values_at + width * values.itemsize
-    fields: dict[str, tuple[Any, int]] = {
-        name: (np.int64, structs.UPDATE.fields[name][1])  # type: ignore[index]
-        for name in structs.UPDATE.names or ()
-    }
+    names = [field[0] for field in structs.Update._fields_]
+    fields: dict[str, tuple[Any, int]] = {name: (np.int64, 8 * number) for number, name in enumerate(names)}
     fields |= {
         "sensors": ((np.int32, (width,)), sensors_at),
         "values": ((values, (width,)), values_at),

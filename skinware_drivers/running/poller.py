@@ -1,4 +1,4 @@
-"""Asks devices that only answer, at absolute deadlines."""
+"""Ask devices that only answer, at absolute deadlines."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _LOOK_AGAIN_S = 0.05
 _PATIENT_TIMES = 3
-"""So often in a row an answer has to be missing before a device is asked more rarely."""
+"""Missing answers in a row before a device is asked less often."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
 _ROOM, _LONGEST_EXTRA_S = 1.25, 1.0
-"""How much longer than it was late an answer is waited for the next time."""
+"""The next time, an answer is awaited for this multiple of its delay, and at most so much longer."""
 
 
 class _Place:
-    """What is known of the polls at one place of the sequence.
+    """The polls at one place of the sequence.
 
     Attributes:
         timer: their deadlines.
         asked_ns: when one was last sent, or would have been.
-        silent_until_ns: nobody is asked before, because nobody answered.
-        extra_s: how much longer than its timeout an answer is waited for, because answers came late.
+        silent_until_ns: none is sent before, because answers were missing.
+        extra_s: time to wait for an answer beyond its timeout, because answers came late.
     """
 
     def __init__(self, timer: Periodic) -> None:
@@ -51,16 +51,16 @@ class _Place:
 
 
 class Poller:
-    """Asks the polls of one bus, one after the other.
+    """Sends the polls of one bus, one after the other.
 
-    Every poll has deadlines of its own, by its place in the sequence: another payload at the same place keeps them. One
-    that cannot be kept (the bus took no more frames, the answer before came late, or this process had no processor
-    time) is counted as missed and not made up for: the next poll goes out at the next deadline.
+    Every poll has deadlines of its own, by its place in the sequence: another payload at the same place keeps them. A
+    missed deadline (the bus took no more frames, the answer before came late, or this process had no processor time)
+    is counted and not made up for: the next poll is sent at the next deadline.
 
-    In lock step, a device that does not answer costs the others its timeout. After three times in a row it is asked
-    more and more rarely, if there are others; once it has answered, as often as before. An answer that comes after the
-    timeout is an answer: it is counted in ``polls_late``, and the device is then given as much time as it takes,
-    up to a second more, for as long as its answers come late.
+    In lock step, a device that does not answer costs the others its timeout. After three missing answers in a row it is
+    asked less often, if there are others; once it has answered, as often as before. A late answer is an answer: it is
+    counted in ``polls_late``, and the device then gets as much time as it takes, up to a second more, as long as its
+    answers come late.
 
     Args:
         link: the bus.
@@ -79,14 +79,11 @@ class Poller:
         self._slow: set[str] = set()
 
     async def run(self, polls: Callable[[], Sequence[Poll]], is_away: Callable[[], bool]) -> None:
-        """Ask what ``polls`` names, the first of each at once, until it is cancelled.
-
-        What ``polls`` or ``check`` raises, it raises.
+        """Send polls, the first of each at once, until it is cancelled; raise whatever ``polls`` or ``check`` raises.
 
         Args:
-            polls: called once before each question: what is to be asked may change. None: a pause, it is called again
-                after 50 ms.
-            is_away: the bus is lost: nothing is sent, and nothing missed.
+            polls: returns the polls; called before each question. If there are none, it is called again after 50 ms.
+            is_away: returns whether the bus is lost: nothing is sent, and nothing missed.
         """
         while True:
             await self._until_first_deadline()
@@ -108,7 +105,7 @@ class Poller:
             await asyncio.sleep(left_ns / NS_PER_S)
 
     def _keep_time(self, asked: Sequence[Poll]) -> None:
-        """A timer for every poll: of one whose period changed, from its last deadline on."""
+        """Keep a timer for every poll; one whose period changed continues from its last deadline."""
         del self._places[len(asked) :]
         for number, poll in enumerate(asked):
             timer = Periodic(1 / poll.period_s)
@@ -120,7 +117,7 @@ class Poller:
                 self._places[number].timer = timer
 
     async def _ask_first(self, asked: Sequence[Poll], is_away: bool) -> None:
-        """Of the polls that are due, ask the one that has waited longest since it was asked, if there is any."""
+        """Send the due poll that was sent the longest time ago, if any is due."""
         time_ns = now_ns()
         due = [pair for pair in zip(self._places, asked, strict=True) if pair[0].timer.deadline_ns <= time_ns]
         if not due:
@@ -130,7 +127,7 @@ class Poller:
         place.timer.advance(time_ns)
         place.asked_ns = time_ns
         if is_away:
-            place.answered()  # who knows
+            place.answered()  # unknown
             return
         if len(asked) > 1 and time_ns < place.silent_until_ns:
             return
@@ -144,10 +141,8 @@ class Poller:
             self._counters.polls_missed += 1
 
     async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
-        extra_s, place.extra_s = (
-            place.extra_s,
-            place.extra_s / 2,
-        )  # one late answer must not hold up the others for long
+        extra_s = place.extra_s
+        place.extra_s /= 2  # one late answer must not hold up the others for long
         came = await self._link.ask(
             poll.identifier,
             poll.payload,
@@ -163,10 +158,10 @@ class Poller:
             place.unanswered()
 
     def _count_late(self, poll: Poll, place: _Place, late_s: float) -> None:
-        """A device answered after its timeout: it lives, at a pace of its own."""
+        """Count an answer after its timeout: the device lives, at a pace of its own."""
         place.answered()
         if late_s <= 0:
-            return  # it came in time, this process read it late
+            return  # it came in time, and was read late
         self._counters.polls_late += 1
         place.extra_s = min(max(place.extra_s, _ROOM * late_s), _LONGEST_EXTRA_S)
         if poll.name not in self._slow:

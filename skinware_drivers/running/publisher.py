@@ -1,4 +1,4 @@
-"""What snapshots say beside values: the arrays that C publishes from, and what only Python changes in them."""
+"""Keep the columns of a snapshot that C publishes beside the values, and change what only Python knows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
+from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
 from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, age_limit_ns
@@ -18,20 +19,19 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, SkinState, Updates
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.guard import hook
-from skinware_drivers.running.patch_timing import PatchTiming
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the column ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
 _IDLE_NS = NS_PER_S // 4
-NOBODY_WAITS = (1 << 63) - 1
-"""In place of the oldest data that is new enough for a request."""
-_STANDS_OUT = 2.0  # a pause between bursts, in mean spacings of a patch's modules
+NEVER_NS = (1 << 63) - 1
+"""In place of the oldest data that is new enough for a request: none waits."""
+_STANDS_OUT = 2.0  # shortest pause between bursts, in mean spacings of a patch's modules
 
 
 class Desk(Protocol):
-    """The requests that wait for a snapshot; see :class:`skinware_drivers.running.desk.RequestDesk`."""
+    """Requests that wait for a snapshot; see :class:`skinware_drivers.running.desk.RequestDesk`."""
 
     @property
     def wanted_ns(self) -> int: ...
@@ -40,15 +40,15 @@ class Desk(Protocol):
 
 
 class Pace(NamedTuple):
-    """How long the publisher waits, ns.
+    """Times of the publisher, ns.
 
     Attributes:
         period_ns: nominal time between two updates of a module.
-        patience_ns: after the first update of a cycle, for the others. It is longer than a period: a late frame must
-            not be cut off from its burst, or bursts mix from then on.
-        pause_ns: a patch that is silent for this long has ended its burst.
-        idle_ns: between two snapshots with nothing new.
-        silence_ns: a patch that is silent for this long is stale.
+        patience_ns: from the first update of a cycle to publication without the others. It is longer than a period: a
+            late frame must not be cut off from its burst, or bursts mix from then on.
+        pause_ns: silence of a patch after which its burst is over.
+        idle_ns: between two snapshots without new values.
+        silence_ns: silence of a patch after which it is stale.
     """
 
     period_ns: int
@@ -77,12 +77,12 @@ class BusColumns:
 
 
 class PatchLife:
-    """Which patches send: (n_patches,) each, times CLOCK_MONOTONIC ns.
+    """The patches that send: (n_patches,) each, times CLOCK_MONOTONIC ns.
 
     Attributes:
         state: :class:`skinware.PatchState`.
         heard_ns: when the last update came.
-        lives_until_ns: when it counts as silent, unless a whole update comes before.
+        lives_until_ns: when it becomes silent, unless a whole update comes before.
         group_heard_ns: (n_groups,), when the last update of each group came.
         age_limit_ns: (n_groups,), beyond which its values are stale.
     """
@@ -96,11 +96,11 @@ class PatchLife:
 
 
 class BurstPauses:
-    """The pauses between the bursts of each patch, as ``bursts.c`` learns them.
+    """The pauses between the bursts of each patch, which ``bursts.c`` learns.
 
     Attributes:
         pause_ns: (n_patches,), the pause that ends a burst.
-        standing_out_ns: (n_patches,), the shortest pause that is no mere spacing of modules.
+        standing_out_ns: (n_patches,), the shortest pause that is longer than the spacing of modules.
         gap_ns: (n_groups,), the time before the last update of each group.
     """
 
@@ -112,13 +112,32 @@ class BurstPauses:
         self.gap_ns: npt.NDArray[np.int64] = np.zeros(len(state.group_patch), np.int64)
 
 
-class Publisher:
-    """The end of the data path: when snapshots are published, and what they say beside values.
+class PatchTiming:
+    """How regularly patches deliver, and how old their data is: histograms, which C counts at publication.
 
-    By cycle: as soon as every update group that lives was heard (groups that are slower than the driver excepted), and
-    always before a patch begins its next burst, so that no update is overwritten before it was published and no
-    snapshot holds two bursts of a patch (``native/bursts.c``). If neither happens, half a period after the cycle is
-    over. Otherwise at the driver's rate. With nothing new, four times a second, so that readers see the states.
+    The buckets are those of :class:`skinware.memory.statistics.Histogram`.
+
+    Attributes:
+        intervals: (n_patches, BUCKETS) int64: time between two updates of a group that were shown in turn.
+        ages: (n_patches, BUCKETS) int64: age of a group's update when it was published.
+        both: (2, n_patches, BUCKETS) int64: one after the other.
+        before_ns: (n_groups,) int64: stamps of what was shown before, 0: nothing.
+    """
+
+    def __init__(self, structure: Structure) -> None:
+        self.both: npt.NDArray[np.int64] = np.zeros((2, structure.n_patches, BUCKETS), np.int64)
+        self.intervals: npt.NDArray[np.int64] = self.both[0]
+        self.ages: npt.NDArray[np.int64] = self.both[1]
+        self.before_ns = np.zeros(structure.n_groups, np.int64)
+
+
+class Publisher:
+    """The end of the data path: the moments of publication, and the columns beside values.
+
+    By cycle, a snapshot is published as soon as every live update group was heard (except groups that are slower than
+    the driver), and always before a patch begins its next burst, so that no update is overwritten before publication
+    and no snapshot holds two bursts of a patch (``native/bursts.c``); else half a period after the cycle is over.
+    Otherwise it is published at the driver's rate; without new values four times a second, so that readers see states.
 
     Args:
         writer: the driver's service.
@@ -156,19 +175,19 @@ class Publisher:
     @property
     def wanted_ns(self) -> int:
         """The oldest data that is new enough for a request that waits; far ahead if none does."""
-        return NOBODY_WAITS if self._desk is None else self._desk.wanted_ns
+        return NEVER_NS if self._desk is None else self._desk.wanted_ns
 
     def answer(self, oldest_ns: int) -> None:
-        """A snapshot was published: answer the requests that waited for it.
+        """Answer the requests that waited for a snapshot that was published.
 
         Args:
-            oldest_ns: of the data that is new in it, CLOCK_MONOTONIC ns.
+            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
         """
         if self._desk is not None:
             self._desk.published(oldest_ns, self.writer.position)
 
     def lose(self, patch: int, state: PatchState) -> None:
-        """Take a patch as silent from here on, until its next data."""
+        """Count a patch as silent from now on, until its next data."""
         self.patches.lives_until_ns[patch] = 0
         self.patches.state[patch] = state
 
@@ -187,11 +206,11 @@ class Publisher:
         times_ns[:] = np.where(times_ns > 0, np.maximum(1, times_ns - asleep_ns), 0)
 
     def silent_ns(self, patch: int) -> int:
-        """For how long a patch has been silent beyond its age limit, while this process attended."""
+        """Return how long a patch has been silent beyond its age limit, while this process ran, ns."""
         return now_ns() - int(self.patches.lives_until_ns[patch])
 
     def count_buses(self) -> npt.NDArray[np.int64]:
-        """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
+        """Return (n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         self._counts[:, : len(OWN_BUS_COUNTERS)] = [read_own(counters) for counters in self.buses.counters]
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self.state.bus_counters
         return self._counts

@@ -1,4 +1,4 @@
-"""What goes over the wires of a driver, published while somebody wants it: ``skin-record --wire``."""
+"""Publish what goes over the wires of a driver while a program records it: ``skin-record --wire``."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from skinware_drivers.running.bus_line import BusLine
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _BEGINNING_S = 0.3
-"""What the driver and its devices say to each other at first is kept so long, in case that somebody wants it."""
+"""How long the first frames are kept, in case that a program records them."""
 _LOOK_S = 0.5
-"""Between two looks whether somebody does."""
+"""Time between two looks whether a program does."""
 _TURN_S = 0.05
 _SLOTS = 64
 _MOST_S = 1.5
-"""So long after its beginning the service is there, until who wants it has found it: the driver may end at once."""
+"""Least life of the service, unless it was found before: the driver may end at once."""
 _FINDING_S = 0.02
 
 
 class Wires:
-    """The service with the wires of a driver. A frame of it has what went over one bus since the one before.
+    """The service with the wires of a driver. A sample has what went over one bus since the sample before.
 
     Args:
         identity: of the driver.
@@ -50,12 +50,12 @@ class Wires:
         self._task: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """Begin to keep what goes over the wires, before there is anything; in the running loop."""
+        """Begin to keep what goes over the wires; in the running loop."""
         self._open_taps()
         self._task = asyncio.get_running_loop().create_task(self._serve())
 
     async def end(self) -> None:
-        """Publish the rest, if somebody wants it, and withdraw the service. Idempotent."""
+        """Publish the rest, if a program records it, and withdraw the service. Idempotent."""
         if self._task is None:
             return
         self._task.cancel()
@@ -73,7 +73,7 @@ class Wires:
         self._withdraw()
 
     def _is_read(self) -> bool:
-        """Whether anybody has found it: who has can take all of it, also when the service has ended."""
+        """Return whether a program reads the service; it can then read all of it, also after its end."""
         name = wire.service_name(self._identity.name)
         return any(record.service == name for record in living_readers(self._namespace))
 
@@ -85,7 +85,10 @@ class Wires:
                 await asyncio.sleep(_TURN_S)
             while True:
                 if is_wished(self._namespace, wire.WISH):
-                    await self._publish_for_a_while()
+                    self._open_taps()
+                    for _ in range(round(_LOOK_S / _TURN_S)):
+                        self._publish()
+                        await asyncio.sleep(_TURN_S)
                 else:
                     self._withdraw()
                     await asyncio.sleep(_LOOK_S)
@@ -93,17 +96,11 @@ class Wires:
             self._log_trouble(error)
             self._withdraw()
 
-    async def _publish_for_a_while(self) -> None:
-        self._open_taps()
-        for _ in range(round(_LOOK_S / _TURN_S)):
-            self._publish()
-            await asyncio.sleep(_TURN_S)
-
     def _publish(self) -> None:
         is_new = self._writer is None
         writer = self._writer_for()
         for line in self._lines:
-            # nothing, but for who wants to know also of a bus on which nothing comes that it is there
+            # an empty sample first, so that a silent bus is known, too
             for batch in line.bus.tap.fetch() if not is_new else (memoryview(b""), *line.bus.tap.fetch()):
                 columns = writer.begin()
                 columns["bus"][()], columns["used"][()] = line.ordinal, len(batch)

@@ -11,7 +11,7 @@ import numpy as np
 from skinware.errors import BusError
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.conditions import Identifier
+from skinware_drivers.fields import Identifier
 from skinware_drivers.layout import Frame
 from skinware_drivers.link import Match
 from skinware_drivers.options import OptionsT

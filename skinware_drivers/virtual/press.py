@@ -1,4 +1,4 @@
-"""What a small device feels: a finger that wanders over it, presses and lets go. A function of time and seed."""
+"""The touch of a small device: a finger that wanders over it, presses and lets go, by time and seed alone."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ import numpy.typing as npt
 
 _PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
 _PRESSES, _REST_S = 6, 6.0
-"""After so many presses and pauses nothing touches it for so long, as a hand rests between two grasps: a baseline can
-begin."""
+"""Presses in a row, and the rest after them, in which a baseline can begin."""
 _RADIUS = 0.22
-"""Of the pressed spot; the device is 1 wide."""
+"""Radius of the pressed spot; the device is 1 wide."""
 
 
 class Press:
     """A wandering press on one device.
 
     Args:
-        seed: of the emulation; devices with different ``number`` feel different things.
-        number: of the device.
-        places: (n, 2) where its sensors are, 0 to 1.
+        seed: of the emulation.
+        number: of the device; devices with other numbers feel other presses.
+        places: (n, 2) of its sensors, 0 to 1.
     """
 
     def __init__(self, seed: int, number: int, places: npt.NDArray[np.float64]) -> None:
@@ -31,7 +30,7 @@ class Press:
         self._places = places
 
     def strength(self, time_s: float) -> npt.NDArray[np.float64]:
-        """(n,) 0 to 1, at a time since the device began to send."""
+        """Return (n,) strengths, 0 to 1, at a time since the device began to send."""
         since_s = time_s - self._first_s
         in_round_s = since_s % (_PRESSES * (_PRESS_S + _PAUSE_S) + _REST_S)
         is_pressing = since_s > 0 and in_round_s < _PRESSES * (_PRESS_S + _PAUSE_S)
@@ -45,7 +44,7 @@ class Press:
 
 
 def on_a_grid(count: int, columns: int, each: int = 1) -> npt.NDArray[np.float64]:
-    """(count * each, 2) places of sensors in rows, with ``each`` at the same place."""
+    """Return (count * each, 2) places of sensors in rows, with ``each`` at the same place."""
     number = np.arange(count)
     rows = -(-count // columns)
     places = np.stack([(number % columns + 0.5) / columns, (number // columns + 0.5) / rows], axis=1)

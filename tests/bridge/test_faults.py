@@ -55,7 +55,7 @@ class Driver:
         assert self._writer is not None
         writer, self._writer = self._writer, None
         if is_killed:
-            writer._service.desert()
+            writer.desert()
         else:
             writer.close()
 

@@ -112,7 +112,7 @@ def test_each_robot_tells_how_it_is(namespace: Namespace) -> None:
             assert arm.age_ms >= 0
             assert summaries["right"].namespace == other.name
             wait_until(lambda: all(seen.clock.is_known for seen in watcher.robots()))
-            writers[0]._service.desert()
+            writers[0].desert()
             wait_until(lambda: state(watcher) == "dead")
             summary = told(watcher, "left")
             assert summary is not None

@@ -323,7 +323,7 @@ def test_operations_are_those_of_the_whole_driver(net: Net, namespace: Namespace
         def work() -> None:
             while not ended.is_set():
                 publish(writer)
-                writer._service.answer_requests(0.01)
+                writer.answer_requests(0.01)
 
         thread = threading.Thread(target=work)
         thread.start()

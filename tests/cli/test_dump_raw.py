@@ -13,9 +13,9 @@ import can
 import numpy as np
 import pytest
 
-from skinware.candump import channel_name
 from skinware.cli._command import exit_status
 from skinware.cli.dump import command as frames_command
+from skinware.wire import channel_name
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.candump import TextFrame, text_frames
 from skinware_drivers.cli.dump import command

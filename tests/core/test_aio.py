@@ -12,8 +12,7 @@ from typing import TypeVar
 import pytest
 
 import skinware.aio
-from skinware import DriverReader, Sample, ServiceReader, ServiceWriter, Skin
-from skinware.aio import _wakeups
+from skinware import DriverReader, Sample, ServiceReader, ServiceWriter, Skin, aio
 from skinware.errors import RequestFailed, RequestTimeout, ServiceTimeout, StructureChanged
 from skinware.memory import futex
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
@@ -35,7 +34,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 async def until_asleep() -> None:
     """Until a coroutine waits."""
-    await until(lambda: len(_wakeups._of_process._waits) == 1)
+    await until(lambda: len(aio._of_process._waits) == 1)
 
 
 def test_a_skin_is_iterated_and_read() -> None:
@@ -96,23 +95,23 @@ def test_many_readers_wait_in_one_thread() -> None:
 def test_waiting_wakes_the_thread_only_for_what_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
     """No polling: over many slices of 50 ms without a frame the thread looks a few times, not twenty times a second."""
     looks = 0
-    look = _wakeups.Wakeups._look
+    look = aio.Wakeups._look
 
-    def counted(self: _wakeups.Wakeups) -> list[_wakeups.WakeWord]:
+    def counted(self: aio.Wakeups) -> list[aio.WakeWord]:
         nonlocal looks
         looks += 1
         return look(self)
 
-    monkeypatch.setattr(_wakeups.Wakeups, "_look", counted)
+    monkeypatch.setattr(aio.Wakeups, "_look", counted)
     slices = 0
-    wait = _wakeups.Wakeups.wait
+    wait = aio.Wakeups.wait
 
-    async def sliced(self: _wakeups.Wakeups, words: list[_wakeups.WakeWord], timeout_s: float) -> None:
+    async def sliced(self: aio.Wakeups, words: list[aio.WakeWord], timeout_s: float) -> None:
         nonlocal slices
         slices += 1
         await wait(self, words, timeout_s)
 
-    monkeypatch.setattr(_wakeups.Wakeups, "wait", sliced)
+    monkeypatch.setattr(aio.Wakeups, "wait", sliced)
 
     async def main() -> None:
         with ServiceWriter("x", SMALL) as writer:
@@ -140,7 +139,7 @@ def test_a_cancelled_wait_leaves_everything_as_it_was() -> None:
                     task.cancel()
                     with pytest.raises(asyncio.CancelledError):
                         await task
-                    assert _wakeups._of_process._waits == []
+                    assert aio._of_process._waits == []
                 with pytest.raises(TimeoutError):
                     await asyncio.wait_for(reader.read(newer_than=frame, timeout_s=None), 0.02)
                 publish(writer, 2)
@@ -251,7 +250,7 @@ def test_the_child_of_a_fork_waits_in_a_thread_of_its_own() -> None:
             async with Reader(ServiceReader(name)) as reader:
                 task = asyncio.create_task(reader.read(newer_than=await reader.read(), timeout_s=60))
                 await until_asleep()
-                thread = _wakeups._of_process._thread
+                thread = aio._of_process._thread
                 assert thread is not None
                 assert thread.is_alive()
                 await asyncio.to_thread(between)

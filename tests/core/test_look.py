@@ -55,9 +55,8 @@ def publish(writer: DriverWriter, value: int) -> None:
 
 def kill(writer: DriverWriter) -> None:
     """Its locks go, and nothing else changes."""
-    service: Any = writer._service
-    service._ring.segment.descriptor.close()
-    service._name_lock.close()
+    writer._ring.segment.descriptor.close()
+    writer._name_lock.close()
 
 
 def clear_away(name: str) -> None:

@@ -6,13 +6,14 @@ import pytest
 
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, StructureChanged
+from skinware.service import Writer
 from tests.core.services import publish
 from tests.core.workers import seeded
 
 COLUMNS = {"values": ("<u8", 4)}
 
 
-def die(writer: ServiceWriter) -> None:
+def die(writer: Writer) -> None:
     """What the kernel does with a killed writer: its locks go, its files stay."""
     writer._ring.segment.descriptor.close()
     writer._name_lock.close()

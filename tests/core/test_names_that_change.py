@@ -54,7 +54,7 @@ def test_a_driver_whose_name_becomes_something_else_leaves_the_skin_until_it_is_
     with skin, driver("a"):
         first = driver("b")
         assert look(skin) == ("a", "b")
-        die(first._service)
+        die(first)
         with successor("b") as other:
             publish(other, 1)
             for _ in range(5):
@@ -72,7 +72,7 @@ def test_its_reader_says_that_it_changed_and_reattach_says_what_it_is(
     first = driver("b")
     with DriverReader("b") as reader:
         frame = reader.read()
-        die(first._service)
+        die(first)
         with successor("b") as other:
             publish(other, 1)
             assert reader.latest == frame.position
@@ -107,7 +107,7 @@ def attached(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_what_a_killed_driver_left_costs_a_skin_nothing(namespace: Namespace, attached: list[str]) -> None:
     """Neither is its structure read, nor a reader of it announced."""
     with driver("live"), Skin() as skin:
-        die(driver("dead")._service)
+        die(driver("dead"))
         assert look(skin) == ("live",)
         announced = namespace.readers_path.stat().st_mtime_ns
         for _ in range(5):
@@ -150,7 +150,7 @@ class Odd(ServiceWriter):
 
     def __init__(self, tables: dict[str, Any], columns: dict[str, Any]) -> None:
         with DriverWriter("whole", STRUCTURE, driver_type="fake", bus_counters=BUS_COUNTERS) as whole:
-            all_tables, all_columns = {**whole._static(), **tables}, {**whole._frame_columns(), **columns}
+            all_tables, all_columns = {**whole._static, **tables}, {**whole._ring.segment.schema.columns, **columns}
         super().__init__(
             "odd",
             {name: column for name, column in all_columns.items() if column is not None},

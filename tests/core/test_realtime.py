@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, Periodic, Profile, _kernel, cpus_from_text, now_ns
-from skinware.realtime._cpus import cpus_as_text, online_cpus
+from skinware.realtime._kernel import cpus_as_text, online_cpus
 from tests.apply_profile import LATER_KIB, command, result_of
 from tests.scheduling import may_have_fifo
 from tests.unprivileged import without_rights

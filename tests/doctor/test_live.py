@@ -332,8 +332,8 @@ def test_a_driver_that_is_late() -> None:
     with publishing(skin, rate_hz=50) as late:
         commit = late.writer.commit
 
-        def commit_late(acquired_ns: int) -> int:
-            return commit(acquired_ns - 2_000_000_000)
+        def commit_late(acquired_ns: int, flags: int = 0) -> int:
+            return commit(acquired_ns - 2_000_000_000, flags)
 
         late.writer.commit = commit_late  # type: ignore[method-assign]
         finding = found_until(of("timing", "old when it is published"))

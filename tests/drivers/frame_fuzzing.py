@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import wire_dtype
-from skinware_drivers.conditions import Bits, Byte, Identifier
 from skinware_drivers.description import assemble
+from skinware_drivers.fields import Bits, Byte, Identifier
 from skinware_drivers.layout import Frame
 from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.one_path import Publishing

@@ -23,10 +23,8 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.proof import Proof
 from skinware_drivers.proving.walk import Manner, Step, walk
 from skinware_drivers.testing.driving import driving_lines
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
 
 NAMES = ("index tip", "middle tip")
 ROWS, COLUMNS = 4, 6

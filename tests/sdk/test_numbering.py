@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.decoding.sequences import read_numbers
+from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 
 

@@ -11,8 +11,8 @@ from skinware.samples import Unused
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import EXTENDED_FLAG, Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.conditions import Byte
 from skinware_drivers.counters import BusCounters, Samples
+from skinware_drivers.fields import Byte
 from skinware_drivers.running import patch_care
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.testing.waiting import wait_until

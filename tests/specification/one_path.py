@@ -20,7 +20,7 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher
 from skinware_drivers.testing.defect import defect
 from tests.specification.publishing import SpecifiedPublisher
 
@@ -72,7 +72,7 @@ class Asking:
     @property
     def wanted_ns(self) -> int:
         """Since when the first of them waits; far ahead if nobody does."""
-        return min(self.waiting, default=NOBODY_WAITS)
+        return min(self.waiting, default=NEVER_NS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
         self.answered.append((oldest_ns, position[1]))

@@ -21,9 +21,7 @@ from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import NoOptions
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 NODES = (1, 2)
 NODE = Bits(shift=0, width=4)

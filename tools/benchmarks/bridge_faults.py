@@ -70,7 +70,7 @@ def drive(namespace: str, sensors: int, life: int) -> None:
             for column in columns.values():
                 column[...] = 0
             time_ns = now_ns()
-            columns["values"][0::3] = writer._service._ring.segment.published + 1
+            columns["values"][0::3] = writer._ring.segment.published + 1
             columns["values"][1::3] = life
             columns["values"][2::3] = time_ns // MS % MOST_MS
             columns["module_time_ns"][:] = time_ns

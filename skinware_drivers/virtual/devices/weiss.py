@@ -1,14 +1,14 @@
-"""What emulated devices of Weiss Robotics have in common: the checksum, and where their commands end."""
+"""The checksum and the commands of emulated devices of Weiss Robotics."""
 
 from __future__ import annotations
 
-from skinware_drivers.virtual.serial_device import cut_packets
+from skinware_drivers.virtual import cut_packets
 
 BEGIN = b"\xaa\xaa\xaa"
 
 
 def crc(data: bytes) -> int:
-    """Bit by bit: the polynomial of the CCITT, shifted the other way."""
+    """Return the checksum bit by bit: the polynomial of the CCITT, shifted the other way."""
     state = 0xFFFF
     for byte in data:
         entry = ((state ^ byte) & 0xFF) << 8
@@ -19,7 +19,7 @@ def crc(data: bytes) -> int:
 
 
 def cut_commands(heard: bytes, *, bare_when_empty: bool = False) -> tuple[list[bytes], bytes]:
-    """The whole commands, which say how long they are, and what is left.
+    """Return the whole commands, by the length in each, and the rest.
 
     Args:
         heard: bytes of the line.

@@ -1,0 +1,154 @@
+"""Fields of frames: conditions that recognize kinds, keys of patches and modules, numbers that devices count up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD
+
+_MOST_BITS = 32  # of a sequence number
+
+
+@dataclass(frozen=True)
+class Identifier:
+    """The condition ``identifier & mask == value``; whether the identifier has 11 or 29 bits always counts.
+
+    Attributes:
+        value: the masked bits; of a 29-bit identifier with the flag: ``EXTENDED_FLAG | 0x18DA00F1``.
+        mask: bits that count; default: all.
+        extended: whether the identifier has 29 bits, as the flag in the value says.
+    """
+
+    value: int
+    mask: int = -1
+    extended: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        is_extended = bool(self.value & EXTENDED_FLAG)
+        object.__setattr__(self, "extended", is_extended)
+        every = EXTENDED_FLAG | IDENTIFIER_MASK if is_extended else LARGEST_STANDARD
+        mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)
+        object.__setattr__(self, "mask", mask)
+
+    @classmethod
+    def covering(cls, identifiers: Sequence[int]) -> Identifier:
+        """Return a condition that all these identifiers of 11 bits fulfil, and as few others as possible."""
+        differ = 0
+        for identifier in identifiers:
+            differ |= identifier ^ identifiers[0]
+        mask = LARGEST_STANDARD & ~((1 << differ.bit_length()) - 1)
+        return cls(identifiers[0] & mask, mask)
+
+
+@dataclass(frozen=True)
+class Byte:
+    """The condition ``payload[offset] & mask == value``; a frame that is too short does not fulfil it."""
+
+    offset: int
+    value: int
+    mask: int = 0xFF
+
+
+Condition = Identifier | Byte
+
+
+@dataclass(frozen=True)
+class Bits:
+    """A bit field that names a patch or a module.
+
+    Attributes:
+        shift: position of the lowest bit.
+        width: number of bits, 1 to 29.
+        byte: number of the payload byte that has the field (only for the key of a module, at most 8 bits); None: the
+            identifier has it.
+    """
+
+    shift: int
+    width: int
+    byte: int | None = None
+
+
+@dataclass(frozen=True)
+class SequenceNumber:
+    """A number in the payload that the device counts up, with a module's frames or with its cycles.
+
+    Skipped and repeated numbers are counted. In a :class:`Cycle` the number also says which frames belong together.
+
+    Attributes:
+        offset: first byte of its word.
+        dtype: unsigned numpy dtype of that word, with byte order.
+        modulo: the number wraps to 0 here, at most 2**32; default: the range of its bits.
+        mask: the adjacent bits of the word that form the number (``0xF0``: the upper half of a byte); default: all.
+    """
+
+    offset: int
+    dtype: str
+    modulo: int | None = None
+    mask: int | None = None
+
+    @property
+    def end(self) -> int:
+        """One past the last byte of its word."""
+        return self.offset + np.dtype(self.dtype).itemsize
+
+    @property
+    def bits(self) -> int:
+        """The mask, also where it is the whole word."""
+        return (1 << 8 * np.dtype(self.dtype).itemsize) - 1 if self.mask is None else self.mask
+
+    @property
+    def shift(self) -> int:
+        """Position of its lowest bit."""
+        return (self.bits & -self.bits).bit_length() - 1
+
+    @property
+    def turn(self) -> int:
+        """Counts until it is 0 again."""
+        return self.modulo or (self.bits >> self.shift) + 1
+
+    def wrong(self, shortest: int) -> str:
+        """Return why a payload of so many bytes cannot have the number; empty if it can."""
+        if np.dtype(self.dtype).kind != "u":
+            return f"the sequence number's dtype {self.dtype!r} is not unsigned"
+        if self.end > shortest:
+            return "the sequence number is not in every right payload"
+        plain = self.bits >> self.shift if self.bits > 0 else 0
+        if not plain or plain & (plain + 1) or self.bits >> 8 * np.dtype(self.dtype).itemsize:
+            return f"mask {self.bits:#x} of the sequence number: give bits of a {self.dtype!r} that lie side by side"
+        if not 2 <= self.turn <= plain + 1:
+            return f"modulo {self.modulo} of the sequence number: its bits do not fit"
+        if self.turn > 1 << _MOST_BITS:
+            return f"the sequence number counts to more than {_MOST_BITS} bits: give its lowest as `mask`"
+        return ""
+
+
+@dataclass(frozen=True)
+class DeviceTime:
+    """The time in a payload at which the device took the values, by its own clock.
+
+    The frame then has this time, converted to CLOCK_MONOTONIC, instead of the time of receipt. A patch has one clock.
+
+    Attributes:
+        offset: first byte.
+        dtype: unsigned numpy dtype with byte order, at most 4 bytes.
+        unit_s: seconds per count.
+        modulo: the time wraps to 0 here; default: the dtype's own range.
+    """
+
+    offset: int
+    dtype: str
+    unit_s: float
+    modulo: int | None = None
+
+    @property
+    def end(self) -> int:
+        """One past its last byte."""
+        return self.offset + np.dtype(self.dtype).itemsize
+
+    @property
+    def turn(self) -> int:
+        """Counts until it is 0 again."""
+        return self.modulo or 1 << 8 * np.dtype(self.dtype).itemsize

@@ -185,16 +185,14 @@ class DeviceClock:
             return
         hull: list[tuple[float, float]] = []
         for _, x, y in whole:
-            while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
-                hull.pop()
+            while len(hull) > 1:
+                (x0, y0), (x1, y1) = hull[-2:]
+                if (y1 - y0) * (x - x0) < (x1 - x0) * (y - y0):
+                    break
+                hull.pop()  # it lies on or above the line from the one before to this one
             hull.append((x, y))
         middle = sum(x for _, x, _ in whole) / len(whole)
         right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
         self._slope = min(max(slope, -self._maximum_drift), self._maximum_drift)
-
-
-def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
-    """Return whether the second point lies on or above the line from the first to the third."""
-    return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])

@@ -182,7 +182,7 @@ class Recorder:
     # -- the collector's listener ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.transfer.collecting.Listener`."""
+        """See :class:`skinware.transfer.collecting.FrameListener`."""
         self._jobs.put(_Began(service, head))
 
     def took(self, service: str, frame: Sample) -> None:

@@ -102,11 +102,11 @@ class RequestDesk:
             *(self._on_bus(line, patches, request, does[line], arguments) for line, patches in meant),
             return_exceptions=True,
         )
-        failures = [
-            f"{line.name}: {_why(result)}"
-            for (line, _), result in zip(meant, results, strict=True)
-            if isinstance(result, BaseException)
-        ]
+        failures = []
+        for (line, _), result in zip(meant, results, strict=True):
+            if isinstance(result, BaseException):
+                is_known = isinstance(result, BusError | ConfigurationError | ValueError)
+                failures.append(f"{line.name}: {result if is_known else f'{type(result).__name__}: {result}'}")
         if failures:
             request.fail(f"{request.operation}: {'; '.join(failures)}")
         else:
@@ -171,9 +171,3 @@ def offered(lines: Sequence[BusLine]) -> dict[str, Callable[..., Any]]:
     for line in lines:
         declared |= _declared(type(line.bus)) | _declared(type(line.adapter))
     return {name: operation.method for name, operation in sorted(declared.items())}
-
-
-def _why(error: BaseException) -> str:
-    if isinstance(error, BusError | ConfigurationError | ValueError):
-        return str(error)
-    return f"{type(error).__name__}: {error}"

@@ -131,8 +131,7 @@ class _Painter:
         """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""
         import numpy as np
 
-        from skinware.tactile.neighbours import neighbours
-        from skinware.tactile.regions import without_holes
+        from skinware.tactile.neighbours import neighbours, without_holes
         from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
 

@@ -35,7 +35,7 @@ class Writer(Ownership):
                 hold something old.
             skip: sequences before this frame that are left out, for who passes frames on of which some did not arrive:
                 readers count them as lost. It may become one more: the newest frame stays readable meanwhile.
-            contents: a slot of a service with the same columns (``Frame.slot``), to begin with.
+            contents: a slot of a service with the same columns (``Sample.slot``), to begin with.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.

@@ -12,11 +12,9 @@ from skinware.errors import Overrun
 from skinware.memory import file_layout, futex
 from skinware.memory.futex import fence
 from skinware.memory.ring import (
-    ACQUIRED,
     COPY_ATTEMPTS,
     LATEST,
     MISSED_PERIODS,
-    PUBLISHED,
     SEQUENCE,
     STATE,
     WAKE_WORD,
@@ -163,15 +161,12 @@ class RingReader(Generic[SampleT]):
     def missed_periods(self) -> int:
         return self.words[MISSED_PERIODS]
 
-    def publication_times_ns(self) -> list[int]:
-        """When the frames that the ring still holds were published, oldest first."""
-        return [time_ns for _, time_ns in self._times_ns(PUBLISHED)]
+    def times_ns(self, word: int) -> list[tuple[int, int]]:
+        """Return (sequence, time) of the frames that the ring still holds, oldest first.
 
-    def acquisition_times_ns(self) -> list[tuple[int, int]]:
-        """(sequence, ``acquired_ns``) of the frames that the ring still holds, oldest first."""
-        return self._times_ns(ACQUIRED)
-
-    def _times_ns(self, word: int) -> list[tuple[int, int]]:
+        Args:
+            word: ``PUBLISHED`` or ``ACQUIRED``.
+        """
         times = []
         latest = self.latest
         for sequence in range(max(1, latest - len(self._slots) + 2), latest + 1):

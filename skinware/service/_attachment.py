@@ -10,7 +10,7 @@ import numpy.typing as npt
 from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, RequestRefused, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring import ACQUIRED, PUBLISHED, Sample, SampleT
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
@@ -98,13 +98,13 @@ class Attachment(Generic[SampleT]):
         None where they are too few: after its start a writer may publish two frames at once and then wait.
         A writer that was held up publishes what has waited at once; then the times of the data count.
         """
-        times = self._ring.publication_times_ns()
+        times = [time_ns for _, time_ns in self._ring.times_ns(PUBLISHED)]
         span_ns = times[-1] - times[0] if times else 0
         is_full = len(times) >= self._ring.slot_count - 1  # the writer may be filling the last one
         if not span_ns or (span_ns < _TELLING_SPAN_NS and not is_full):
             return None
         rate_hz = (len(times) - 1) * NS_PER_S / span_ns
-        acquired_ns = [time_ns for _, time_ns in self._ring.acquisition_times_ns()]
+        acquired_ns = [time_ns for _, time_ns in self._ring.times_ns(ACQUIRED)]
         intervals_ns = sorted(after - before for before, after in pairwise(acquired_ns))
         usual_ns = intervals_ns[len(intervals_ns) // 2] if intervals_ns else 0
         if span_ns < _TELLING_SPAN_NS and rate_hz * usual_ns > _HASTE * NS_PER_S:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy.typing as npt
 
 from skinware.errors import Closed, NameInUse, NamespaceError
-from skinware.memory import file_layout, segments
+from skinware.memory import file_layout, name_lock, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring_writer import RingWriter
@@ -71,12 +71,12 @@ class Ownership:
         self._next_file_check_ns = 0
         self._file_trouble = ""
         self.namespace.create(group)
-        self._name_lock = segments.take_name(self.namespace, name)
+        self._name_lock = name_lock.take_name(self.namespace, name)
         try:
             sweep(self.namespace)
             previous = segments.previous(self.namespace, name)
             if published_before is None:
-                published_before = segments.published_so_far(self._name_lock, previous)
+                published_before = name_lock.published_so_far(self._name_lock, previous)
             self._begin_generation(schema, static, period_ns, previous, published_before)
         except BaseException:
             self._name_lock.close()
@@ -176,7 +176,7 @@ class Ownership:
             return
         with self._changing:
             segment = self._ring.segment
-            segments.note_published(self._name_lock, segment.published)
+            name_lock.note_published(self._name_lock, segment.published)
             path = self.namespace.ring_path(self.name)
             if segments.current_inode(path) == segment.inode:
                 path.unlink()
@@ -258,12 +258,12 @@ class Ownership:
         if os.fstat(self._name_lock.fd).st_nlink == 0:
             self.namespace.create(self._group)
             try:
-                name_lock = segments.take_name(self.namespace, self.name)
+                taken = name_lock.take_name(self.namespace, self.name)
             except NameInUse:
                 self.close()
                 raise
             self._name_lock.close()
-            self._name_lock = name_lock
+            self._name_lock = taken
         if os.fstat(self._ring.segment.descriptor.fd).st_nlink == 0:
             self._succeed(self._ring.segment.schema, self._static)
         if self._server is not None:

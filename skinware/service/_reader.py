@@ -10,7 +10,7 @@ from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring import ACQUIRED, Sample, SampleT
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.take import NEWER, NEXT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
@@ -128,7 +128,7 @@ class ServiceReader(Taking[SampleT]):
             Closed: as ``read``.
         """
         alive = self._keep_up()  # which may replace the ring
-        frame = self._checked(self._whole(self._ring.view), alive)
+        frame = self._whole(self._ring.view, alive)
         try:
             yield frame
         finally:
@@ -264,11 +264,6 @@ class Tap(ServiceReader[SampleT]):
         return self._ring.segment.head
 
     @property
-    def inode(self) -> tuple[int, int]:
-        """Device and number of the file that is being read."""
-        return self._ring.segment.inode
-
-    @property
     def period_ns(self) -> int:
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
@@ -348,7 +343,7 @@ class Tap(ServiceReader[SampleT]):
         return taken
 
     def _acquisitions(self) -> list[tuple[int, int]]:
-        times = self._ring.acquisition_times_ns()
+        times = self._ring.times_ns(ACQUIRED)
         if not times:
             raise Overrun(f"service {self.name!r}: no frame could be read")
         return times

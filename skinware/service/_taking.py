@@ -148,10 +148,11 @@ class Taking(Attachment[SampleT]):
 
     def _read_in_order(self, deadline_ns: int) -> SampleT:
         self._require_open()
-        if self._lags():
-            self._end_turn()
-            return self._taken(self._whole(self._next_in_order), self.alive)
-        return self._next_frame(self._last, deadline_ns, in_order=True)
+        last = self._last
+        if last is not None and last < (self._ring.generation, self._ring.latest):
+            self._end_turn()  # the generation at hand has newer frames, though there may be another one already
+            return self._taken(self._next_in_order, self.alive)
+        return self._next_frame(last, deadline_ns, in_order=True)
 
     def _next_frame(
         self,
@@ -179,7 +180,7 @@ class Taking(Attachment[SampleT]):
             latest = ring.latest
             if latest and (known is None or (ring.generation, latest) > known):
                 take = self._next_in_order if in_order else ring.copy
-                return self._taken(self._whole(take), slept or self.alive)
+                return self._taken(take, slept or self.alive)
             if self._moved:
                 raise self._structure_changed()
             remaining_ns = deadline_ns - now_ns()
@@ -205,11 +206,6 @@ class Taking(Attachment[SampleT]):
             return f"no frame of {self.name!r} yet: its writer is running, but has published nothing so far"
         return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
 
-    def _lags(self) -> bool:
-        """Return whether the generation at hand has newer frames, though there may be another one already."""
-        last = self._last
-        return last is not None and last < (self._ring.generation, self._ring.latest)
-
     def _next_in_order(self) -> SampleT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
@@ -231,26 +227,24 @@ class Taking(Attachment[SampleT]):
 
     def _newest_now(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
         """Return the newest frame without a wait, so that this is the moment to count it."""
-        frame = self._taken(self._whole(take), alive)
+        frame = self._taken(take, alive)
         self._end_turn()
         return frame
 
-    def _whole(self, take: Callable[[], SampleT | None]) -> SampleT | None:
+    def _whole(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
         try:
-            return take()
+            frame = take()
         except Overrun:
             self._accounts.record.overruns += 1
             raise
-
-    def _taken(self, frame: SampleT | None, alive: bool) -> SampleT:
-        frame = self._checked(frame, alive)
-        self._count(frame)
-        return frame
-
-    def _checked(self, frame: SampleT | None, alive: bool) -> SampleT:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
         frame.stale = not alive
+        return frame
+
+    def _taken(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
+        frame = self._whole(take, alive)
+        self._count(frame)
         return frame
 
     @property

@@ -266,8 +266,8 @@ def test_a_signal_ends_a_wait() -> None:
         snapshot = skin.read()
         before = signal.signal(signal.SIGALRM, ring)
         try:
-            signal.setitimer(signal.ITIMER_REAL, 0.02)
             with pytest.raises(Rang):
+                signal.setitimer(signal.ITIMER_REAL, 0.02)
                 skin.read(newer_than=snapshot, timeout_s=20)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)

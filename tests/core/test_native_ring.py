@@ -197,8 +197,8 @@ def test_a_signal_ends_a_wait(way: str) -> None:
             take = taking(reader, way)
             publish(writer, 1)
             take()
-            signal.setitimer(signal.ITIMER_REAL, 0.02)
             with pytest.raises(Rang):
+                signal.setitimer(signal.ITIMER_REAL, 0.02)
                 take()
             publish(writer, 2)
             frame = taking(reader, way)()  # a generator that raised is over

@@ -105,7 +105,7 @@ def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
 def _remove_leftovers(namespace: Namespace, name: str) -> None:
     """Remove what a writer that was killed left half made, and its socket; the caller owns the name.
 
-    The ring stays until another takes its place: readers still want its last frame.
+    The ring stays until another takes its place: readers still want its last sample.
     """
     pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
     for entry in os.listdir(namespace.path):
@@ -114,7 +114,7 @@ def _remove_leftovers(namespace: Namespace, name: str) -> None:
 
 
 def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:
-    """Return the number of frames that were published under a name before.
+    """Return the number of samples that were published under a name before.
 
     A writer that is closed leaves the count in the file of the lock (:func:`note_published`), one that is killed in its
     ring. Absurd counts are not believed.

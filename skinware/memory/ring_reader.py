@@ -51,8 +51,8 @@ class RingReader(Generic[SampleT]):
 
     Args:
         segment: the attached generation.
-        frame_class: class of the frames it hands out.
-        context: what every frame carries as ``context``.
+        frame_class: class of the samples it hands out.
+        context: what every sample carries as ``context``.
     """
 
     def __init__(self, segment: Segment, frame_class: type[SampleT], context: object = None) -> None:
@@ -75,7 +75,7 @@ class RingReader(Generic[SampleT]):
 
     @property
     def latest(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
+        """Sequence of the newest sample, 0 before the first."""
         return self.words[LATEST]
 
     def frame_in(self, data: bytearray, start: int) -> SampleT:
@@ -162,7 +162,7 @@ class RingReader(Generic[SampleT]):
         return self.words[MISSED_PERIODS]
 
     def times_ns(self, word: int) -> list[tuple[int, int]]:
-        """Return (sequence, time) of the frames that the ring still holds, oldest first.
+        """Return (sequence, time) of the samples that the ring still holds, oldest first.
 
         Args:
             word: ``PUBLISHED`` or ``ACQUIRED``.
@@ -178,7 +178,7 @@ class RingReader(Generic[SampleT]):
         return times
 
     def view(self) -> SampleT | None:
-        """Return the newest frame in place, without a copy; ask ``frame.valid`` after using it."""
+        """Return the newest sample in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(COPY_ATTEMPTS):
             wanted = self.latest
             if wanted == 0:

@@ -93,9 +93,9 @@ class Attachment(Generic[SampleT]):
         return self._ring.missed_periods
 
     def rate_hz(self) -> float | None:
-        """Return how often the writer publishes, from the times of the frames that the ring holds.
+        """Return how often the writer publishes, from the times of the samples that the ring holds.
 
-        None where they are too few: after its start a writer may publish two frames at once and then wait.
+        None where they are too few: after its start a writer may publish two samples at once and then wait.
         A writer that was held up publishes what has waited at once; then the times of the data count.
         """
         times = [time_ns for _, time_ns in self._ring.times_ns(PUBLISHED)]
@@ -162,7 +162,7 @@ class Attachment(Generic[SampleT]):
         return RingReader(segment, self.frame_class, self._describe(segment))
 
     def _describe(self, _attached: segments.Segment) -> object:
-        """Return the ``context`` of frames (a subclass reads its structure here); kept while the columns are equal."""
+        """Return the ``context`` of samples (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
     def _attach_within(self, timeout_s: float | None) -> RingReader[SampleT]:

@@ -25,7 +25,7 @@ log = logging.getLogger("skinware.service")
 _FILE_CHECK_NS = NS_PER_S
 
 Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
-"""Every array of a frame, by name: dtype and length, dtype and shape, or a :class:`Column`."""
+"""Every array of a sample, by name: dtype and length, dtype and shape, or a :class:`Column`."""
 
 
 class Ownership:
@@ -37,7 +37,7 @@ class Ownership:
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.
-        published_before: frames that were published under the name before; None: the count in the files.
+        published_before: samples that were published under the name before; None: the count in the files.
 
     Raises:
         NameInUse: a running writer has this name.
@@ -88,7 +88,7 @@ class Ownership:
 
     @property
     def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
+        """Sequence of the newest sample, 0 before the first."""
         return self._ring.sequence
 
     @property

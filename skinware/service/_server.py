@@ -77,7 +77,7 @@ class Request:
 
         Args:
             result: anything that JSON can hold.
-            position: (generation, sequence) of the frame that goes with it.
+            position: (generation, sequence) of the sample that goes with it.
         """
         try:
             encoded = msgspec.json.encode(result)

@@ -31,7 +31,7 @@ _EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
 @dataclass
-class Traffic:
+class LinkTraffic:
     """The frames of a service that came.
 
     Attributes:
@@ -87,7 +87,7 @@ class Pulls:
         return is_open
 
 
-class Output:
+class FrameOutput:
     """Publishes the frames of a service in order.
 
     Attributes:
@@ -98,7 +98,7 @@ class Output:
 
     def __init__(self, name: str, peer: Peer, mirror: Mirror) -> None:
         self._name, self._peer, self._mirror = name, peer, mirror
-        self.traffic = Traffic()
+        self.traffic = LinkTraffic()
         self.count: int | None = None
         self.newest = (0, 0)
         self.is_dead = False
@@ -134,7 +134,7 @@ class Output:
         return age_ns
 
 
-class Follower:
+class ServiceFollower:
     """Follows a service of a robot. Callers hold the lock of the mirror.
 
     Args:
@@ -151,7 +151,7 @@ class Follower:
     ) -> None:
         self._name, self._peer, self._mirror, self._part = name, peer, mirror, part
         self.service = service
-        self.output = Output(name, peer, mirror)
+        self.output = FrameOutput(name, peer, mirror)
         self.is_over = False
         self._pacing = Pacing(0, mode)
         self._pulls = Pulls()
@@ -195,12 +195,12 @@ class Follower:
             self._probe()
 
     def start_over(self) -> None:
-        """The robot has other generations than before."""
+        """Forget the generation: the robot begins new ones."""
         self._generation = None
         self.output.newest, self.output.count = (0, 0), None
 
     def lose(self) -> None:
-        """The robot is not heard any more; all questions are asked again when it is."""
+        """Show the service as dead, and forget all open questions."""
         self._mirror.happened(self._name, DEAD)
         self.output.is_dead, self.output.newest = True, (0, 0)
         self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
@@ -273,7 +273,7 @@ class Follower:
             self._end_listening = self._peer.listen(self._peer.keys.frame(self._name, self._part), self._pushed)
 
     def _pushed(self, key: str, message: bytes) -> None:
-        """In the receiving thread, so that a frame waits for no other one."""
+        """Take a frame in the receiving thread: handing over would cost time."""
         with self._mirror.lock:
             if key == self._peer.keys.frame(self._name, self._part):  # not from a bridge that was followed before
                 self._take_frame(message)

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from skinware.bridge.clock import PeerClock
-from skinware.bridge.following import Follower
+from skinware.bridge.following import ServiceFollower
 from skinware.bridge.link import Link, Priority
 from skinware.bridge.messages import CallResult, Keys, Service, Services, Wish, read_text
 from skinware.bridge.mirror import Mirror
@@ -53,7 +53,7 @@ class Joiner:
     ) -> None:
         self._mode, self._wish, self._namespace = mode, wish, namespace
         self._missing = ""  # of the wish, in the last answer
-        self._followers: dict[str, Follower] = {}
+        self._followers: dict[str, ServiceFollower] = {}
         self._callers: tuple[str, ...] = ()
         self._stopping = False
         self._next_services_ns = 0
@@ -199,7 +199,7 @@ class Joiner:
                 if service.state == "closed":
                     continue
                 part = "" if self._wish is None else self._wish.number
-                follower = Follower(name, service, self._peer, self._mirror, mode=self._mode, part=part)
+                follower = ServiceFollower(name, service, self._peer, self._mirror, mode=self._mode, part=part)
                 self._followers[name] = follower
             follower.take(service)
             if follower.is_over:

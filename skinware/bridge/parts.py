@@ -16,14 +16,14 @@ import numpy.typing as npt
 from skinware import _names
 from skinware._columns import Index, as_index, texts
 from skinware.bridge.messages import Wish
-from skinware.bridge.streaming import Stream
+from skinware.bridge.streaming import FrameStream
 from skinware.errors import BadRecording, BridgeError, StructureError
 from skinware.memory.file_layout import SLOT
 from skinware.memory.ring import Sample
 from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
-from skinware.tactile.choosing import SensorChoice
+from skinware.tactile.regions import SensorChoice
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _KEPT_NS = 10 * NS_PER_S
@@ -32,7 +32,7 @@ _MOST_PARTS = 64
 
 
 @dataclass
-class Head:
+class ServiceFile:
     """The file of a service up to its slots, packed and parsed at most once."""
 
     name: str
@@ -62,7 +62,7 @@ class Cut:
 
     Attributes:
         generation: of the same number, with what stays.
-        head: its file.
+        file: of that generation.
 
     Raises:
         StructureError: it is not a driver, or no sensor stays.
@@ -97,8 +97,8 @@ class Cut:
         others = columns.keys() - {name for name, *_ in self._stay}
         self._stay += [(name, 1, 1, slice(0, 1)) for name in others if math.prod(columns[name].shape)]
         cut = _structure(structure, positions, groups, modules, patches, buses)
-        self.head = Head(whole.name, whole.head_with(cut, Schema(columns, whole.schema.description)))
-        self.generation: Generation = Generation(self.head.raw, whole.name)
+        self.file = ServiceFile(whole.name, whole.head_with(cut, Schema(columns, whole.schema.description)))
+        self.generation: Generation = Generation(self.file.raw, whole.name)
 
     def frame(self, frame: Sample) -> RecordedDriverSnapshot:
         slot = np.zeros(self.generation.slot_stride, np.uint8)
@@ -139,14 +139,14 @@ def _structure(
     )
 
 
-class Part:
+class RobotPart:
     """Some sensors of the drivers of a robot; ``stream_of`` makes the stream of a service."""
 
-    def __init__(self, choice: SensorChoice, stream_of: Callable[[str], Stream]) -> None:
+    def __init__(self, choice: SensorChoice, stream_of: Callable[[str], FrameStream]) -> None:
         self.choice, self._stream_of = choice, stream_of
         self._lock = threading.Lock()
         self._cuts: dict[str, tuple[Generation, Cut | None]] = {}  # by service, each with the whole generation
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, FrameStream] = {}
 
     def fit(self, name: str, whole: Generation) -> bool:
         """Follow a driver to a generation; return whether that has any of the sensors."""
@@ -171,10 +171,10 @@ class Part:
         if cut is not None and cut.generation.generation == frame.generation:
             self._streams[name].take(frame)
 
-    def find(self, name: str) -> tuple[Head, Stream] | None:
+    def find(self, name: str) -> tuple[ServiceFile, FrameStream] | None:
         """Return the file and stream of this part of a driver."""
         _, cut = self._cuts.get(name, (None, None))
-        return None if cut is None else (cut.head, self._streams[name])
+        return None if cut is None else (cut.file, self._streams[name])
 
     def expire(self) -> None:
         """Answer questions that waited too long."""
@@ -191,13 +191,13 @@ class Part:
 class Parts:
     """All parts that peers want now; ``stream_of`` makes the stream of (service, number of the wish)."""
 
-    def __init__(self, stream_of: Callable[[str, str], Stream]) -> None:
+    def __init__(self, stream_of: Callable[[str, str], FrameStream]) -> None:
         self._stream_of = stream_of
         self._lock = threading.Lock()
-        self._parts: dict[str, Part] = {}
+        self._parts: dict[str, RobotPart] = {}
         self._asked_ns: dict[str, int] = {}
 
-    def wanted(self, wish: Wish) -> Part:
+    def wanted(self, wish: Wish) -> RobotPart:
         """Return the part of a wish that came now.
 
         Raises:
@@ -210,12 +210,12 @@ class Parts:
             if part is None:
                 if len(self._parts) >= _MOST_PARTS:
                     raise BridgeError(f"{_MOST_PARTS} other parts of it are wanted already")
-                part = Part(wish.choice(), lambda service: self._stream_of(service, number))
+                part = RobotPart(wish.choice(), lambda service: self._stream_of(service, number))
                 self._parts[number] = part
             self._asked_ns[number] = now_ns()
             return part
 
-    def find(self, number: str, name: str) -> tuple[Head, Stream] | None:
+    def find(self, number: str, name: str) -> tuple[ServiceFile, FrameStream] | None:
         """Return the file and stream of a driver's part."""
         part = self._parts.get(number)
         return None if part is None else part.find(name)

@@ -28,8 +28,8 @@ from skinware.bridge.messages import (
     host_name,
     read_text,
 )
-from skinware.bridge.parts import Head, Parts
-from skinware.bridge.streaming import Stream
+from skinware.bridge.parts import Parts, ServiceFile
+from skinware.bridge.streaming import FrameStream
 from skinware.bridge.watching import Summaries
 from skinware.errors import (
     BridgeError,
@@ -96,11 +96,11 @@ class _Workers:
 
 
 @dataclass
-class _Served:
+class _ServedService:
     """A service, its present generation, and its state."""
 
-    stream: Stream
-    head: Head
+    stream: FrameStream
+    file: ServiceFile
     service: Service
 
 
@@ -130,7 +130,7 @@ class Server:
         instance = os.urandom(8).hex()
         self._identity = Services(instance, f"{boot()}/{namespace.name}", tuple(callers), host=host_name())
         self._keys, self._link, self._namespace = Keys(robot, instance), link, namespace
-        self._services: dict[str, _Served] = {}
+        self._services: dict[str, _ServedService] = {}
         self._states: dict[str, State] = {}
         self._lock = threading.Lock()
         self._is_ending = False
@@ -190,17 +190,17 @@ class Server:
                 for name, served in self._services.items()
             }
 
-    # -- a skinware.transfer.collecting.Listener ------------------------------------------------------------------
+    # -- a skinware.transfer.collecting.FrameListener -------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
         segment = segments.recorded(head, service)
-        state = Service(segment.generation, self._states.get(service, "live"))
+        file, state = ServiceFile(service, head), Service(segment.generation, self._states.get(service, "live"))
         with self._lock:
             served = self._services.get(service)
             if served is None:
-                served = self._services[service] = _Served(self._stream(service), Head(service, head), state)
+                served = self._services[service] = _ServedService(self._stream(service), file, state)
             else:
-                served.head, served.service = Head(service, head), state
+                served.file, served.service = file, state
             served.stream.begin(segment.generation, [CodedColumn.of(column) for column in segment.layout.slot])
         self._link.put(self._keys.services, self._list_of_services())
 
@@ -223,14 +223,14 @@ class Server:
 
     # -- coding, in a thread of its own ---------------------------------------------------------------------------
 
-    def _stream(self, service: str, part: str = "") -> Stream:
-        return Stream(self._link.sender(self._keys.frame(service, part)), self._code_soon)
+    def _stream(self, service: str, part: str = "") -> FrameStream:
+        return FrameStream(self._link.sender(self._keys.frame(service, part)), self._code_soon)
 
     def _code_soon(self, work: Callable[..., object], *arguments: object) -> None:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
-    def _there(self) -> dict[str, _Served]:
+    def _there(self) -> dict[str, _ServedService]:
         """Return copies of all services that are not closed."""
         with self._lock:
             return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
@@ -242,7 +242,7 @@ class Server:
             return
         drivers: dict[str, tuple[State, Structure, Generation, Sample | None]] = {}
         for name, served in there.items():
-            driver = served.head.driver
+            driver = served.file.driver
             if driver is not None and driver.structure is not None:
                 drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
         self._summaries.send(drivers, len(there) - len(drivers), self.lost)
@@ -260,7 +260,7 @@ class Server:
         """Cut a part out of all drivers and add those that have any of it to ``services``; return what is missing."""
         part, structures = self._parts.wanted(wish), []
         for name, served in self._there().items():
-            driver = served.head.driver
+            driver = served.file.driver
             if driver is None or driver.structure is None:
                 continue
             structures.append(driver.structure)
@@ -293,11 +293,11 @@ class Server:
         else:
             question.reply(self._list_of_services())
 
-    def _find(self, question: Question) -> tuple[Head, Stream] | None:
+    def _find(self, question: Question) -> tuple[ServiceFile, FrameStream] | None:
         """Return the file and stream of a service that a question is for; answer the question if there is none."""
         name, part = question.key.split("/")[4], question.parameters.get("part")
         served = self._services.get(name)
-        found = None if served is None else (served.head, served.stream)
+        found = None if served is None else (served.file, served.stream)
         if part:
             found = self._parts.find(part, name)
         if found is None:
@@ -320,12 +320,12 @@ class Server:
         if not self._calls.submit(work, question, *arguments):
             question.fail(b"too many questions at once")
 
-    def _answer_generation(self, question: Question, head: Head) -> None:
+    def _answer_generation(self, question: Question, file: ServiceFile) -> None:
         operations: dict[str, str] = {}
         with contextlib.suppress(SkinwareError):
-            with ServiceReader[Sample](head.name, namespace=self._namespace, announce=False) as reader:
+            with ServiceReader[Sample](file.name, namespace=self._namespace, announce=False) as reader:
                 operations = dict(reader.operations(timeout_s=_OPERATIONS_S))
-        question.reply(generation_message(About(operations), head.packed))
+        question.reply(generation_message(About(operations), file.packed))
 
     def _call(self, question: Question) -> None:
         *_, name, _, operation = question.key.split("/")

@@ -28,7 +28,7 @@ _MOST_OPEN = 1024
 _LONGEST_NAME = 64
 
 
-class _Form(NamedTuple):
+class _FrameForm(NamedTuple):
     """Form in which the frames of a generation are sent.
 
     Attributes:
@@ -63,7 +63,7 @@ class _Puller:
     asked_ns: int = 0
 
 
-class Stream:
+class FrameStream:
     """Sends the frames of a service: each to listeners, the newest to pullers.
 
     ``soon`` calls a function in the only thread that codes.
@@ -76,7 +76,7 @@ class Stream:
     def __init__(self, send: Sender, soon: Callable[..., None]) -> None:
         self._send, self._soon = send, soon
         self._lock = threading.Lock()
-        self._form = _Form(0, (), None)
+        self._form = _FrameForm(0, (), None)
         self._pullers: dict[str, _Puller] = {}
         self.newest: Sample | None = None
         self.frames: int = 0
@@ -90,7 +90,7 @@ class Stream:
     ) -> None:
         """Begin another generation; ``cut`` makes the frames that are sent of those that are taken."""
         with self._lock:
-            self._form, self.newest = _Form(generation, columns, cut), None
+            self._form, self.newest = _FrameForm(generation, columns, cut), None
 
     def take(self, frame: Sample) -> None:
         """Send a frame, unless it is of another generation or not newer than the newest."""
@@ -171,7 +171,7 @@ class Stream:
             puller = self._pullers[who] = _Puller()
         return puller
 
-    def _send_coded(self, form: _Form, frame: Sample, question: Question, puller: _Puller) -> None:
+    def _send_coded(self, form: _FrameForm, frame: Sample, question: Question, puller: _Puller) -> None:
         """Answer a question with a frame; always in the same thread."""
         sent = form.of(frame)
         if puller.generation != sent.generation:

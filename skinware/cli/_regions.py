@@ -40,8 +40,7 @@ def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
     Raises:
         ConfigurationError: a file cannot be read, or has no region of a name.
     """
-    from skinware.tactile.choosing import unknown
-    from skinware.tactile.regions import read_regions
+    from skinware.tactile.regions import read_regions, unknown
 
     regions = read_regions(*(files or (DEFAULT_REGIONS,)))
     for why in unknown("region", names, [region.name for region in regions]):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from skinware.ros2.serving import Ros2Server
-    from skinware.ros2.transport import Identity, Node
+    from skinware.ros2.transport import Node, NodeIdentity
 
 
 @click.command(
@@ -111,7 +111,7 @@ def command(
     from skinware.conversion.showing import in_topic
     from skinware.memory.namespace import Namespace, check_name
     from skinware.ros2.serving import Ros2Server
-    from skinware.ros2.transport import Distro, Identity
+    from skinware.ros2.transport import Distro, NodeIdentity
 
     if connect and rmw != "zenoh":
         raise click.UsageError("--connect is for --rmw zenoh: over DDS, nodes find each other without routers")
@@ -120,7 +120,7 @@ def command(
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
-    identity = Identity(f"skinware_{in_topic(place.name)}", ros_namespace, domain, Distro(distro))
+    identity = NodeIdentity(f"skinware_{in_topic(place.name)}", ros_namespace, domain, Distro(distro))
     with contextlib.closing(_node(rmw, identity, connect, interfaces, _router_report(as_json))) as node:
         server = Ros2Server(
             node,
@@ -143,7 +143,7 @@ def command(
 
 def _node(
     rmw: str,
-    identity: Identity,
+    identity: NodeIdentity,
     connect: tuple[str, ...],
     interfaces: tuple[str, ...],
     router_changed: Callable[[bool, str], None],

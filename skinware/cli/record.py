@@ -172,7 +172,7 @@ def command(
     path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
     beside = Viewers() if for_viewers else None
-    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, beside=beside)
+    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
     report = _Report(recorder, target, path, as_json)
     keys = pressed_calls(recorder.save) if last_s is not None else contextlib.nullcontext()
     with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:

@@ -156,8 +156,7 @@ class _Painter:
         """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
         import numpy as np
 
-        from skinware.tactile.neighbours import neighbours
-        from skinware.tactile.regions import without_holes
+        from skinware.tactile.neighbours import neighbours, without_holes
         from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
 

@@ -1,7 +1,7 @@
 """Write recordings as files of other programs: numpy, CSV, Parquet, HDF5, Foxglove, ROS 2.
 
-A source (:mod:`skinware.conversion.tables`) gives a recording as arrays with a row for each sample, a little at a time;
-each format writes what a source gives, in little memory.
+A source (:mod:`skinware.conversion.tables`) reads a recording as arrays with a row for each sample, a few rows at a
+time; each format writes these rows, in little memory.
 """
 
 from __future__ import annotations

@@ -9,22 +9,18 @@ from skinware.errors import MissingExtra
 
 
 def h5py() -> Any:
-    """The package h5py.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
+    """Return the package h5py, or raise MissingExtra."""
     return _package("h5py", "HDF5")
 
 
 def pyarrow() -> Any:
-    """The package pyarrow, with its module ``parquet``; likewise."""
+    """Return the package pyarrow with its module ``parquet``, or raise MissingExtra."""
     _package("pyarrow.parquet", "Parquet")
     return _package("pyarrow", "Parquet")
 
 
 def pillow() -> Any:
-    """The module ``PIL.Image``; likewise."""
+    """Return the module ``PIL.Image``, or raise MissingExtra."""
     return _package("PIL.Image", "a data set with images")
 
 

@@ -19,7 +19,7 @@ FORMAT, VERSION = "skinware-arrays", 1
 
 
 def description(source: Source, units: Sequence[dict[str, str]]) -> bytes:
-    """Return the JSON text that a file of arrays carries: its format, tables, units, events and clocks."""
+    """Return the JSON text in a file of arrays: its format, tables, units, events and clocks."""
     tables = [
         {"name": table.name, "service": table.service, "units": of}
         for table, of in zip(source.tables, units, strict=True)
@@ -32,7 +32,7 @@ _DESCRIPTION = "recording"
 
 
 def write_npz(source: Source, path: Path) -> None:
-    """Write a source. Each array is a pass over it: it must be whole before the next one begins.
+    """Write a source, in one pass for each array, which must be whole before the next one begins.
 
     Raises:
         OSError: it cannot be written.
@@ -70,11 +70,11 @@ def _write_streamed(archive: zipfile.ZipFile, table: Table, output: Output, rows
 
 
 _CHUNK_BYTES = 256 << 10
-"""Of an array: what a program reads at least."""
+"""Bytes of an array that HDF5 reads at once."""
 
 
 class _File:
-    """A file in which HDF5 writes, and which never fails for it: the library does not survive a full disk.
+    """A file for HDF5 that keeps errors to itself, because the library does not survive a full disk.
 
     Args:
         path: of the file.
@@ -122,7 +122,7 @@ class _File:
         return self._file.tell()
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing: writes are not buffered."""
 
     def check(self) -> None:
         if self.failure is not None:

@@ -1,4 +1,4 @@
-"""Convert a recording: write it in another format under a name that appears when all is written."""
+"""Write a recording in another format, under a name that appears when the file is complete."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from skinware.recording.wire import Chosen, Exported, export_candump, export_pca
 
 
 class Format(NamedTuple):
-    """A format that can be written.
+    """A format of files or folders.
 
     Attributes:
-        suffix: of its files, or of its folders.
-        write: writes a source into a path at which nothing is.
-        without: tells of a source what the format cannot hold of it; a line each.
+        suffix: of its files or folders.
+        write: writes a source to a path that does not exist.
+        without: returns a line for each thing of a source that the format cannot hold.
     """
 
     suffix: str
@@ -49,13 +49,13 @@ FORMATS = {
 
 @dataclass
 class Converted:
-    """What came of a conversion.
+    """The result of a conversion.
 
     Attributes:
         path: of the new file or folder.
-        frames: of each table in it.
-        notes: what is wrong with the old file, and what is not in the new one; a line each.
-        episodes: of a learning set; None: it is none.
+        frames: samples in it, by table.
+        notes: a line for each fault of the old file, and for each thing that the new one lacks.
+        episodes: number of episodes of a learning set; None for other formats.
     """
 
     path: Path
@@ -78,18 +78,18 @@ def convert(
 
     Args:
         path: a recording; it is only read.
-        target: the new file or folder, at which nothing may be; None: beside the old one, with the format's suffix.
+        target: the new file or folder, which must not exist; None: beside the recording, with the format's suffix.
         format_name: one of :data:`FORMATS`.
-        selection: what of it; None: all.
-        start_s: where to begin, s since it began.
-        end_s: where to end, likewise; None: at its end.
-        is_stopped: asked now and then; True ends it with :class:`KeyboardInterrupt`, and nothing is written.
+        selection: the services and sensors to convert; None: all.
+        start_s: begin at this time, s since the recording began.
+        end_s: end before this time; None: at the end of the recording.
+        is_stopped: called now and then; True ends the conversion with :class:`KeyboardInterrupt` and leaves no file.
 
     Raises:
-        BadRecording: the file is not one of these, or of a newer version, or nothing in it can be used.
-        ConfigurationError: it does not have what is selected.
+        BadRecording: the file is not a recording, needs a newer version, or has no undamaged sample.
+        ConfigurationError: the recording lacks what is selected.
         MissingExtra: a package of the extra ``convert`` is not installed.
-        OSError: it cannot be read, or the new one cannot be written.
+        OSError: the recording cannot be read, or the target cannot be written.
     """
     form = FORMATS[format_name]
     target = new_target(path, target, form.suffix)
@@ -100,16 +100,16 @@ def convert(
         with begun_beside(target) as begun:
             form.write(source, begun)
             if not source.frames.total():
-                raise ConfigurationError(f"{path}: nothing was recorded of what was asked for in that time")
+                raise ConfigurationError(f"{path}: no sample of the selection was recorded in that time")
         notes = [f"{target}: {note}" for note in form.without(source)]
         return Converted(target, source.frames, [*source.problems, *notes])
 
 
 def new_target(path: Path, target: Path | None, suffix: str) -> Path:
-    """Where a file is converted to: the target itself, or, if that is None, a name beside the file.
+    """Return the target, or, if that is None, a name beside the file.
 
     Raises:
-        FileExistsError: something is there.
+        FileExistsError: it exists.
     """
     target = target or path.with_name(path.stem + suffix)
     if target.exists():
@@ -119,7 +119,7 @@ def new_target(path: Path, target: Path | None, suffix: str) -> Path:
 
 @contextlib.contextmanager
 def begun_beside(target: Path) -> Iterator[Path]:
-    """A path to write at, which gets its name when all is written; what was begun is removed otherwise."""
+    """Yield a path to write to, which is renamed to the target at the end, or removed if an error occurs."""
     begun = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         yield begun
@@ -133,7 +133,7 @@ def begun_beside(target: Path) -> Iterator[Path]:
 
 
 class Watched(DerivedSource):
-    """A source whose frames are counted as they are written, until somebody stops that."""
+    """A source that counts its samples as they are written, and ends when it is stopped."""
 
     def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:
         self.frames: Counter[str] = Counter()
@@ -141,7 +141,7 @@ class Watched(DerivedSource):
 
 
 class _WatchedTable(Table):
-    """A table that notes how many frames its last pass gave."""
+    """A table that counts the samples of its last pass."""
 
     def __init__(self, table: Table, frames: Counter[str], is_stopped: Callable[[], bool]) -> None:
         super().__init__(table.name, table.service, table.generations)
@@ -163,7 +163,7 @@ class _Export(Protocol):
 
 
 class WireFormat(NamedTuple):
-    """A format that can be written: the suffix of its files, and what writes them."""
+    """A format of recorded wires: the suffix of its files, and the function that writes one."""
 
     suffix: str
     export: _Export
@@ -182,25 +182,25 @@ def convert_wires(
     end_s: float | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Converted:
-    """Write what went over the wires of drivers.
+    """Write the recorded wires of drivers.
 
     Args:
         path: a recording that ``skin-record --wire`` made; it is only read.
-        target: as for :func:`skinware.conversion.convert`.
+        target: the new file.
         format_name: one of :data:`WIRE_FORMATS`.
-        selection: which drivers; None: all.
-        start_s: as for :func:`skinware.conversion.convert`.
-        end_s: likewise.
-        is_stopped: likewise.
+        selection: the drivers to export; None: all.
+        start_s: begin at this time, s since the recording began.
+        end_s: end before this time; None: at the end of the recording.
+        is_stopped: as for :func:`convert`.
 
     Raises:
-        BadRecording: the file is no recording, or one of a newer version, or one without wires.
-        ConfigurationError: no wire of a driver was recorded, or only some sensors are selected: a wire has none.
-        OSError: it cannot be read, or the new one cannot be written.
+        BadRecording: the file is not a recording, needs a newer version, or has no wires.
+        ConfigurationError: no wire of a driver was recorded, or sensors are selected, which a wire does not have.
+        OSError: the recording cannot be read, or the new file cannot be written.
     """
     form, selection = WIRE_FORMATS[format_name], selection or Selection()
     if selection.sensors:
-        raise ConfigurationError(f"{format_name} has what went over the wires: frames, not sensors, can be selected")
+        raise ConfigurationError(f"{format_name} holds frames of wires: select drivers, not sensors")
     target = new_target(path, target, form.suffix)
     with contextlib.closing(Recording(path)) as recording, begun_beside(target) as begun:
         exported = form.export(recording, begun, Chosen(selection.services, start_s, end_s, is_stopped))

@@ -70,7 +70,7 @@ _CHUNK_NS = NS_PER_S // 4
 _CHUNK_BYTES = 8 << 20
 
 
-class _Told(NamedTuple):
+class _TimedJson(NamedTuple):
     """An event, or what the clocks were.
 
     Attributes:
@@ -92,10 +92,10 @@ def write_recording(source: Source, path: Path) -> None:
     """
     file = RecordingFile(path)
     writer = _RecordingWriter(file)
-    items: list[Iterator[TimedFrame | _Told]] = [
+    items: list[Iterator[TimedFrame | _TimedJson]] = [
         *(timed_frames([table]) for table in source.tables),
-        _told(EVENTS, source.events),
-        _told(CLOCK, source.clock),
+        _timed_json(EVENTS, source.events),
+        _timed_json(CLOCK, source.clock),
     ]
     try:
         for item in heapq.merge(*items, key=lambda item: item.time_ns):
@@ -109,9 +109,11 @@ def write_recording(source: Source, path: Path) -> None:
         file.finish()
 
 
-def _told(topic: str, told: list[dict[str, Any]]) -> Iterator[_Told]:
-    for each in told:
-        yield _Told(each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"})
+def _timed_json(topic: str, entries: list[dict[str, Any]]) -> Iterator[_TimedJson]:
+    for each in entries:
+        yield _TimedJson(
+            each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"}
+        )
 
 
 @dataclass
@@ -148,9 +150,9 @@ class _RecordingWriter:
         self._frames_size += len(timed.frame.slot)
         self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
 
-    def add_json(self, told: _Told) -> None:
-        channel, schema = self._channels.of_all(told.topic)
-        self._chunk.add(channel, schema, 0, told.time_ns, json.dumps(told.data).encode())
+    def add_json(self, item: _TimedJson) -> None:
+        channel, schema = self._channels.of_all(item.topic)
+        self._chunk.add(channel, schema, 0, item.time_ns, json.dumps(item.data).encode())
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
@@ -172,11 +174,11 @@ class _RecordingWriter:
 
 _MESSAGE_CHUNK_BYTES = 4 << 20
 _BAG_VERSION = 5
-"""Of metadata.yaml: that of ROS 2 Humble, which later ones read."""
+"""Version of metadata.yaml: that of ROS 2 Humble, which later ones read."""
 
 
 def write_foxglove(source: Source, path: Path) -> None:
-    """Write what viewers show of drivers, at most 30 times a second, and what happened to them.
+    """Write the pictures and states of drivers, at most 30 times a second, and their events.
 
     Raises:
         ConfigurationError: no driver is in it.
@@ -206,7 +208,7 @@ def viewers_without(source: Source) -> list[str]:
 
 
 def write_ros2(source: Source, folder: Path) -> None:
-    """Write a bag of ROS 2 (rosbag2, storage mcap) into a folder, which is made: every frame, and what viewers show.
+    """Write a bag of ROS 2 (rosbag2, storage mcap) into a new folder: every sample, and pictures for viewers.
 
     Raises:
         ConfigurationError: no driver is in it.
@@ -217,12 +219,12 @@ def write_ros2(source: Source, folder: Path) -> None:
     name = f"{source.path.stem}_0.mcap"
     viewers = Viewers(json_state=False)
     writer = _MessageWriter(folder / name, "ros2")
-    told: set[Generation] = set()
+    described: set[Generation] = set()
     tables = {generation: table for table in drivers for generation in table.generations}
     try:
         for timed in timed_frames(drivers):
-            if timed.generation not in told:
-                told.add(timed.generation)
+            if timed.generation not in described:
+                described.add(timed.generation)
                 writer.add(_sensors(timed, tables[timed.generation]), timed.time_ns)
             writer.add(_skin_frame(timed), timed.time_ns)
             for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
@@ -285,7 +287,7 @@ class _MessageWriter:
             self._file.finish()
 
     def metadata(self, name: str) -> str:
-        """What rosbag2 wants to know of the file, which has that name."""
+        """Return the text of rosbag2's metadata.yaml for a file of this name."""
         begin_ns = min(self._begin_ns, self._end_ns)
         times = [
             ("duration", f"{{nanoseconds: {self._end_ns - begin_ns}}}"),

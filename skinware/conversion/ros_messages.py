@@ -178,7 +178,7 @@ STATE = Schema(21, json.dumps(_STATE).encode(), "jsonschema", "skinware.State")
 
 
 def acquired_ns(frame: DriverSnapshot, time_ns: int) -> int:
-    """When the newest data of a frame was acquired, wall clock; when it was published, if it has none.
+    """Return when the newest data of a sample was acquired, wall clock; without data the time of publication.
 
     Args:
         frame: it.
@@ -188,7 +188,7 @@ def acquired_ns(frame: DriverSnapshot, time_ns: int) -> int:
 
 
 def skin_frame(frame: DriverSnapshot, time_ns: int, status: npt.NDArray[np.uint8] | None = None) -> bytes:
-    """All values of a frame, as ``skinware_msgs/SkinFrame``.
+    """Return all values of a sample as ``skinware_msgs/SkinFrame``.
 
     Args:
         frame: it.
@@ -205,7 +205,7 @@ def skin_frame(frame: DriverSnapshot, time_ns: int, status: npt.NDArray[np.uint8
 
 
 def sensors(structure: Structure, names: Sequence[str], generation: int, time_ns: int) -> bytes:
-    """What the sensors of a generation are, as ``skinware_msgs/Sensors``.
+    """Return the sensors of a generation as ``skinware_msgs/Sensors``.
 
     Args:
         structure: of it.

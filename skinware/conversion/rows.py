@@ -48,7 +48,7 @@ class Leaf(NamedTuple):
         return math.prod(self.shape)
 
     def of(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(m, size) the numbers in m rows, in place where that is possible."""
+        """Return the numbers of m rows, (m, size), as a view where that is possible."""
         for field in self.path:
             rows = rows[field]
         return rows.reshape(len(rows), self.size)
@@ -58,7 +58,7 @@ class Leaf(NamedTuple):
 
 
 def leaves(each: ArrayFormat) -> list[Leaf]:
-    """Of the rows of an array; those in which there is nothing are left out."""
+    """Return the leaves of an array that hold numbers."""
     found = [Leaf((), each.shape, each.dtype)]
     while any(leaf.dtype.names is not None for leaf in found):
         found = [inner for leaf in found for inner in _opened(leaf)]
@@ -80,7 +80,7 @@ def _opened(leaf: Leaf) -> list[Leaf]:
 _OF_DRIVERS = (
     "values", "status", "module_time_ns", "group_time_ns", "patch_state", "bus_state", "bus_reason", "bus_load",
 )  # fmt: skip
-"""Columns of a driver that a text has; counters and histograms would be most of it."""
+"""Columns of a driver in text files; counters and histograms would fill most of the file."""
 
 
 def write_csv(source: Source, folder: Path) -> None:
@@ -129,7 +129,7 @@ def _is_wanted(table: Table, output: Output) -> bool:
 
 
 def _file_part(output: Output) -> str:
-    """What the name of a file has of its array: ``values``, or the type of physical values."""
+    """Return the part of a file name for an array: ``values``, or the type of physical values."""
     name = output.name.removeprefix(COLUMNS).removeprefix(PHYSICAL)
     return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in name)
 
@@ -156,7 +156,7 @@ class _Text:
 
 
 def _texts(leaf: Leaf, rows: npt.NDArray[Any]) -> list[str]:
-    """The numbers of a leaf in m rows, a text for each row. Floats have as many digits as tell them exactly."""
+    """Return the numbers of a leaf as one text for each of m rows; floats with all the digits that define them."""
     numbers = leaf.of(rows)
     if leaf.dtype.kind in "iu":
         return [",".join(map(str, row)) for row in numbers.tolist()]
@@ -192,7 +192,7 @@ def _labels(table: Table, output: Output) -> list[str]:
 
 
 def _numbered(leaf: Leaf, name: str) -> list[str]:
-    """A label for each number of a leaf: its name, with its place where there are several."""
+    """Return a label for each number of a leaf: its name, with an index if there are several."""
     if not leaf.shape:
         return [name]
     return [f"{name}[{','.join(map(str, place))}]" for place in np.ndindex(leaf.shape)]
@@ -205,7 +205,7 @@ def _write_lines(path: Path, columns: dict[str, npt.NDArray[Any]]) -> None:
 
 
 def _line(cells: Iterable[object]) -> str:
-    """A line of cells, in quotes where they would be taken for something else."""
+    """Return a CSV line of cells, quoted where needed."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\r\n").writerow(cells)  # which has \r in quotes too
     return text.getvalue().removesuffix("\r\n") + "\n"
@@ -235,7 +235,7 @@ def write_parquet(source: Source, folder: Path) -> None:
 
 
 def _write_parquet_table(arrow: Any, table: Table, made: Sequence[Output], path: Path) -> None:
-    """The rows of a table; a column for each leaf of its arrays, a list for each frame where there are several."""
+    """Write the rows of a table: a column for each leaf of its arrays, with lists where a leaf has several numbers."""
     columns = [(output, leaf) for output in made for leaf in leaves(output.format)]
     check_distinct([leaf.name(output.name) for output, leaf in columns], "Parquet", table)
     fields = [
@@ -259,7 +259,7 @@ def _write_parquet_table(arrow: Any, table: Table, made: Sequence[Output], path:
 
 
 def _is_plain(leaf: Leaf) -> bool:
-    """Whether the numbers are ones that Parquet has; others are written as bytes."""
+    """Return whether Parquet has this type of number; others are written as bytes."""
     return leaf.dtype.kind in "iu" or (leaf.dtype.kind == "f" and leaf.dtype.itemsize in (4, 8))
 
 

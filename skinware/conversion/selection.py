@@ -1,4 +1,4 @@
-"""What of a recording is converted: some services, and of drivers some sensors."""
+"""Select the services of a recording, and the sensors of its drivers, for a conversion."""
 
 from __future__ import annotations
 
@@ -12,22 +12,20 @@ import numpy.typing as npt
 from skinware._columns import as_index
 from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
 from skinware.errors import ConfigurationError
-from skinware.tactile.choosing import SensorChoice, unknown
-from skinware.tactile.regions import Regions
+from skinware.tactile.regions import Regions, SensorChoice, unknown
 from skinware.transfer.generation import PER_SENSOR
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What is wanted.
+    """The services and sensors to convert. A choice of sensors leaves out services without sensors.
 
     Attributes:
         services: names; empty: all.
-        types: names of sensor types; empty: all. This and what follows is about sensors: services that have none are
-            then left out.
-        patches: names of patches, as people know them; empty: all.
-        regions: those that ``in_regions`` names are of.
-        in_regions: names of regions: only sensors that are in any of them; empty: all.
+        types: names of sensor types; empty: all.
+        patches: names of patches; empty: all.
+        regions: definitions of the regions in ``in_regions``.
+        in_regions: names of regions: only sensors in one of them; empty: all.
     """
 
     services: Collection[str] = ()
@@ -38,14 +36,14 @@ class Selection:
 
     @property
     def sensors(self) -> SensorChoice:
-        """Which sensors are wanted."""
+        """The choice of sensors."""
         return SensorChoice(self.types, self.patches, self.regions, self.in_regions)
 
     def of(self, source: Source) -> SelectedSource:
-        """What of a source is wanted.
+        """Return a source reduced to the selection.
 
         Raises:
-            ConfigurationError: the source has no service, type or patch of a name, or nothing that is wanted.
+            ConfigurationError: the source has no service, type or patch of a name, or none of the chosen sensors.
         """
         sensors = self.sensors
         structures = [table.structure for table in source.tables if table.structure is not None]
@@ -56,12 +54,12 @@ class Selection:
         if sensors:
             tables = [narrowed for table in tables for narrowed in _narrowed(table, sensors)]
             if not tables:
-                raise ConfigurationError(f"{source.path}: no sensor in it is of what was asked for")
+                raise ConfigurationError(f"{source.path}: no sensor in it is selected")
         return SelectedSource(source, tables)
 
 
 def _narrowed(table: Table, sensors: SensorChoice) -> Iterator[Table]:
-    """A driver's table with some of its sensors, if it has any of them."""
+    """Yield a driver's table with the chosen sensors, if it has any of them."""
     if table.structure is not None:
         wanted = sensors.of(table.service, table.structure)
         if wanted.any():
@@ -72,8 +70,8 @@ class NarrowedTable(Table):
     """A driver's table with some of its sensors.
 
     Args:
-        table: with all of them.
-        positions: (n,) of those that stay, in a frame.
+        table: with all sensors.
+        positions: (n,) positions of the sensors to keep.
     """
 
     def __init__(self, table: Table, positions: npt.NDArray[np.int64]) -> None:

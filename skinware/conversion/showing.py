@@ -28,7 +28,7 @@ from skinware.transfer.generation import Generation
 from skinware.views.scene import shape_of
 
 _FLOAT32, _UINT8 = 7, 2
-"""Types of fields of a PointCloud2."""
+"""Field types of a PointCloud2."""
 _FIELDS = (
     *((name, _FLOAT32) for name in ("x", "y", "z", "intensity", "age")),
     ("status", _UINT8),
@@ -41,10 +41,8 @@ class Message(NamedTuple):
     """A message for viewers.
 
     Attributes:
-        topic: its channel's.
-        encoding: likewise.
-        schema: likewise.
-        data: of it.
+        topic, encoding, schema: of its channel.
+        data: contents.
     """
 
     topic: str
@@ -54,12 +52,12 @@ class Message(NamedTuple):
 
 
 class Showing:
-    """What is shown of one generation of a driver.
+    """Makes messages for viewers from the samples of one generation of a driver.
 
     Args:
         name: of the driver.
         structure: of the generation.
-        json_state: the state is JSON as it is; else it is in a ``std_msgs/String``, for ROS 2.
+        json_state: write the state as JSON; False: in a ``std_msgs/String``, for ROS 2.
 
     Attributes:
         has_points: whether the place of any sensor is known.
@@ -76,11 +74,11 @@ class Showing:
         return {each.topic: each.schema for each in self._shown}
 
     def messages(self, frame: DriverSnapshot, time_ns: int) -> Iterator[Message]:
-        """What is shown of a frame.
+        """Yield the pictures and the state of a sample.
 
         Args:
-            frame: it.
-            time_ns: when it was published, wall clock.
+            frame: the sample.
+            time_ns: time of publication, wall clock.
         """
         yield from self.pictures(frame, time_ns)
         yield self._state(frame)
@@ -93,13 +91,13 @@ class Showing:
         status: npt.NDArray[np.uint8] | None = None,
         wanted: Callable[[str], bool] = lambda _: True,
     ) -> Iterator[Message]:
-        """The point clouds and images of a frame.
+        """Yield the point clouds and images of a sample.
 
         Args:
-            frame: it.
-            time_ns: when it was published, wall clock.
-            status: (n_sensors,) of the sensors; default: as of the frame.
-            wanted: tells of a topic whether its message is made.
+            frame: the sample.
+            time_ns: time of publication, wall clock.
+            status: (n_sensors,) status of the sensors; default: that of the sample.
+            wanted: says for a topic whether to make its message.
         """
         status = frame.status if status is None else status
         shown = [each for each in self._shown if wanted(each.topic)]
@@ -300,13 +298,13 @@ class Viewers:
         self._drivers: dict[str, _Driver] = {}
 
     def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[Message]:
-        """What is shown of a frame, if it is time for one.
+        """Yield the messages of a sample if the next ones of its driver are due.
 
         Args:
-            service: whose frame.
-            generation: of it.
-            frame: it.
-            time_ns: when it was published, wall clock.
+            service: name of the service.
+            generation: of the sample.
+            frame: the sample.
+            time_ns: time of publication, wall clock.
         """
         if not isinstance(generation.context, Structure):
             return

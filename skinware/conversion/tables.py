@@ -1,4 +1,4 @@
-"""Give what was recorded as tables: arrays with a row for each sample of a service, read in pieces."""
+"""Read recordings as tables: arrays with a row for each sample of a service, a few rows at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skinware.structure import Structure
 from skinware.transfer.generation import Generation
 
 FRAMES, COLUMNS, PHYSICAL = "frames/", "columns/", "physical/"
-"""What names of arrays begin with: of what every frame has, of columns of the service, of values in their unit."""
+"""Prefixes of array names: headers of samples, columns of the service, values in their unit."""
 
 TIME = "frames/time_ns"
 OF_FRAMES = {
@@ -33,10 +33,10 @@ OF_FRAMES = {
     "frames/published_ns": np.dtype("<i8"),
     "frames/flags": np.dtype("<u8"),
 }
-"""``time_ns``: when it was published, ns since 1970, on the axis of the recording; the others as those of a frame."""
+"""``time_ns``: time of publication, ns since 1970, on the axis of the recording; the others as in a sample."""
 
 Block = dict[str, npt.NDArray[Any]]
-"""m rows of some arrays, by name."""
+"""m rows of arrays, by name."""
 
 
 class Span(NamedTuple):
@@ -51,7 +51,7 @@ class Span(NamedTuple):
 
     @staticmethod
     def of(recording_begin_ns: int, start_s: float, end_s: float | None) -> Span:
-        """From seconds since a recording began; None: to its end."""
+        """Return the span of seconds since a recording began; None: to its end."""
         begin_ns = recording_begin_ns + round(start_s * NS_PER_S)
         return Span(begin_ns, 1 << 63 if end_s is None else recording_begin_ns + round(end_s * NS_PER_S))
 
@@ -65,10 +65,10 @@ class Span(NamedTuple):
 
 
 class ArrayFormat(NamedTuple):
-    """What a row of an array is.
+    """The format of a row.
 
     Attributes:
-        shape: of a row; () where it is one number.
+        shape: () for one number.
         dtype: of its numbers.
     """
 
@@ -81,12 +81,12 @@ class ArrayFormat(NamedTuple):
 
 
 class Table(ABC):
-    """The frames of one service for as long as its columns and tables stayed the same.
+    """The samples of one service as long as its columns and tables stayed the same.
 
     Args:
-        name: of the table: that of the service; with ``@2`` if it is the second part of what was recorded of it.
+        name: of the table: the service's, with ``@2`` for its second part.
         service: name of the service.
-        generations: whose frames are in it, by number; with the same columns and tables.
+        generations: of its samples, by number; all have the same columns and tables.
 
     Attributes:
         name, service, generations: as given.
@@ -98,11 +98,10 @@ class Table(ABC):
 
     @abstractmethod
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """Some of the arrays, a few rows at a time; every pass gives the same.
+        """Yield rows of some arrays, a few at a time; each call begins again with the first.
 
         Raises:
-            BadRecording: they cannot be read.
-            OSError: likewise.
+            BadRecording, OSError: they cannot be read.
         """
 
     @property
@@ -111,7 +110,7 @@ class Table(ABC):
 
     @property
     def structure(self) -> Structure | None:
-        """Of a driver; None of other services."""
+        """The structure of a driver; None for other services."""
         return self.origin.context if isinstance(self.origin.context, Structure) else None
 
     @cached_property
@@ -142,26 +141,26 @@ class Source(Protocol):
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """What happened to services, each with ``log_time_ns``, on the axis of the recording."""
+        """Events of services, each with ``log_time_ns`` on the axis of the recording."""
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """The clocks of the machine at the same moments, likewise."""
+        """Readings of the machine's clocks, each with ``log_time_ns``."""
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong with the file, as far as it was read, and what of it is in no table; a line each."""
+        """A line for each fault found in the file so far, and for each thing that no table has."""
 
     def close(self) -> None:
-        """Let go of the file. Idempotent."""
+        """Close the file. Idempotent."""
 
 
 class DerivedSource:
-    """A source whose tables are made of those of another; everything else is that one's.
+    """A source with other tables than the one that it stands for.
 
     Args:
-        source: the other one.
-        tables: of this one.
+        source: everything but the tables.
+        tables: made of the source's.
     """
 
     def __init__(self, source: Source, tables: Sequence[Table]) -> None:
@@ -189,14 +188,14 @@ class DerivedSource:
 
 @dataclass(frozen=True)
 class Output:
-    """An array as it is written: one of the table's, or made of them.
+    """An array to write: one of a table's, or computed from them.
 
     Attributes:
-        name: of it.
+        name: in the file.
         format: of a row.
         unit: of its numbers, for people.
-        needs: names of the table's arrays that it is made of.
-        of: makes it of a block of them.
+        needs: names of the table's arrays that it is computed from.
+        of: computes it from a block of these.
     """
 
     name: str
@@ -207,7 +206,7 @@ class Output:
 
 
 def outputs(table: Table) -> list[Output]:
-    """All arrays of a table, and for each type of sensors ``physical/TYPE``: values in the type's unit."""
+    """Return all arrays of a table, and ``physical/TYPE``, values in its unit, for each sensor type."""
     found = [Output(name, each, _unit(table, name), (name,), _itself(name)) for name, each in table.arrays.items()]
     structure = table.structure
     if structure is not None:
@@ -240,22 +239,22 @@ def check_distinct(names: Sequence[str], format_name: str, table: Table) -> None
 
 
 def sensor_table(table: Table) -> dict[str, npt.NDArray[Any]]:
-    """Of each of the n sensors of a driver, in the order of its values, what people and programs want to know of it.
+    """Return columns (n,) that describe the n sensors of a driver, in the order of its values.
 
-    Texts are numpy's; places are NaN where they are not known, and left out if nobody knows any.
+    Unknown places are NaN; without any place these columns are left out.
     """
     structure = table.structure
     if structure is None:
         return {}
     row_of = {sensor_type.id: row for row, sensor_type in enumerate(structure.types)}
     rows = np.array([row_of[type_id] for type_id in structure.sensor_type.tolist()])
-    told: dict[str, npt.NDArray[Any]] = {"name": np.array(table.sensor_names)}
+    columns: dict[str, npt.NDArray[Any]] = {"name": np.array(table.sensor_names)}
     for field in ("name", "unit", "scale", "offset", "minimum", "maximum"):
         of_types = np.array([getattr(sensor_type, field) for sensor_type in structure.types])
-        told["type" if field == "name" else field] = of_types[rows]
+        columns["type" if field == "name" else field] = of_types[rows]
     module = structure.sensor_module.astype(np.int64)
     patch = structure.sensor_patch.astype(np.int64)
-    told |= {
+    columns |= {
         "uid": structure.sensor_uid,
         "module": np.array(structure.module_names)[module],
         "module_number": module,
@@ -265,20 +264,19 @@ def sensor_table(table: Table) -> dict[str, npt.NDArray[Any]]:
     }
     if structure.geometry is not None:
         geometry = structure.geometry
-        told["frame"] = geometry.frame.astype(str)
+        columns["frame"] = geometry.frame.astype(str)
         for axis, letter in enumerate("xyz"):
-            told[f"{letter}_m"] = geometry.position_m[:, axis]
-            told[f"normal_{letter}"] = geometry.normal[:, axis]
-        told["radius_m"] = geometry.radius_m
-    return told
+            columns[f"{letter}_m"] = geometry.position_m[:, axis]
+            columns[f"normal_{letter}"] = geometry.normal[:, axis]
+        columns["radius_m"] = geometry.radius_m
+    return columns
 
 
 def _unit(table: Table, name: str) -> str:
     if name.startswith(FRAMES):
         return "ns" if name.endswith("_ns") else ""
     column = name.removeprefix(COLUMNS)
-    told = table.origin.schema.columns[column].unit
-    return told or ("ns" if column.endswith("_ns") else "")
+    return table.origin.schema.columns[column].unit or ("ns" if column.endswith("_ns") else "")
 
 
 def _itself(name: str) -> Callable[[Block], npt.NDArray[Any]]:
@@ -290,7 +288,7 @@ def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDA
 
 
 class RecordedTable(Table):
-    """A part of what was recorded of a service."""
+    """A track, read as a table."""
 
     def __init__(self, name: str, part: Track, recording: Recording, span: Span) -> None:
         super().__init__(name, part.name, part.generations)
@@ -319,10 +317,10 @@ class RecordedSource:
 
     Args:
         path: of the file.
-        start_s, end_s: what part of its time, s since it began; None: to its end.
+        start_s, end_s: part of its time, s since it began; None: to its end.
 
     Raises:
-        BadRecording: it is not one, or of a newer version.
+        BadRecording: it is not a recording, or needs a newer version.
         OSError: it cannot be read.
     """
 
@@ -338,7 +336,7 @@ class RecordedSource:
     def _tables_of(self, track: Track) -> list[Table]:
         parts = track.parts
         if not parts:
-            self._recording.note(f"frames of {track.name!r} left out: what they are made of is lost")
+            self._recording.note(f"samples of {track.name!r} left out: their description is lost")
         names = [track.name if not number else f"{track.name}@{number + 1}" for number in range(len(parts))]
         return [RecordedTable(*each, self._recording, self._span) for each in zip(names, parts, strict=True)]
 
@@ -354,15 +352,15 @@ class RecordedSource:
     @property
     def problems(self) -> list[str]:
         cut = [] if self._recording.is_whole else ["cut off or damaged: converted as far as it is whole"]
-        wires = ["what went over wires is left out: candump and pcapng have it"] * bool(self._recording.wires)
+        wires = ["wires are left out: convert them to candump or pcapng"] * bool(self._recording.wires)
         return [f"{self.path}: {problem}" for problem in [*cut, *self._recording.problems, *wires]]
 
     def close(self) -> None:
         self._recording.close()
 
-    def _in_span(self, told: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _in_span(self, readings: list[dict[str, Any]]) -> list[dict[str, Any]]:
         timed = []
-        for each in told:
+        for each in readings:
             time_ns = self.start_ns + round(each.pop("time_s") * NS_PER_S)
             if self._span.has(time_ns):
                 timed.append({**each, "log_time_ns": time_ns})

@@ -1,4 +1,4 @@
-"""Recordings of skins: everything that was published, in one MCAP file, and how to read it.
+"""Record all published samples in an MCAP file, and read it.
 
 ::
 
@@ -7,7 +7,7 @@
     with skinware.recording.open("walk.mcap") as recording:
         torso = recording["torso"].read()
         pressure = torso.physical("pressure")  # (frames, sensors) float32, at torso.time_s
-        for snapshot in recording.snapshots():  # as skinware.Skin gives them
+        for snapshot in recording.snapshots():  # like those of skinware.Skin
             ...
 """
 
@@ -47,7 +47,7 @@ def open(path: str | Path) -> Recording:  # noqa: A001, as of gzip and others
         path: of the file.
 
     Raises:
-        BadRecording: it is not a recording, or one of a newer version.
+        BadRecording: it is not a recording, or needs a newer version.
         OSError: it cannot be read.
     """
     return Recording(path)

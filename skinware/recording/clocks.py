@@ -1,8 +1,7 @@
-"""The axis on which a recording is ordered, and what the other clocks of the machine do meanwhile.
+"""Order a recording by CLOCK_MONOTONIC, and notice what the other clocks of the machine do.
 
-Everything is ordered by CLOCK_MONOTONIC, which never jumps. What MCAP tools see as time is that clock plus one number
-for the whole recording: what made it the wall clock when the recording began. The wall clock of each moment is only a
-label beside it.
+CLOCK_MONOTONIC never jumps. MCAP tools see it plus one constant: the difference to the wall clock when the recording
+began. The wall clock of each message is only a label beside it.
 """
 
 from __future__ import annotations
@@ -14,20 +13,19 @@ from typing import Any, NamedTuple
 from skinware.realtime import NS_PER_S
 
 _READINGS = 3
-_LEAST_STEP_NS = NS_PER_S // 20
-"""Smaller steps than a busy machine may put between two readings."""
+_LEAST_STEP_NS = NS_PER_S // 20  # a busy machine may delay a reading by less
 
 STEPPED, SUSPENDED = "clock_stepped", "suspended"
-"""Events of no service."""
+"""Events that belong to no service."""
 
 
 class Clocks(NamedTuple):
-    """Clocks of the machine at the same moment, ns.
+    """Clocks of the machine at one moment, ns.
 
     Attributes:
-        monotonic_ns: CLOCK_MONOTONIC, the time of frames.
+        monotonic_ns: CLOCK_MONOTONIC, the time of samples.
         realtime_ns: CLOCK_REALTIME, the wall clock.
-        boottime_ns: CLOCK_BOOTTIME: the first one, and how long the machine was suspended since it started.
+        boottime_ns: CLOCK_BOOTTIME: CLOCK_MONOTONIC plus the time in which the machine was suspended.
     """
 
     monotonic_ns: int
@@ -36,26 +34,24 @@ class Clocks(NamedTuple):
 
 
 def read_clocks() -> Clocks:
-    """Read all clocks, of several readings the one that took the shortest time."""
-    return min((_reading() for _ in range(_READINGS)), key=lambda reading: reading[0])[1]
-
-
-def _reading() -> tuple[int, Clocks]:
-    """How long it took to read the clocks, and what they were."""
-    before_ns = time.monotonic_ns()
-    realtime_ns, boottime_ns = time.time_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-    after_ns = time.monotonic_ns()
-    return after_ns - before_ns, Clocks((before_ns + after_ns) // 2, realtime_ns, boottime_ns)
+    """Read all clocks a few times, and return the reading that took the shortest time."""
+    readings = []
+    for _ in range(_READINGS):
+        before_ns = time.monotonic_ns()
+        realtime_ns, boottime_ns = time.time_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        after_ns = time.monotonic_ns()
+        readings.append((after_ns - before_ns, Clocks((before_ns + after_ns) // 2, realtime_ns, boottime_ns)))
+    return min(readings)[1]
 
 
 class TimeAxis:
     """The times of a recording's messages.
 
     Args:
-        read: gives the clocks.
+        read: reads the clocks.
 
     Attributes:
-        clocks: when they were read last.
+        clocks: the last reading.
     """
 
     def __init__(self, read: Callable[[], Clocks] = read_clocks) -> None:
@@ -64,18 +60,14 @@ class TimeAxis:
         self._origin_ns = self.clocks.realtime_ns - self.clocks.monotonic_ns
 
     def log_ns(self, monotonic_ns: int) -> int:
-        """Return the time by which a message is ordered: ns since 1970, if the wall clock had never been set since."""
+        """Return the time that orders a message: ns since 1970 by a wall clock that was never set since."""
         return monotonic_ns + self._origin_ns
 
     def wall_ns(self, monotonic_ns: int) -> int:
         return monotonic_ns + self.clocks.realtime_ns - self.clocks.monotonic_ns
 
     def look(self) -> list[dict[str, Any]]:
-        """Read the clocks again.
-
-        Returns:
-            An event if the machine was suspended meanwhile, and one if the wall clock was set.
-        """
+        """Read the clocks again. Return an event if the machine was suspended, and one if the wall clock was set."""
         before, now = self.clocks, self._read()
         self.clocks = now
         passed_ns = now.monotonic_ns - before.monotonic_ns

@@ -15,20 +15,20 @@ from mcap.records import Channel, Schema
 
 from skinware.errors import BadRecording
 from skinware.realtime import NS_PER_S
-from skinware.recording.mcap_reading import ChunkContents, Damaged, McapSource
+from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import ClosedChunk, McapFile, OpenChunk
 
-_RESTATED_AFTER_NS = 60 * NS_PER_S
-_RESTATED_AFTER_BYTES = 64 << 20
+_REPEATED_AFTER_NS = 60 * NS_PER_S
+_REPEATED_AFTER_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """A generation, as it is told in a file before the first chunk that has frames of it.
+    """The message that describes a generation, written before the first chunk with its samples.
 
     Attributes:
-        channel, schema: of its message.
-        sequence: how many of the service came before.
+        channel, schema: of the message.
+        sequence: number of the generations of the service before it.
         data: the service's file up to its slots.
     """
 
@@ -39,15 +39,15 @@ class Head:
 
 
 class Target(Protocol):
-    """Where a recording goes."""
+    """A destination of a recording."""
 
     @property
     def paths(self) -> list[Path]:
-        """The files that are there now."""
+        """The files that exist now."""
 
     @property
     def size(self) -> int:
-        """Bytes of them; of what is kept in memory, where that is all."""
+        """Bytes in these files; bytes in memory before there is a file."""
 
     @property
     def counts(self) -> Counter[int]:
@@ -55,46 +55,46 @@ class Target(Protocol):
 
     @property
     def is_full(self) -> bool:
-        """Whether the recording is to end because it has its size."""
+        """Whether the recording has reached its greatest size."""
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
         """Add a chunk.
 
         Args:
-            chunk: it.
-            heads: of the generations that its frames are of.
+            chunk: the chunk.
+            heads: descriptions of the generations of its samples.
 
         Raises:
-            OSError: it cannot be written; all before it is safe.
+            OSError: it cannot be written; the chunks before it are safe.
         """
 
     def check(self) -> None:
-        """Make sure that the file that is being written is still there, and as it was written.
+        """Make sure that the open file still exists, unchanged by others.
 
         Raises:
-            OSError: it is not.
+            OSError: it does not.
         """
 
     def save(self) -> None:
-        """Write what is only in memory.
+        """Write the chunks that are only in memory.
 
         Raises:
-            OSError: that is not possible.
+            OSError: they cannot be written.
         """
 
     def finish(self) -> None:
         """Complete the files. Idempotent.
 
         Raises:
-            OSError: one is left without its summary, for which there is no room.
+            OSError: the disk has no room for a summary; the file stays without one.
         """
 
 
 class RecordingFile:
-    """A file that explains itself: generations are told before their frames, now and then again, and at the end.
+    """A file that explains itself: it has the heads of generations before their samples, now and then, and at the end.
 
     Args:
-        path: of the file, which must not be there.
+        path: of the file, which must not exist.
 
     Raises:
         OSError: it cannot be made.
@@ -102,44 +102,45 @@ class RecordingFile:
 
     def __init__(self, path: Path) -> None:
         self.file = McapFile(path)
-        self._told: dict[Head, int] = {}  # and how big the file was then
-        self._told_ns = 0
+        self._written: dict[Head, int] = {}  # and the size of the file then
+        self._written_ns = 0
         self._last_ns = 0
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
-        """Append a chunk, after the generations that its frames are of."""
+        """Append a chunk, after the heads of its generations."""
         self._last_ns = chunk.end_ns
-        told_at = max(self._told.values(), default=0)
-        if chunk.start_ns - self._told_ns > _RESTATED_AFTER_NS or self.file.size - told_at > _RESTATED_AFTER_BYTES:
-            self._told.clear()
-        self._tell([head for head in heads if head not in self._told], chunk.start_ns)
+        size = max(self._written.values(), default=0)
+        if chunk.start_ns - self._written_ns > _REPEATED_AFTER_NS or self.file.size - size > _REPEATED_AFTER_BYTES:
+            self._written.clear()
+        self._write([head for head in heads if head not in self._written], chunk.start_ns)
         self.file.add(chunk)
 
     def finish(self) -> None:
-        told, self._told = list(self._told), {}
+        heads, self._written = list(self._written), {}
         try:
-            self._tell(told, self._last_ns)
+            self._write(heads, self._last_ns)
         finally:
             self.file.finish()
 
-    def _tell(self, heads: Collection[Head], time_ns: int) -> None:
+    def _write(self, heads: Collection[Head], time_ns: int) -> None:
         if not heads:
             return
         chunk = OpenChunk()
         for head in heads:
             chunk.add(head.channel, head.schema, head.sequence, time_ns, head.data)
         self.file.add(chunk.close())
-        self._told |= dict.fromkeys(heads, self.file.size)
-        self._told_ns = time_ns
+        self._written |= dict.fromkeys(heads, self.file.size)
+        self._written_ns = time_ns
 
 
 class Files:
     """One file, or several one after the other.
 
     Args:
-        path: of the file; of several, with a number before its suffix (``walk-001.mcap``).
-        split_size: bytes after which another file begins; None: all in one.
-        max_size: bytes of all files together. Of several the oldest are removed; one is ended. None: no limit.
+        path: of the file; several get a number before the suffix (``walk-001.mcap``).
+        split_size: bytes after which another file begins; None: one file.
+        max_size: most bytes of all files together: the oldest of several are removed, a single one is ended. None: no
+            limit.
 
     Raises:
         OSError: the first file cannot be made.
@@ -187,7 +188,7 @@ class Files:
         self._file.file.check()
 
     def save(self) -> None:
-        """Nothing: all is written."""
+        """Do nothing: every chunk is written at once."""
 
     def finish(self) -> None:
         """See :class:`Target`."""
@@ -204,11 +205,11 @@ class Files:
 
 
 class Past:
-    """The last seconds, kept in memory, and written whenever somebody wants them and at the end.
+    """The last seconds, kept in memory, and written on request and at the end.
 
     Args:
-        path: of the first file; the next ones have a number before the suffix (``fall-2.mcap``).
-        duration_s: how much of the past.
+        path: of the first file; the next ones get a number before the suffix (``fall-2.mcap``).
+        duration_s: time that is kept.
     """
 
     def __init__(self, path: Path, duration_s: float) -> None:
@@ -227,7 +228,7 @@ class Past:
 
     @property
     def counts(self) -> Counter[int]:
-        """Messages of each channel in the last file; before there is one, in memory."""
+        """Messages of each channel in the last file, or in memory before there is one."""
         if self._saved:
             return self._saved[-1].counts
         counts: Counter[int] = Counter()
@@ -246,10 +247,10 @@ class Past:
             self._chunks.popleft()
 
     def check(self) -> None:
-        """Nothing: no file is being written."""
+        """Do nothing: no file is open."""
 
     def save(self) -> None:
-        """Write what is kept; it stays in memory too."""
+        """Write the chunks that are kept; they also stay in memory."""
         number = len(self._saved) + 1
         file = RecordingFile(self._path if number == 1 else _numbered(self._path, number, 1))
         self._saved.append(file.file)
@@ -271,12 +272,12 @@ def _numbered(path: Path, number: int, digits: int) -> Path:
 
 @dataclass(frozen=True)
 class Recovered:
-    """What came of a recovery.
+    """The result of a recovery.
 
     Attributes:
-        messages: of each channel that are in the new file.
-        damaged: chunks that were found, but are damaged.
-        was_whole: the file ended in good order, and nothing of it was damaged.
+        messages: number in the new file, by topic.
+        damaged: number of damaged chunks.
+        was_whole: the file had its summary, and no chunk was damaged.
     """
 
     messages: dict[str, int]
@@ -285,15 +286,15 @@ class Recovered:
 
 
 def recover(source: Path, target: Path) -> Recovered:
-    """Write what is undamaged in a recording into a new file, which is there only when it is complete.
+    """Copy the undamaged chunks of a recording into a new file, which appears when it is complete.
 
     Args:
         source: the recording; it is only read.
-        target: the new file; may have the place of the old one, and of no other.
+        target: the new file; it may replace the old one, but no other.
 
     Raises:
-        BadRecording: it is not a recording, or nothing of it can be used.
-        OSError: it cannot be read, or the new one cannot be written.
+        BadRecording: the source is not a recording, or no chunk is undamaged.
+        OSError: the source cannot be read, or the target cannot be written.
     """
     if target.exists() and not target.samefile(source):
         raise FileExistsError(errno.EEXIST, "exists already: give another name", str(target))
@@ -308,7 +309,12 @@ def recover(source: Path, target: Path) -> Recovered:
                 except Damaged:
                     damaged += 1
                     continue
-                chunk = _again(contents)
+                chunk = OpenChunk()
+                for message in contents.messages:
+                    channel = contents.channels.get(message.channel_id)
+                    schema = contents.schemas.get(channel.schema_id) if channel is not None else None
+                    if channel is not None and schema is not None:
+                        chunk.add(channel, schema, message.sequence, message.time_ns, message.data)
                 if not chunk.is_empty:
                     new.add(chunk.close())
             new.finish()
@@ -322,13 +328,3 @@ def recover(source: Path, target: Path) -> Recovered:
             raise
         messages = {old.channels[channel].topic: count for channel, count in sorted(new.counts.items())}
         return Recovered(messages, damaged, old.is_whole and not damaged)
-
-
-def _again(contents: ChunkContents) -> OpenChunk:
-    chunk = OpenChunk()
-    for message in contents.messages:
-        channel = contents.channels.get(message.channel_id)
-        schema = contents.schemas.get(channel.schema_id) if channel is not None else None
-        if channel is not None and schema is not None:
-            chunk.add(channel, schema, message.sequence, message.time_ns, message.data)
-    return chunk

@@ -1,7 +1,7 @@
-"""What is in an MCAP file of ours, however damaged it is.
+"""Read MCAP files of recordings, however damaged they are.
 
-A whole file ends with a summary that says where its chunks are. In any other, chunks are found by their signature and
-not by going from record to record, so that a damaged length, or bytes that are missing, cost no chunk but their own.
+A whole file ends with a summary that lists its chunks. In any other file, chunks are found by their signature and not
+from record to record, so that a damaged length or missing bytes cost only the chunk that they are in.
 """
 
 from __future__ import annotations
@@ -34,22 +34,21 @@ _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the map that follows
 _MESSAGE_INDEX = struct.Struct("<HQ")  # channel, offset
 _FOOTER = struct.Struct("<BQQQI")
-_MOST_REFUSED = 10
-"""Chunks that are named."""
+_MOST_REFUSED = 10  # chunks that get a line each
 
 
 class Damaged(Exception):
-    """A chunk, or the summary, is not as it was written."""
+    """A chunk or the summary is not as it was written."""
 
 
 class Message(NamedTuple):
     """One message.
 
     Attributes:
-        channel_id: of its channel.
-        sequence: of the message.
-        time_ns: when it was published, on the axis that orders the file (``log_time``).
-        data: of it.
+        channel_id: number of its channel.
+        sequence: number of the message.
+        time_ns: time of publication, on the axis that orders the file (``log_time``).
+        data: contents.
     """
 
     channel_id: int
@@ -60,15 +59,15 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class ChunkPlace:
-    """Where a chunk is.
+    """The place of a chunk in its file.
 
     Attributes:
-        offset: of its record in the file.
+        offset: of its record.
         start_ns, end_ns: times of its first and last message.
         size: bytes of its contents.
-        compressed_at, compressed_size: where its contents are in the file.
-        crc: of its contents.
-        channel_ids: of its messages; None where nobody told.
+        compressed_at, compressed_size: place of its compressed contents.
+        crc: CRC-32 of its contents.
+        channel_ids: channels of its messages; None: not known.
     """
 
     offset: int
@@ -87,7 +86,7 @@ class ChunkPlace:
 
 @dataclass
 class ChunkContents:
-    """What is in a chunk.
+    """The contents of a chunk.
 
     Attributes:
         channels, schemas: by id.
@@ -100,22 +99,21 @@ class ChunkContents:
 
 
 class McapSource:
-    """An MCAP file that is read.
+    """An open MCAP file.
 
     Args:
         path: of the file.
-        limits: of what its chunks may become.
+        limits: bounds for the size of its chunks.
 
     Attributes:
         is_whole: it ends with a summary that fits it.
-        chunks: where its chunks are, in the order of the file; where there was no summary to tell, only those that
-            are whole.
+        chunks: places of its chunks, in the order of the file; without a summary only those that are whole.
         channels: by id.
-        damaged: chunks that were found to be damaged.
-        refused: those that claim to become larger than the limits allow, a line each; where they are.
+        damaged: number of damaged chunks found so far.
+        refused: a line for each chunk that claims more bytes than the limits allow.
 
     Raises:
-        BadRecording: it is no such file.
+        BadRecording: it is not an MCAP file, or is compressed in another way.
         OSError: it cannot be read.
     """
 
@@ -131,13 +129,13 @@ class McapSource:
         self.damaged: int = 0
         self.refused: list[str] = []
         self._room = limits.room(len(self._map))
-        self._compressions: set[str] = set()  # of chunks that are not where they should be
+        self._compressions: set[str] = set()  # of chunks that the summary misplaces
         try:
-            self.chunks: list[ChunkPlace] = self._told_by_summary()
+            self.chunks: list[ChunkPlace] = self._chunks_in_summary()
             self.is_whole: bool = True
         except Damaged:
             self._room, self.damaged, self.refused = limits.room(len(self._map)), 0, []
-            self.chunks, self.is_whole = list(self._whole_ones()), False
+            self.chunks, self.is_whole = list(self._undamaged_chunks()), False
         if not self.chunks and self._compressions - {COMPRESSION}:
             self.close()
             how = ", ".join(each or "nothing" for each in sorted(self._compressions))
@@ -152,7 +150,7 @@ class McapSource:
 
     @property
     def library(self) -> str:
-        """What wrote the file, as its header says; empty where that is damaged."""
+        """The program that wrote the file, from its header; empty if that is damaged."""
         try:
             opcode, record = next(_records(self._data[len(MAGIC) :]), (0, memoryview(b"")))
             return str(_read(Header, record).library) if opcode == Opcode.HEADER else ""
@@ -160,7 +158,7 @@ class McapSource:
             return ""
 
     def contents(self, place: ChunkPlace) -> ChunkContents:
-        """What is in a chunk.
+        """Return the contents of a chunk.
 
         Raises:
             Damaged: it is not as it was written.
@@ -172,20 +170,20 @@ class McapSource:
             data = zstandard.ZstdDecompressor().decompress(compressed, max_output_size=place.size)
         except (zstandard.ZstdError, MemoryError) as error:
             raise Damaged(f"its contents cannot be decompressed ({error})") from None
-        if len(data) != place.size or zlib.crc32(data) != place.crc:  # also 0, "none" in MCAP: ours always have one
+        if len(data) != place.size or zlib.crc32(data) != place.crc:  # 0, MCAP's "none", too: ours have a CRC
             raise Damaged("its contents do not fit their checksum")
         return _parsed(data, self._limits)
 
     def close(self) -> None:
-        """Close the file. What was read from it stays. Idempotent."""
+        """Close the file; contents that were read stay valid. Idempotent."""
         self._data.release()
         self._map.close()
 
-    def _told_by_summary(self) -> list[ChunkPlace]:
-        """Where the summary says that chunks are.
+    def _chunks_in_summary(self) -> list[ChunkPlace]:
+        """Return the places that the summary lists.
 
         Raises:
-            Damaged: there is none, or it does not fit the file.
+            Damaged: there is no summary, or it does not fit the file.
         """
         end = len(self._data) - len(MAGIC)
         footer_at = end - _FOOTER.size
@@ -210,7 +208,7 @@ class McapSource:
                     raise Damaged("the summary has a time that no clock has")
                 if self._is_refused(place):
                     continue
-                # times before a chunk have no checksum, those of the summary have
+                # the times in the summary are covered by its checksum, those in front of the chunk by none
                 places.append(replace(place, start_ns=start_ns, end_ns=end_ns))
             elif kind == Opcode.CHANNEL:
                 channel = _read(Channel, record)
@@ -221,10 +219,10 @@ class McapSource:
             raise Damaged("the summary does not say where all chunks are")
         return places
 
-    def _whole_ones(self) -> Iterator[ChunkPlace]:
+    def _undamaged_chunks(self) -> Iterator[ChunkPlace]:
         at = 0
         while (signature := self._map.find(_SIGNATURE, at)) >= 0:
-            at = signature + 1  # of one that is damaged, the length may be too: others may begin within it
+            at = signature + 1  # the length of a damaged chunk may be wrong too: others may begin within it
             place = self._chunk_at(signature - _SIGNATURE_AT)
             if place is None or self._is_refused(place):
                 continue
@@ -235,7 +233,10 @@ class McapSource:
             else:
                 self.channels |= contents.channels
                 at = place.end
-                yield _as_it_is(place, contents)
+                times_ns = [message.time_ns for message in contents.messages] or [place.start_ns]
+                channels = frozenset(message.channel_id for message in contents.messages)
+                # no checksum covers the times in front of the chunk
+                yield replace(place, start_ns=min(times_ns), end_ns=max(times_ns), channel_ids=channels)
 
     def _chunk_at(self, offset: int, channel_ids: frozenset[int] | None = None) -> ChunkPlace | None:
         if not 0 <= offset <= len(self._data) - _CHUNK.size:
@@ -255,7 +256,7 @@ class McapSource:
         return ChunkPlace(offset, start_ns, end_ns, size, compressed_at, compressed_size, crc, channel_ids)
 
     def _is_refused(self, place: ChunkPlace) -> bool:
-        """Whether a chunk claims to become larger than the limits allow, or all chunks together do."""
+        """Return whether a chunk, or all chunks together, claim more bytes than the limits allow."""
         most = min(self._limits.chunk_size, self._room)
         if place.size <= most:
             self._room -= place.size
@@ -270,13 +271,6 @@ class McapSource:
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.close()
-
-
-def _as_it_is(place: ChunkPlace, contents: ChunkContents) -> ChunkPlace:
-    """A chunk with the channels and times of its messages: those that stand before it have no checksum."""
-    times_ns = [message.time_ns for message in contents.messages] or [place.start_ns]
-    channels = frozenset(message.channel_id for message in contents.messages)
-    return replace(place, start_ns=min(times_ns), end_ns=max(times_ns), channel_ids=channels)
 
 
 def _parsed(data: bytes, limits: Limits) -> ChunkContents:
@@ -299,10 +293,10 @@ def _parsed(data: bytes, limits: Limits) -> ChunkContents:
 
 
 def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """The records of a part of a file: (opcode, contents).
+    """Yield (opcode, contents) of each record in a part of a file.
 
     Raises:
-        Damaged: they do not fill it.
+        Damaged: the records do not fill it.
     """
     at = 0
     while at < len(data):
@@ -317,12 +311,10 @@ def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
-    """When the messages of a chunk begin and end, where it begins, and the ids of its channels.
-
-    An hour has some 14,000 of these records.
+    """Return (first time, last time, offset, channels) of a chunk index. An hour has some 14,000 of these records.
 
     Raises:
-        Damaged: it is not one.
+        Damaged: it is not a chunk index.
     """
     try:
         start_ns, end_ns, offset, _, size = _CHUNK_INDEX.unpack_from(record)
@@ -333,10 +325,10 @@ def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
 
 
 def _read(kind: Any, record: memoryview) -> Any:
-    """A record as one of mcap's.
+    """Return a record as an object of the package mcap.
 
     Raises:
-        Damaged: it is not one.
+        Damaged: it is not a record of this kind.
     """
     try:
         return kind.read(ReadDataStream(BytesIO(record)))

@@ -1,7 +1,7 @@
-"""MCAP files, written chunk by chunk: each chunk is complete in itself, and is in the file as soon as it is closed.
+"""Write MCAP files chunk by chunk. A chunk is complete in itself, and is in the file as soon as it is closed.
 
-A chunk brings the schemas and channels of its messages with it, so that it can be read without any other, copied to
-another file, or kept for later. https://mcap.dev/spec has the format.
+A chunk contains the schemas and channels of its messages, so that it can be read without any other, copied to another
+file, or kept for later. https://mcap.dev/spec defines the format.
 """
 
 from __future__ import annotations
@@ -37,25 +37,22 @@ from mcap.records import (
 MAGIC = bytes((137, 77, 67, 65, 80, 48, 13, 10))
 PROFILE = "skinware"
 COMPRESSION = "zstd"
-_LEVEL = 1
-"""Of compression: at higher ones, matches that chance makes in noise cost time and bytes."""
+_LEVEL = 1  # higher levels find chance matches in noise, which cost time and bytes
 _MESSAGE = struct.Struct("<BQHIQQ")
-_LEAST_FREE = 64 << 10
-"""Bytes that are left on the disk for what comes last, beside the summary."""
-_SPOOL_BYTES = 64 << 10
-"""Records of the summary that wait in memory; those of 500 chunks, two minutes."""
+_LEAST_FREE = 64 << 10  # bytes of the disk that are kept free for the last heads, besides the summary
+_SPOOL_BYTES = 64 << 10  # records of the summary in memory: those of 500 chunks, two minutes
 
 
 @dataclass(frozen=True)
 class ClosedChunk:
-    """A chunk as it stands in a file, wherever that is.
+    """A finished chunk, ready for any file.
 
     Attributes:
-        record: bytes of the chunk, and of the indexes of its messages behind it.
-        index: of the chunk in the summary, as if it began at 0.
+        record: bytes of the chunk and of its message indexes.
+        index: its entry in the summary, for a chunk at offset 0.
         counts: messages of each channel.
         channels: of its messages.
-        schemas: of these.
+        schemas: of these channels.
     """
 
     record: bytes
@@ -66,7 +63,7 @@ class ClosedChunk:
 
     @property
     def start_ns(self) -> int:
-        """Time of its first message: see :class:`OpenChunk`."""
+        """Time of its first message, as for :meth:`OpenChunk.add`."""
         return int(self.index.message_start_time)
 
     @property
@@ -101,11 +98,11 @@ class OpenChunk:
 
         Args:
             channel: its channel, the same object each time.
-            schema: of the channel.
-            sequence: of the message.
-            time_ns: when it was published, on the axis that orders the file (MCAP's ``log_time``).
-            data: of it.
-            wall_ns: the same moment by the wall clock (MCAP's ``publish_time``); None: the same number.
+            schema: schema of the channel.
+            sequence: number of the message.
+            time_ns: time of publication, on the axis that orders the file (MCAP's ``log_time``).
+            data: contents.
+            wall_ns: the same moment by the wall clock (MCAP's ``publish_time``); None: ``time_ns``.
         """
         if schema.id not in self._schemas:
             self._schemas[schema.id] = schema
@@ -167,11 +164,11 @@ class OpenChunk:
 
 
 class McapFile:
-    """A file that grows by whole chunks. Whatever happens, it consists of whole chunks up to the last that was added.
+    """A file that grows by whole chunks, and always consists of the chunks that were added.
 
     Args:
-        path: of the file, which must not be there.
-        profile: what MCAP tools may expect of its channels.
+        path: of the file, which must not exist.
+        profile: MCAP's name for the kind of its channels.
 
     Attributes:
         size: bytes in it so far.
@@ -211,10 +208,10 @@ class McapFile:
         return (info.st_dev, info.st_ino) == self._inode
 
     def check(self) -> None:
-        """Make sure that the file is as it was written, and where it was made.
+        """Make sure that the file is unchanged, and where it was made.
 
         Raises:
-            OSError: it is not; the message says what became of it.
+            OSError: it is not; the message says what happened to it.
         """
         if self._fd < 0:
             return
@@ -233,8 +230,8 @@ class McapFile:
         """Append a chunk.
 
         Raises:
-            OSError: it cannot be written, in particular because the disk is full: nothing of it is in the file then;
-                or :meth:`check` fails.
+            OSError: it cannot be written, for instance because the disk is full: the file stays without it; or
+                :meth:`check` fails.
         """
         self.check()
         free = os.fstatvfs(self._fd)
@@ -265,10 +262,10 @@ class McapFile:
         self.counts += chunk.counts
 
     def finish(self) -> None:
-        """Write the summary, by which readers find everything at once, and close the file. Idempotent.
+        """Write the summary, which makes reading fast, and close the file. Idempotent.
 
         Raises:
-            OSError: there is no room for it. The file then ends with its last chunk, and is closed.
+            OSError: the disk has no room for it. The file then ends with its last chunk, and is closed.
         """
         if self._fd < 0:
             return
@@ -281,7 +278,7 @@ class McapFile:
             fd, self._fd = self._fd, -1
             try:
                 os.close(fd)
-            except OSError as error:  # file systems of other machines say late that there is no room
+            except OSError as error:  # network file systems report a full disk late
                 raise OSError(error.errno, error.strerror, str(self.path)) from None
 
     @property
@@ -335,10 +332,10 @@ class McapFile:
 
 
 class _Spool:
-    """Records of a summary, which wait in a file without a name beside the one that they are for, not in memory.
+    """Records of a summary, kept in an unnamed file beside the recording instead of in memory.
 
     Args:
-        folder: of the file.
+        folder: where to make the unnamed file.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -355,10 +352,10 @@ class _Spool:
         self._waiting += record
 
     def save(self) -> None:
-        """Write what waits, if it is much.
+        """Write the records in memory to the file, if they are many.
 
         Raises:
-            OSError: it cannot be written; it waits on.
+            OSError: they cannot be written, and stay in memory.
         """
         if len(self._waiting) < _SPOOL_BYTES:
             return

@@ -1,4 +1,4 @@
-"""Recordings, read: frame by frame, as snapshots, or as whole columns."""
+"""Read recordings: sample by sample, as snapshots, or as whole columns."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from skinware.transfer.generation import Generation, RecordedDriverSnapshot, Rec
 
 @dataclass
 class _Service:
-    """Numbers of a service's channels (0: none), and its generations by number."""
+    """The channels of a service (0: none), and its generations by number."""
 
     frame_channel: int = 0
     head_channel: int = 0
@@ -38,8 +38,6 @@ _Count = Annotated[int, msgspec.Meta(ge=0, le=LIMITS.time_ns)]
 
 
 class _Event(msgspec.Struct):
-    """What must be so of an event, if it has it."""
-
     event: str = ""
     service: str = ""
     time_ns: _Int = 0
@@ -49,8 +47,6 @@ class _Event(msgspec.Struct):
 
 
 class _Clock(msgspec.Struct):
-    """What must be so of a reading of the clocks."""
-
     monotonic_ns: _Int = 0
     realtime_ns: _Int = 0
     boottime_ns: _Int = 0
@@ -63,33 +59,31 @@ class _AboutBus(msgspec.Struct):
 
 
 class _About(msgspec.Struct):
-    """What must be so of what a driver says of itself."""
-
     driver_type: str = ""
     listen_only: bool = False
     versions: dict[str, Any] = {}
     buses: dict[str, _AboutBus] = {}
 
 
-_FORMS: dict[str, type] = {EVENTS: _Event, CLOCK: _Clock}
+_CHECKED: dict[str, type] = {EVENTS: _Event, CLOCK: _Clock}
 
 
 class Recording:
-    """A recording. Not for several threads at once.
+    """A recording. Use it in one thread at a time.
 
-    Chunks that are damaged are left out; ``problems`` says so.
+    Damaged chunks are left out and named in ``problems``.
 
     Args:
         path: of the file.
 
     Attributes:
         path: of the file.
-        is_whole: it was ended in good order; others are read too, only more slowly (``skin-recover``).
-        start_ns, end_ns: time of its first and last message, ns since 1970. All between them is on the axis of
-            CLOCK_MONOTONIC: how the wall clock was set meanwhile is in ``clock``.
+        is_whole: it ends with its summary; others can be read too, but more slowly (``skin-recover``).
+        start_ns, end_ns: time of its first and last message, ns since 1970. Times between them follow
+            CLOCK_MONOTONIC; ``clock`` says how the wall clock was set meanwhile.
 
     Raises:
-        BadRecording: it is not a recording, or one of a newer version.
+        BadRecording: it is not a recording, or needs a newer version.
         OSError: it cannot be read.
     """
 
@@ -113,17 +107,17 @@ class Recording:
 
     @property
     def services(self) -> tuple[str, ...]:
-        """Names of all services of which there are frames, drivers among them."""
+        """Names of all services with samples, drivers among them."""
         return tuple(sorted(self._services))
 
     @property
     def drivers(self) -> tuple[str, ...]:
-        """Names of those that are drivers."""
+        """Names of the services that are drivers."""
         return tuple(name for name in self.services if self[name].is_driver)
 
     @property
     def wires(self) -> tuple[WireTrack, ...]:
-        """What went over the wires of the drivers, bus by bus, if that was recorded (``skin-record --wire``)."""
+        """The wires of the drivers, bus by bus, if they were recorded (``skin-record --wire``)."""
         return tuple(self._wires[key] for key in sorted(self._wires))
 
     @property
@@ -133,17 +127,17 @@ class Recording:
 
     @property
     def recorded_by(self) -> str:
-        """Program and version that wrote the file, as it says: ``skinware 0.1.0``; empty where that is damaged."""
+        """Program and version that wrote the file, ``skinware 0.1.0``; empty if that is damaged."""
         return self._source.library
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Time from the first message to the last."""
         return (self.end_ns - self.start_ns) / NS_PER_S
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """What happened to the services, in order, each with its ``time_s``: see "Recordings" in the documentation."""
+        """Events of services in order, each with its ``time_s``: see "Recordings" in the documentation."""
         return list(self._json(EVENTS))
 
     @property
@@ -153,21 +147,21 @@ class Recording:
 
     @property
     def lost(self) -> int:
-        """Frames that were published meanwhile, and could not be recorded."""
+        """Samples that were published meanwhile and could not be recorded."""
         return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "lost")
 
     @property
     def problems(self) -> list[str]:
-        """What was found to be wrong with the file so far; all of it after all of it was read."""
+        """Faults of the file that were found so far; complete when all of it was read."""
         damaged = self._source.damaged + len(self._damaged)
-        told = [f"{damaged} chunk{'s' * (damaged > 1)} damaged and left out"] if damaged else []
-        return [*told, *self._source.refused, *self._problems]
+        chunks = [f"{damaged} chunk{'s' * (damaged > 1)} damaged and left out"] if damaged else []
+        return [*chunks, *self._source.refused, *self._problems]
 
     def __getitem__(self, name: str) -> Track:
-        """What was recorded of a service.
+        """Return the recorded samples of a service.
 
         Raises:
-            ConfigurationError: nothing was; the message lists what there is.
+            ConfigurationError: the recording has none; the message lists its services.
         """
         if name not in self._services:
             there_are = ", ".join(self.services) or "none"
@@ -178,14 +172,14 @@ class Recording:
     def snapshots(
         self, drivers: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
     ) -> Iterator[RecordedSnapshot]:
-        """What :class:`skinware.Skin` would have given: a snapshot whenever a driver published, in order.
+        """Yield a snapshot whenever a driver published, as :class:`skinware.Skin` would have.
 
-        A driver joins with its first frame, and leaves when it was closed or died.
+        A driver joins with its first sample, and leaves when it was closed or died.
 
         Args:
             drivers: names; None: all.
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last.
+            start_s: begin at this time, s since the recording began.
+            end_s: end before this time; None: after the last snapshot.
         """
         newest: dict[str, RecordedDriverSnapshot] = {}
         layout = SkinLayout((), ())
@@ -203,12 +197,12 @@ class Recording:
     def moments(
         self, services: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
     ) -> Iterator[Moment]:
-        """Every frame of several services, and when they were paused, went on, or were gone, by time.
+        """Yield every sample of several services, and the events that paused, resumed or ended them, by time.
 
         Args:
             services: names; None: all.
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last.
+            start_s: begin at this time, s since the recording began.
+            end_s: end before this time; None: after the last moment.
         """
         timeline = self.timeline(services)
         timeline.seek(start_s)
@@ -216,14 +210,14 @@ class Recording:
             yield moment
 
     def timeline(self, services: Collection[str] | None = None, *, ahead: Executor | None = None) -> Timeline:
-        """The moments of several services, to go to and fro in.
+        """Return the moments of several services, to move in forward and back.
 
         Args:
             services: names; None: all.
             ahead: see :class:`Timeline`.
 
         Raises:
-            ConfigurationError: nothing was recorded of one of them.
+            ConfigurationError: the recording has no samples of one of them.
         """
         names = self.services if services is None else tuple(services)
         for name in names:
@@ -231,13 +225,13 @@ class Recording:
         return Timeline(self, names, ahead)
 
     def close(self) -> None:
-        """Close the file; what was read stays. Idempotent."""
+        """Close the file; data that were read stay valid. Idempotent."""
         self._source.close()
 
     def chunks(
         self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
     ) -> Iterator[ChunkContents]:
-        """The chunks in which there may be messages of some channels, of a time; for tracks."""
+        """Yield the chunks that may have messages of some channels within a time; for tracks."""
         for place in self._source.chunks:
             has_some = place.channel_ids is None or not place.channel_ids.isdisjoint(channels)
             begins_in_time = end_s is None or self.time_s(place.start_ns) < end_s
@@ -245,35 +239,35 @@ class Recording:
                 yield self._contents(place)
 
     def note(self, problem: str) -> None:
-        """Something that is wrong with the file; for tracks."""
+        """Note a fault of the file; for tracks."""
         self._problems[problem] = None
 
-    # -- what timelines ask for ---------------------------------------------------------------------------------
+    # -- for timelines ------------------------------------------------------------------------------------------
 
     @property
     def places(self) -> list[ChunkPlace]:
-        """Its chunks, in order."""
+        """Places of its chunks, in order."""
         return self._source.chunks
 
     def time_s(self, time_ns: int) -> float:
-        """The time of a message, s since the recording began."""
+        """Return the time of a message, s since the recording began."""
         return (time_ns - self.start_ns) / NS_PER_S
 
     def may_have(self, place: ChunkPlace, services: Collection[str], *, events: bool = True) -> bool:
-        """Whether there may be frames of some services in a chunk, or events."""
+        """Return whether a chunk may have samples of some services, or events."""
         if place.channel_ids is None:
             return True
         channels = {self._services[name].frame_channel for name in services}
         return not place.channel_ids.isdisjoint(channels | {self._topics.get(EVENTS, 0)} if events else channels)
 
     def moments_in(self, place: ChunkPlace, services: Collection[str]) -> list[Moment]:
-        """The moments of some services in a chunk, by time; none if it is damaged."""
+        """Return the moments of some services in a chunk, by time; none if it is damaged."""
         contents = self._contents(place)
         frames = [Moment(time_s, name, frame) for name in services for time_s, frame in self[name].frames_in(contents)]
         return sorted([*self._changes_in(contents, services), *frames], key=lambda moment: moment.time_s)
 
     def _changes_in(self, contents: ChunkContents, services: Collection[str]) -> list[Moment]:
-        """What happened to some services; not later than the frames that come after it in the file."""
+        """Return the events of some services, none later than the samples after it in the file."""
         channels = {self._services[name].frame_channel: name for name in services}
         next_s: dict[str, float] = {}
         changes = []
@@ -282,7 +276,7 @@ class Recording:
             if message.channel_id in channels:
                 next_s[channels[message.channel_id]] = time_s
             elif message.channel_id == self._topics.get(EVENTS):
-                event = self._told(EVENTS, message) or {}
+                event = self._checked(EVENTS, message) or {}
                 name, what = str(event.get("service")), str(event.get("event"))
                 if name in services and what in (PAUSED, LIVE, *GONE):
                     next_s[name] = min(time_s, next_s.get(name, time_s))
@@ -296,7 +290,7 @@ class Recording:
             self._damaged.add(place.offset)
             return ChunkContents()
 
-    # -- what there is ------------------------------------------------------------------------------------------
+    # -- contents of the file -----------------------------------------------------------------------------------
 
     def _find_services(self) -> dict[str, _Service]:
         services: dict[str, _Service] = {}
@@ -340,9 +334,9 @@ class Recording:
                     services[name].generations.setdefault(generation.generation, generation)
 
     def about(self, driver: str) -> dict[str, Any]:
-        """What a driver said of itself last, if its wires were recorded: see "Recordings" in the documentation.
+        """Return the last description of a driver: see "Recordings" in the documentation.
 
-        Empty in files of earlier versions, which do not have it.
+        Empty if its wires were not recorded, and in files of earlier versions.
 
         Args:
             driver: its name.
@@ -352,29 +346,29 @@ class Recording:
         for contents in self.chunks({channel} if channel is not None else ()):
             for message in contents.messages:
                 if message.channel_id == channel:
-                    about = self._told(f"/wire/{driver}", message) or about
+                    about = self._checked(f"/wire/{driver}", message) or about
         return about
 
     def _json(self, topic: str) -> Iterator[dict[str, Any]]:
         channel = self._topics.get(topic, 0)
         for contents in self.chunks({channel}):
             for message in contents.messages:
-                told = self._told(topic, message) if message.channel_id == channel else None
-                if told is not None:
-                    yield {**told, "time_s": self.time_s(message.time_ns)}
+                data = self._checked(topic, message) if message.channel_id == channel else None
+                if data is not None:
+                    yield {**data, "time_s": self.time_s(message.time_ns)}
 
-    def _told(self, topic: str, message: Message) -> dict[str, Any] | None:
-        """What a message in JSON has; None if it cannot be read."""
+    def _checked(self, topic: str, message: Message) -> dict[str, Any] | None:
+        """Return the fields of a JSON message; None, with a note, if they are not what they should be."""
         try:
-            told = read_json(message.data, dict[str, Any])
-            msgspec.convert(told, _FORMS.get(topic, _About))
+            data = read_json(message.data, dict[str, Any])
+            msgspec.convert(data, _CHECKED.get(topic, _About))
         except ValueError as error:
             if topic not in self._unread:
                 self._unread.add(topic)
                 where = f"the first at {self.time_s(message.time_ns):.3f} s"
                 self.note(f"{topic}: unreadable messages left out, {where} ({error})")
             return None
-        return told
+        return data
 
     def __enter__(self) -> Self:
         return self
@@ -387,7 +381,7 @@ class Recording:
 
 
 def _layout(newest: dict[str, RecordedDriverSnapshot], before: SkinLayout) -> SkinLayout:
-    """The layout of some frames; the same one as before if nothing changed."""
+    """Return the layout of some samples; the one before if nothing changed."""
     drivers = tuple(sorted(newest))
     structures = tuple(newest[name].structure for name in drivers)
     same = drivers == before.drivers and all(a is b for a, b in zip(structures, before.structures, strict=True))

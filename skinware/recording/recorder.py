@@ -1,7 +1,7 @@
-"""Records all frames of all services.
+"""Record all samples of all services.
 
-One thread takes frames from the rings, which must not wait; another codes, compresses and writes them. Where that one
-cannot keep up (a slow disk), frames wait in memory; where that is full, they are not taken, and counted as lost.
+One thread takes samples from the rings and never waits for the disk; another codes, compresses and writes them. If the
+second one cannot keep up (a slow disk), samples wait in memory; if that is full, they are not taken, and count as lost.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
-"""A chunk is closed so long after its first message: that much is lost with a killed recorder."""
+"""A chunk is closed so long after its first message; a killed recorder loses at most that."""
 _CHUNK_BYTES = 8 << 20
-_CLOCK_NS = _TELL_NS = NS_PER_S
+_CLOCK_NS = _REPORT_NS = NS_PER_S
 _MOST_WAITING = 128 << 20
-"""Bytes of frames that wait to be written."""
+"""Bytes of samples in memory."""
 _LONGEST_REST_NS = 10_000_000
 _MOST_NEWS = 100
 
@@ -62,26 +62,26 @@ class _Happened:
 
 
 class _Save:
-    """What is only in memory is wanted."""
+    """Asks the coder to write the chunks that are only in memory."""
 
 
 class _End:
-    """That was all."""
+    """Asks the coder to end."""
 
 
-class Beside(Protocol):
-    """Makes messages of frames, such as viewers know."""
+class Renderer(Protocol):
+    """Makes messages for viewers from samples."""
 
     def messages(
         self, service: str, generation: Generation, frame: Sample, time_ns: int
     ) -> Iterable[tuple[str, str, Schema, bytes]]:
-        """(topic, encoding, schema, data) of each message.
+        """Return (topic, encoding, schema, data) of each message.
 
         Args:
-            service: whose frame.
-            generation: of it.
-            frame: it.
-            time_ns: when it was published, ns since 1970, on the axis of the recording.
+            service: name of the service.
+            generation: of the sample.
+            frame: the sample.
+            time_ns: time of publication, ns since 1970, on the axis of the recording.
         """
 
 
@@ -89,12 +89,12 @@ class Recorder:
     """Records until it is stopped.
 
     Args:
-        target: where the recording goes; the recorder completes it.
-        names: of services; None: all there are and come.
-        namespace: where they are.
-        with_wires: record also what goes over the wires of the drivers.
-        disguise: gives what is written in the place of names of buses and of texts of options; None: they are.
-        beside: makes messages that are recorded beside frames.
+        target: destination of the recording; the recorder completes it.
+        names: of services; None: all, also those that appear later.
+        namespace: of the services.
+        with_wires: also record the frames and bytes on the wires of the drivers.
+        disguise: replaces names of buses and texts of options; None: they are written as they are.
+        renderer: makes messages for viewers, recorded beside the samples.
         clocks: reads the clocks of the machine.
     """
 
@@ -106,20 +106,20 @@ class Recorder:
         namespace: Namespace | str | None = None,
         with_wires: bool = False,
         disguise: Callable[[str], str] | None = None,
-        beside: Beside | None = None,
+        renderer: Renderer | None = None,
         clocks: Callable[[], Clocks] = read_clocks,
     ) -> None:
         self._target = target
         self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
-        self._coder = _Coder(target, self._jobs, disguise, beside, TimeAxis(clocks))
+        self._coder = _Coder(target, self._jobs, disguise, renderer, TimeAxis(clocks))
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
-        self._collector.take()  # what comes later is recorded from its first frame on
+        self._collector.take()  # later services are recorded from their first sample on
         self._stopping = False
 
     @property
     def lost(self) -> int:
-        """Frames that were published meanwhile and could not be taken."""
+        """Samples that were published meanwhile and could not be taken."""
         return self._collector.lost
 
     @property
@@ -132,34 +132,34 @@ class Recorder:
         return {names[channel]: count for channel, count in sorted(self._target.counts.items())}
 
     def news(self) -> list[dict[str, Any]]:
-        """Return the events of the machine since the last call: suspended, or its wall clock was set."""
+        """Return events of the machine since the last call: it was suspended, its wall clock was set."""
         news = self._coder.news
         return [news.popleft() for _ in range(len(news))]
 
-    def run(self, duration_s: float | None = None, tell: Callable[[], object] = lambda: None) -> None:
+    def run(self, duration_s: float | None = None, report: Callable[[], object] = lambda: None) -> None:
         """Record until ``stop``, until the time is over, or until the target is full.
 
         Args:
             duration_s: how long; None: without end.
-            tell: called once a second.
+            report: called once a second.
 
         Raises:
-            OSError: the recording cannot be written any more, or its file was deleted, replaced, moved or changed. What
-                was written is complete.
+            OSError: the recording cannot be written any more, or its file was deleted, replaced, moved or changed. The
+                chunks written before are complete.
         """
         end_ns = None if duration_s is None else now_ns() + round(duration_s * NS_PER_S)
-        tell_ns = now_ns() + _TELL_NS
+        report_ns = now_ns() + _REPORT_NS
         self._coder.start()
         try:
             with short_turns():
                 while not (self._stopping or self._coder.failure or self._target.is_full):
                     if end_ns is not None and now_ns() >= end_ns:
                         break
-                    if now_ns() >= tell_ns:
-                        tell_ns = max(tell_ns + _TELL_NS, now_ns())
-                        tell()
+                    if now_ns() >= report_ns:
+                        report_ns = max(report_ns + _REPORT_NS, now_ns())
+                        report()
                     taken = self._bytes_waiting < _MOST_WAITING and self._collector.take()
-                    if taken:  # those that come soon are taken together
+                    if taken:  # take together the samples that come soon
                         time.sleep(min(_LONGEST_REST_NS, self._collector.slack_ns // 4) / NS_PER_S)
                     self._collector.wait(WAIT_SLICE_NS // 5)
                 if not self._coder.failure:
@@ -176,13 +176,13 @@ class Recorder:
         self._stopping = True
 
     def save(self) -> None:
-        """Write what is only in memory (:class:`skinware.recording.files.Past`); likewise."""
+        """Write the chunks in memory (:class:`skinware.recording.files.Past`); from any thread or signal handler."""
         self._jobs.put(_Save())
 
-    # -- what the collector tells ---------------------------------------------------------------------------------
+    # -- the collector's listener ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.transfer.collecting.Listener`."""
+        """See :class:`skinware.transfer.collecting.FrameListener`."""
         self._jobs.put(_Began(service, head))
 
     def took(self, service: str, frame: Sample) -> None:
@@ -199,7 +199,7 @@ class Recorder:
 
 @dataclass
 class _Stream:
-    """The frames of one service as they are coded."""
+    """Codes the samples of one service."""
 
     head: Head
     encoder: Encoder
@@ -208,7 +208,7 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _WireStream:
-    """What goes over the wires of a driver, with their names, and what it says of itself."""
+    """The buses of a driver's wire service, and the driver's description of itself."""
 
     driver: str
     buses: list[str]
@@ -216,21 +216,21 @@ class _WireStream:
 
 
 class _Coder(threading.Thread):
-    """Codes frames, fills chunks, and hands them to the target when they are due."""
+    """Codes samples, fills chunks, and hands them to the target when they are due."""
 
     def __init__(
         self,
         target: Target,
         jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End],
         disguise: Callable[[str], str] | None,
-        beside: Beside | None,
+        renderer: Renderer | None,
         axis: TimeAxis,
     ) -> None:
         super().__init__(name="skinware recorder")
         self.channels = Channels()
         self.bytes_done = 0
         self.failure: Exception | None = None
-        self._target, self._jobs, self._disguise, self._beside = target, jobs, disguise, beside
+        self._target, self._jobs, self._disguise, self._renderer = target, jobs, disguise, renderer
         self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
         self._chunk = OpenChunk()
         self._frames_size = 0  # of the chunk, decoded
@@ -242,12 +242,12 @@ class _Coder(threading.Thread):
         self.news: deque[dict[str, Any]] = deque(maxlen=_MOST_NEWS)
 
     def run(self) -> None:
-        """Until there is nothing more to do, or nothing can be done."""
+        """Do jobs until the end, or until one fails."""
         try:
             while self._work():
                 pass
             self._close_chunk()
-        except Exception as error:  # noqa: BLE001, whoever records is told
+        except Exception as error:  # noqa: BLE001, Recorder.run raises it
             self.failure = error
         try:
             self._target.finish()
@@ -255,7 +255,7 @@ class _Coder(threading.Thread):
             self.failure = self.failure or error
 
     def _work(self) -> bool:
-        """One job; False: that was the last."""
+        """Do one job; return False after the last."""
         if now_ns() >= self._next_clock_ns:
             self._look_around()
         is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
@@ -301,7 +301,7 @@ class _Coder(threading.Thread):
             self._begin_wires(service, wires)
             return
         if self._disguise is not None:
-            with contextlib.suppress(BadRecording):  # it is kept as it is, and nobody can read it
+            with contextlib.suppress(BadRecording):  # an unreadable head is kept as it is
                 head = disguised(head, service, self._disguise)
         before = self._streams.get(service)
         number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
@@ -309,8 +309,8 @@ class _Coder(threading.Thread):
         columns = segment.layout.slot
         encoder = Encoder([CodedColumn.of(column) for column in columns])
         generation = None
-        if self._beside is not None:
-            with contextlib.suppress(BadRecording):  # of no driver that anybody could show
+        if self._renderer is not None:
+            with contextlib.suppress(BadRecording):  # viewers cannot show an unreadable driver
                 generation = Generation(head, service)
         self._streams[service] = _Stream(Head(channel, schema, number, head), encoder, generation)
 
@@ -332,9 +332,9 @@ class _Coder(threading.Thread):
             stream.encoder.next_is_key()
         self._heads.add(stream.head)
         self._add(channel, schema, frame.sequence, frame.published_ns, stream.encoder.encode(frame))
-        if self._beside is not None and stream.generation is not None:
+        if self._renderer is not None and stream.generation is not None:
             time_ns = self._axis.log_ns(frame.published_ns)
-            for topic, encoding, known, data in self._beside.messages(service, stream.generation, frame, time_ns):
+            for topic, encoding, known, data in self._renderer.messages(service, stream.generation, frame, time_ns):
                 self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
 
     def _add_wire(self, stream: _WireStream, frame: Sample) -> None:
@@ -355,7 +355,7 @@ class _Coder(threading.Thread):
         self._chunk.add(channel, schema, sequence, axis.log_ns(monotonic_ns), data, axis.wall_ns(monotonic_ns))
 
     def _look_around(self) -> None:
-        """Once a second: record what the clocks are, and make sure that the target is still there."""
+        """Record the clocks, and make sure that the target still exists; once a second."""
         self._next_clock_ns = now_ns() + _CLOCK_NS
         for event in self._axis.look():
             self.news.append(event)
@@ -373,7 +373,7 @@ class _Coder(threading.Thread):
 
 
 def _wires_of(segment: segments.Segment) -> _WireStream | None:
-    """What goes over the wires of a driver; None if a service is not one that tells that."""
+    """Return the buses of a wire service; None for other services."""
     columns = {column.name for column in segment.layout.slot}
     if bytes(segment.header["kind"]).decode() != KIND or columns != COLUMNS.keys():
         return None

@@ -1,4 +1,4 @@
-"""Publishes a recording again, so that every reader and service works on it as on the drivers that were recorded."""
+"""Publish a recording again, so that readers and services work on it as on the recorded drivers."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from skinware.transfer.republishing import Republisher
 
 _LATE_NS = 10_000_000
 _MOST_BEHIND_NS = 50_000_000
-"""Who is later than that goes on from there: frames that follow at once are more than a ring holds."""
+"""A replay that is later than that shifts its time: catching up at once would overrun the rings."""
 _FINE_NS = 1_500_000
-"""Before a frame is due, requests wait: their wait is in full milliseconds."""
+"""So long before a sample is due, no request is answered: that wait has a resolution of a millisecond."""
 _NEAR_S = 1.0
 _TIDY_NS = NS_PER_S // 2
 
 
 class Replayer:
-    """Publishes what was recorded under the same names, with the same tables, and in the same rhythm.
+    """Publishes recorded services under the same names, with the same tables, and in the same rhythm.
 
-    Programs ask its services for the operations :meth:`replay`, :meth:`pause`, :meth:`resume`, :meth:`step`,
-    :meth:`seek`, :meth:`speed` and :meth:`loop`; whichever they ask, all services of the replay follow. In Python they
-    are for the thread that runs it.
+    Programs may request the operations :meth:`replay`, :meth:`pause`, :meth:`resume`, :meth:`step`, :meth:`seek`,
+    :meth:`speed` and :meth:`loop` from any of its services; all services follow. In Python, call them in the thread
+    that runs the replay.
 
     Args:
-        recording: what to publish.
+        recording: the recording to publish.
         names: of services; None: all.
-        namespace: where to publish them.
-        speed: 2.0: twice as fast.
-        start_s: where it begins, s since the recording began.
-        end_s: where it ends, likewise; default: where the recording does.
-        loop: it begins again at its end.
-        paused: it waits for ``resume`` or ``step`` first.
-        stays: at its end it is paused, and does not end.
-        keeps_times: times stay as they were recorded; otherwise they are moved to now.
+        namespace: in which to publish them.
+        speed: 2.0 is twice as fast as recorded.
+        start_s: begin at this time, s since the recording began.
+        end_s: end before this time; None: at the end of the recording.
+        loop: begin again at the end.
+        paused: wait for ``resume`` or ``step`` first.
+        stays: pause at the end instead of ending.
+        keeps_times: keep the recorded times; False: move them to now.
 
     Attributes:
-        late: frames that were published more than 10 ms after their time.
+        late: samples that were published more than 10 ms after their time.
 
     Raises:
         BadRecording: its services need more shared memory than the limits allow.
-        ConfigurationError: nothing was recorded of one of them.
+        ConfigurationError: the recording has no samples of one of them.
     """
 
     def __init__(
@@ -87,12 +87,12 @@ class Replayer:
         self._jumped: set[str] = set()
         self._goes_on = False
         self._stopping = False
-        self._tell_ns = self._tidy_ns = 0
+        self._report_ns = self._tidy_ns = 0
         self.late: int = 0
 
     @property
     def time_s(self) -> float:
-        """Where it is in the recording, s since that began."""
+        """Position in the recording, s since it began."""
         if self._paused:
             return self._from_s
         passed_s = self._from_s + (now_ns() - self._from_ns) / NS_PER_S * self._republisher.speed
@@ -104,15 +104,15 @@ class Replayer:
 
     @property
     def frames(self) -> Counter[str]:
-        """Of each service that were published."""
+        """Number of published samples, by service."""
         return self._republisher.frames
 
-    def run(self, tell: Callable[[], object] = lambda: None, every_s: float = 1.0) -> None:
-        """Publish it, until its end or until ``stop``.
+    def run(self, report: Callable[[], object] = lambda: None, every_s: float = 1.0) -> None:
+        """Publish the recording, until its end or until ``stop``.
 
         Args:
-            tell: called about every ``every_s``.
-            every_s: how often.
+            report: called about every ``every_s``.
+            every_s: time between two calls.
 
         Raises:
             NameInUse: a running driver or service has one of the names.
@@ -121,18 +121,18 @@ class Replayer:
         if self._start_s > self._recording.duration_s:
             return
         with short_turns():
-            self._run(tell, every_s)
+            self._run(report, every_s)
 
-    def _run(self, tell: Callable[[], object], every_s: float) -> None:
+    def _run(self, report: Callable[[], object], every_s: float) -> None:
         self._go_to(self._start_s)
-        if self._paused and not self.frames:  # who is to resume it has to find it
+        if self._paused and not self.frames:  # programs that are to resume it must find its services
             self.step()
         while not self._stopping:
             if not self._paused and self._next is None:
                 self._next = self._take_next()
             time_s = self._last_s if self._next is None else self._next.time_s
             due_ns = now_ns() + WAIT_SLICE_NS if self._paused else self._due_ns(time_s)
-            if not self._wait(due_ns, tell, every_s) or self._paused:
+            if not self._wait(due_ns, report, every_s) or self._paused:
                 continue
             if self._next is None:
                 if not self._end():
@@ -148,26 +148,26 @@ class Replayer:
             self._apply(moment)
 
     def stop(self) -> None:
-        """End it; from any thread, and from a signal handler."""
+        """End the replay; from any thread or signal handler."""
         self._stopping = True
 
     def close(self) -> None:
-        """Withdraw what is published. Idempotent."""
+        """Withdraw the published services. Idempotent."""
         self._ahead.shutdown()
         self._republisher.close()
 
     def watch(self, fd: int, call: Callable[[], object]) -> None:
-        """While it runs, call something whenever a descriptor can be read."""
+        """Call a function whenever a descriptor can be read, while the replay runs."""
         self._republisher.watch(fd, call)
 
     def unwatch(self, fd: int) -> None:
-        """Not any more."""
+        """End a watch."""
         self._republisher.unwatch(fd)
 
     # -- operations -----------------------------------------------------------------------------------------------
 
     def replay(self) -> dict[str, Any]:
-        """Tell the file, time_s, duration_s, speed, and whether it is paused and loops."""
+        """Return the file, time_s, duration_s, speed, late, and whether the replay is paused and loops."""
         return {
             "file": str(self._recording.path),
             "time_s": self.time_s,
@@ -179,17 +179,17 @@ class Replayer:
         }
 
     def pause(self) -> dict[str, Any]:
-        """Stop publishing; then as replay."""
+        """Pause, and return what :meth:`replay` does."""
         self._set_paused(True, self.time_s)
         return self.replay()
 
     def resume(self) -> dict[str, Any]:
-        """Go on after a pause; then as replay."""
+        """Resume after a pause, and return what :meth:`replay` does."""
         self._set_paused(False, self.time_s)
         return self.replay()
 
     def step(self, frames: int = 1) -> dict[str, Any]:
-        """Pause, and publish the next of the frames, or as many; back with numbers below 0; then as replay."""
+        """Pause, publish the next samples (below 0: go back), and return what :meth:`replay` does."""
         if _number(frames, "frames") != int(frames) or not frames:
             raise ValueError(f"frames={frames!r}: give a whole number, below 0 to go back")
         self._set_paused(True, self.time_s)
@@ -201,13 +201,17 @@ class Replayer:
         return self.replay()
 
     def seek(self, time_s: float) -> dict[str, Any]:
-        """Go to a time, s since the recording began, and publish what was newest then; then as replay."""
+        """Go to a time, publish the newest samples then, and return what :meth:`replay` does.
+
+        Args:
+            time_s: since the recording began.
+        """
         time_s = _number(time_s, "time_s")
         self._go_to(min(max(time_s, self._start_s), self._last_s))
         return self.replay()
 
     def speed(self, factor: float) -> dict[str, Any]:
-        """Be so many times as fast as the recording; then as replay."""
+        """Set the speed as a multiple of the recording's, and return what :meth:`replay` does."""
         factor = _number(factor, "factor")
         if not factor > 0:
             raise ValueError(f"factor={factor!r}: a speed is above 0; 1 is that of the recording")
@@ -216,28 +220,28 @@ class Replayer:
         return self.replay()
 
     def loop(self, on: bool = True) -> dict[str, Any]:
-        """Begin again at the end, or not any more; then as replay."""
+        """Switch looping on or off, and return what :meth:`replay` does."""
         self._loops = bool(on)
         return self.replay()
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def _from_now(self, time_s: float) -> None:
-        """From now on time goes on from there; what is waited for is another moment."""
+        """Continue from a time in the recording, and end the wait for the next moment."""
         self._from_ns, self._from_s = now_ns(), time_s
         self._turned += 1
 
     def _due_ns(self, time_s: float) -> int:
         return self._from_ns + round((time_s - self._from_s) / self._republisher.speed * NS_PER_S)
 
-    def _wait(self, due_ns: int, tell: Callable[[], object], every_s: float) -> bool:
-        """Until a time; False: something was asked for meanwhile, or it is to end."""
+    def _wait(self, due_ns: int, report: Callable[[], object], every_s: float) -> bool:
+        """Wait until a time, and answer requests; return False if one of them, or ``stop``, ended the wait."""
         turned = self._turned
         while not self._stopping and self._turned == turned:
             time_ns = now_ns()
-            if time_ns >= self._tell_ns:
-                self._tell_ns = time_ns + round(every_s * NS_PER_S)
-                tell()
+            if time_ns >= self._report_ns:
+                self._report_ns = time_ns + round(every_s * NS_PER_S)
+                report()
             if time_ns >= self._tidy_ns:
                 self._tidy_ns = time_ns + _TIDY_NS
                 self._republisher.tidy()
@@ -250,10 +254,10 @@ class Replayer:
                 time.sleep(left_ns / NS_PER_S)
         return False
 
-    # -- what is published ----------------------------------------------------------------------------------------
+    # -- publishing -----------------------------------------------------------------------------------------------
 
     def _take_next(self) -> Moment | None:
-        """The next moment, of which the timeline is then behind; None at the end."""
+        """Pass the next moment and return it; None at the end."""
         moment = self._timeline.next()
         if moment is not None and moment.time_s >= self._end_s:
             self._timeline.back()
@@ -261,7 +265,7 @@ class Replayer:
         return moment
 
     def _end(self) -> bool:
-        """What is done at the end; False: nothing more."""
+        """Loop or pause at the end; return False if the replay is over."""
         if self._loops and self._goes_on:
             self._goes_on = False
             self._go_to(self._start_s)
@@ -287,7 +291,7 @@ class Replayer:
         self._from_now(time_s)
 
     def _put_back(self) -> None:
-        """The moment that is waited for comes after the timeline's place again."""
+        """Return the pending moment to the timeline."""
         if self._next is not None:
             self._timeline.back()
             self._next = None

@@ -1,4 +1,4 @@
-"""The moments of a recording, forward and back, and what there was at any of them."""
+"""Go through the moments of a recording, forward and back, and find the state at any of them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _KEPT_CHUNKS = 3
 
 
 class Moment(NamedTuple):
-    """A frame, or what happened to a service.
+    """A sample, or an event of a service.
 
     Attributes:
         time_s: since the recording began.
         service: its name.
-        frame: it; None of an event.
-        event: ``paused``, ``live``, ``closed`` or ``dead``; empty of a frame.
+        frame: the sample; None for an event.
+        event: ``paused``, ``live``, ``closed`` or ``dead``; empty for a sample.
     """
 
     time_s: float
@@ -33,29 +33,29 @@ class Moment(NamedTuple):
 
 
 class MomentSource(Protocol):
-    """Where moments come from: a recording."""
+    """A recording that has moments."""
 
     @property
     def places(self) -> list[ChunkPlace]:
-        """Its chunks, in order."""
+        """Places of its chunks, in order."""
 
     def time_s(self, time_ns: int) -> float:
-        """The time of a message, s since the recording began."""
+        """Return the time of a message, s since the recording began."""
 
     def may_have(self, place: ChunkPlace, services: Collection[str], *, events: bool = True) -> bool:
-        """Whether there may be frames of some services in a chunk, or events."""
+        """Return whether a chunk may have samples of some services, or events."""
 
     def moments_in(self, place: ChunkPlace, services: Collection[str]) -> list[Moment]:
-        """The moments of some services in a chunk, by time; none if it is damaged."""
+        """Return the moments of some services in a chunk, by time; none if it is damaged."""
 
 
 class Timeline:
-    """A place between two moments of some services, which moves.
+    """A position between two moments of some services.
 
     Args:
-        recording: whose.
-        services: their names.
-        ahead: decodes the chunk after the one at hand meanwhile, for who must not wait for it.
+        recording: the source of the moments.
+        services: names of the services.
+        ahead: decodes the next chunk in the background; None: each chunk is decoded when it is needed.
     """
 
     def __init__(self, recording: MomentSource, services: Iterable[str], ahead: Executor | None = None) -> None:
@@ -68,12 +68,12 @@ class Timeline:
         self._chunk = self._at = 0
 
     def seek(self, time_s: float) -> None:
-        """Go to right before the first moment that is not before a time, s since the recording began."""
+        """Go before the first moment at or after a time, s since the recording began."""
         self._chunk = bisect_left(self._ends_s, time_s)
         self._at = bisect_left(self._moments(self._chunk), time_s, key=lambda moment: moment.time_s)
 
     def next(self) -> Moment | None:
-        """Go over the next moment; None at the end."""
+        """Pass the next moment and return it; None at the end."""
         while self._chunk < len(self._places):
             moments = self._moments(self._chunk)
             if self._at < len(moments):
@@ -83,7 +83,7 @@ class Timeline:
         return None
 
     def back(self) -> Moment | None:
-        """Go back over the moment before; None at the beginning."""
+        """Pass the moment before and return it; None at the beginning."""
         while not self._at:
             if not self._chunk:
                 return None
@@ -93,9 +93,9 @@ class Timeline:
         return self._moments(self._chunk)[self._at]
 
     def so_far(self, services: Collection[str]) -> dict[str, list[Moment]]:
-        """What some services were like: the newest frame of each, and what happened to it since, in order.
+        """Return the newest sample of each service and the events after it, in order.
 
-        Those that had not begun are left out.
+        Services that had not begun are left out.
         """
         found: dict[str, list[Moment]] = {name: [] for name in services}
         wanted = set(services)
@@ -116,7 +116,7 @@ class Timeline:
         return {name: moments for name, moments in found.items() if name not in wanted}
 
     def first_s(self) -> Mapping[str, float]:
-        """When each service was there first, as exactly as chunks tell, s since the recording began."""
+        """Return the start of the first chunk that has samples of each service, s since the recording began."""
         first: dict[str, float] = {}
         for place in self._places:
             for name in self.services:

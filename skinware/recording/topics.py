@@ -8,13 +8,13 @@ from mcap.records import Channel, Schema
 
 FORMAT = 1
 ENCODING = f"skinware/{FORMAT}"
-"""Of messages with frames and with generations. A file with a higher number needs a newer version of this package."""
+"""Encoding of samples and generations. A file with a higher number needs a newer version of this package."""
 _FAMILY = "skinware/"
 FRAME, GENERATION = "frame", "generation"
 EVENTS, CLOCK = "/skin/events", "/skin/clock"
 WIRE, ABOUT = "wire", "about"
 WIRE_ENCODING = "skinware-wire/1"
-"""Of messages with what went over a wire."""
+"""Encoding of the frames and bytes of a wire."""
 
 _EVENT = {
     "type": "object",
@@ -22,11 +22,11 @@ _EVENT = {
         "event": {"type": "string", "description": "found, live, ... see Recordings in the documentation"},
         "service": {"type": "string"},
         "time_ns": {"type": "integer", "description": "CLOCK_MONOTONIC"},
-        "count": {"type": "integer", "description": "of lost: how many frames"},
-        "before": {"type": "integer", "description": "of lost: sequence of the frame after them"},
-        "why": {"type": "string", "description": "of unreadable"},
-        "for_ns": {"type": "integer", "description": "of suspended: how long the machine was"},
-        "by_ns": {"type": "integer", "description": "of clock_stepped: by how much the wall clock was set"},
+        "count": {"type": "integer", "description": "lost: how many samples"},
+        "before": {"type": "integer", "description": "lost: sequence of the sample after them"},
+        "why": {"type": "string", "description": "unreadable: the reason"},
+        "for_ns": {"type": "integer", "description": "suspended: for how long"},
+        "by_ns": {"type": "integer", "description": "clock_stepped: by how much"},
     },
 }
 _CLOCK = {
@@ -34,8 +34,8 @@ _CLOCK = {
     "properties": {
         "monotonic_ns": {"type": "integer", "description": "CLOCK_MONOTONIC, the time of frames"},
         "realtime_ns": {"type": "integer", "description": "CLOCK_REALTIME at the same moment"},
-        "boottime_ns": {"type": "integer", "description": "CLOCK_BOOTTIME, likewise: monotonic_ns and suspended time"},
-        "boot": {"type": "string", "description": "which start of the machine the first one counts from"},
+        "boottime_ns": {"type": "integer", "description": "CLOCK_BOOTTIME: monotonic_ns plus suspended time"},
+        "boot": {"type": "string", "description": "identifies the start of the machine from which monotonic_ns counts"},
     },
 }
 _ABOUT = {
@@ -43,7 +43,7 @@ _ABOUT = {
     "properties": {
         "driver_type": {"type": "string", "description": "as --driver takes it"},
         "listen_only": {"type": "boolean"},
-        "versions": {"type": "object", "description": "of the programs that ran"},
+        "versions": {"type": "object", "description": "versions of the programs that ran"},
         "buses": {
             "type": "object",
             "description": "by name: medium, and the options of the driver for it",
@@ -77,7 +77,7 @@ class Channels:
         self._channels: dict[str, Channel] = {}
 
     def of_service(self, name: str, what: str) -> tuple[Channel, Schema]:
-        """The channel of a service's frames, or of its generations."""
+        """Return the channel of a service's samples or generations."""
         return self.of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
 
     def of_all(self, topic: str) -> tuple[Channel, Schema]:
@@ -87,7 +87,7 @@ class Channels:
         return self.of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
 
     def of_about(self, driver: str) -> tuple[Channel, Schema]:
-        """The channel of what a driver says of itself beside its wires."""
+        """Return the channel in which a driver describes itself."""
         return self.of(f"/wire/{driver}", "json", SCHEMAS[ABOUT], {"driver": driver})
 
     def names(self) -> dict[int, str]:
@@ -96,7 +96,7 @@ class Channels:
     def of(
         self, topic: str, encoding: str, schema: Schema, metadata: dict[str, str] | None = None
     ) -> tuple[Channel, Schema]:
-        """The channel of a topic; the schema is given back."""
+        """Return the channel of a topic, made if it is new, and the schema."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = Channel(len(self._channels) + 1, topic, encoding, metadata or {}, schema.id)
@@ -105,7 +105,7 @@ class Channels:
 
 
 def service_of(channel: Channel) -> tuple[str, str] | None:
-    """(name of the service, what of it) of a channel of ours; None of any other."""
+    """Return (service, ``frame`` or ``generation``); None for a channel of another kind."""
     parts = channel.topic.split("/")
     if channel.message_encoding != ENCODING or len(parts) != 4 or parts[3] not in (FRAME, GENERATION):
         return None
@@ -113,20 +113,20 @@ def service_of(channel: Channel) -> tuple[str, str] | None:
 
 
 def wire_of(channel: Channel) -> tuple[str, str] | None:
-    """(driver, name of its bus) of a channel with what went over a wire; None of any other."""
-    told = channel.metadata
-    is_wire = channel.message_encoding == WIRE_ENCODING and "driver" in told and "bus" in told
-    return (told["driver"], told["bus"]) if is_wire else None
+    """Return (driver, bus) of a wire; None for a channel of another kind."""
+    names = channel.metadata
+    is_wire = channel.message_encoding == WIRE_ENCODING and "driver" in names and "bus" in names
+    return (names["driver"], names["bus"]) if is_wire else None
 
 
 def about_of(channel: Channel) -> str | None:
-    """The driver of a channel with what it says of itself beside its wires; None of any other."""
+    """Return the driver that describes itself in a channel; None for a channel of another kind."""
     driver = channel.metadata.get("driver", "")
     return driver if driver and channel.topic == f"/wire/{driver}" else None
 
 
 def newer_format(channel: Channel) -> str | None:
-    """The encoding of a channel that needs a newer version of this package; None of any other."""
+    """Return the encoding of a channel that needs a newer version of this package, or None."""
     encoding = channel.message_encoding
     number = encoding.removeprefix(_FAMILY)
     return encoding if encoding.startswith(_FAMILY) and number.isdigit() and int(number) > FORMAT else None

@@ -1,4 +1,4 @@
-"""Give what was recorded of one service: sample by sample, or as whole columns."""
+"""Read the samples of one recorded service, one by one or as whole columns."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from skinware.transfer.generation import PER_SENSOR, Generation, RecordedSample,
 
 
 class Series:
-    """n frames of one service, whose columns and tables are the same in all of them.
+    """n samples of one service that have the same columns and tables.
 
     Args:
         origin: one of their generations.
         headers: (n,) of :data:`skinware.transfer.codec.HEADER`.
-        time_s: (n,) when each was published, s since the recording began.
+        time_s: (n,) time of publication, s since the recording began.
         columns: (n, ...) by name.
 
     Attributes:
         origin, headers, time_s, columns: as given.
-        generation: (n,) uint64, which incarnation of the service each frame belongs to.
-        sequence: (n,) uint64, number of each within it; a gap are frames that were lost.
-        acquired_ns: (n,) int64, newest time stamp of the data in each, CLOCK_MONOTONIC of the machine that recorded.
-        published_ns: (n,) int64, when the writer handed it out, likewise.
+        generation: (n,) uint64, number of each sample's generation.
+        sequence: (n,) uint64, number of each sample in its generation; a jump means lost samples.
+        acquired_ns: (n,) int64, newest time stamp of the data, CLOCK_MONOTONIC of the machine that recorded.
+        published_ns: (n,) int64, time of publication by the same clock.
         flags: (n,) uint64, bits for the service's own use.
     """
 
@@ -55,7 +55,7 @@ class Series:
 
     @classmethod
     def joined(cls, parts: Sequence[Series]) -> Series:
-        """Join at least one series of the same columns, one after the other."""
+        """Concatenate one or more series of the same columns."""
         return cls(
             parts[0].origin,
             np.concatenate([part.headers for part in parts]),
@@ -78,7 +78,7 @@ class Series:
         return cast(Structure, self.origin.context)
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """(n, ...) one column of all frames.
+        """Return one column of all samples, (n, ...).
 
         Raises:
             KeyError: no such column, or it was not read.
@@ -90,33 +90,33 @@ class Series:
             raise KeyError(f"column {name!r} {known}; there are {', '.join(self.columns)}") from None
 
     def raw(self, type_name: str) -> npt.NDArray[Any]:
-        """(n, sensors) raw counts of all sensors of a type, in the order of ``structure.index``.
+        """Return (n, sensors) raw counts of a type, in the order of ``structure.index``.
 
         Raises:
-            StructureError: no such type here; the same for all that take a type.
+            StructureError: no such type; also raised by the other methods that take a type.
         """
         return self.column("values")[:, self.structure.index(type_name)]
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
-        """(n, sensors) float32 values in the type's unit; float64 where raw values are int32."""
+        """Return (n, sensors) float32 values in the type's unit; float64 for raw values of int32."""
         return self.structure.physical(self.column("values"), type_name)
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """(n, sensors) uint8, bits of :class:`skinware.Status`."""
+        """Return (n, sensors) uint8, bits of :class:`skinware.Status`."""
         return self.column("status")[:, self.structure.index(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n, sensors) int64: time of the data of each sensor (of its update group), 0: never seen."""
+        """Return (n, sensors) int64, the time of each sensor's data (of its update group); 0: never seen."""
         structure = self.structure
         times_ns = self.column("group_time_ns" if "group_time_ns" in self.origin.columns else "module_time_ns")
         return times_ns[:, structure.sensor_group[structure.index(type_name)]]
 
     def fresh(self, type_name: str, *, max_age_s: float | None = None) -> npt.NDArray[np.bool_]:
-        """(n, sensors) bool: which could be trusted when their frame was published.
+        """Return (n, sensors) bool: whether each value was fresh when its sample was published.
 
         Args:
-            type_name: which sensors.
-            max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverSnapshot.fresh`.
+            type_name: a sensor type.
+            max_age_s: oldest fresh age; default: as for :meth:`skinware.DriverSnapshot.fresh`.
         """
         limits_ns = self.structure.age_limits_ns(self.origin.period_ns)[self.structure.index(type_name)]
         max_age_ns = limits_ns if max_age_s is None else round(max_age_s * NS_PER_S)
@@ -124,14 +124,14 @@ class Series:
         return is_fresh(self.status_of(type_name), self.time_ns(type_name), at_ns=at_ns, max_age_ns=max_age_ns)
 
     def __repr__(self) -> str:
-        return f"<Series of {len(self)} frames of {self.origin.name!r}: {', '.join(self.columns)}>"
+        return f"<Series of {len(self)} samples of {self.origin.name!r}: {', '.join(self.columns)}>"
 
 
 _FOR_DRIVERS = ("values", "status", "module_time_ns")
 
 
 class ChunkSource(Protocol):
-    """Where the chunks of a recording come from."""
+    """A recording that has chunks."""
 
     path: Path
     start_ns: int
@@ -143,21 +143,21 @@ class ChunkSource(Protocol):
     def chunks(
         self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
     ) -> Iterator[ChunkContents]:
-        """The chunks in which there may be messages of some channels, of a time."""
+        """Yield the chunks that may have messages of some channels within a time."""
 
     def note(self, problem: str) -> None:
-        """Something is wrong with the file."""
+        """Note that something is wrong with the file."""
 
 
 class Track:
-    """What was recorded of one service.
+    """The recorded samples of one service.
 
     Args:
-        recording: where it is.
+        recording: the source of its chunks.
         name: of the service.
-        channel: number of the channel of its frames.
-        generations: those whose frames are wanted, by number.
-        told: all that are told in the recording; default: the same.
+        channel: number of the channel of its samples.
+        generations: the generations to read, by number.
+        known: numbers of all generations that the recording describes; default: the same.
 
     Attributes:
         name: of the service.
@@ -169,21 +169,21 @@ class Track:
         name: str,
         channel: int,
         generations: Mapping[int, Generation],
-        told: Collection[int] | None = None,
+        known: Collection[int] | None = None,
     ) -> None:
         self._recording = recording
         self.name: str = name
         self.channel: int = channel
         self._generations = generations
-        self._told: Collection[int] = generations.keys() if told is None else told
+        self._known: Collection[int] = generations.keys() if known is None else known
 
     @property
     def generations(self) -> tuple[Generation, ...]:
-        """Its generations, in order."""
+        """Its generations, by number."""
         return tuple(self._generations[number] for number in sorted(self._generations))
 
     def generation(self, number: int) -> Generation:
-        """One of them, by its number."""
+        """Return one of its generations."""
         return self._generations[number]
 
     @property
@@ -193,20 +193,20 @@ class Track:
 
     @property
     def parts(self) -> tuple[Track, ...]:
-        """One for each time that its columns or tables changed; their frames are one after the other."""
+        """Successive tracks, one for each stretch in which the columns and tables stayed the same."""
         parts: list[dict[int, Generation]] = []
         for generation in self.generations:
             if not parts or next(iter(parts[-1].values())).digest != generation.digest:
                 parts.append({})
             parts[-1][generation.generation] = generation
-        return tuple(Track(self._recording, self.name, self.channel, part, self._told) for part in parts)
+        return tuple(Track(self._recording, self.name, self.channel, part, self._known) for part in parts)
 
     @property
     def structure(self) -> Structure:
-        """The structure of a driver.
+        """The structure of the driver.
 
         Raises:
-            StructureError: it is not a driver, or had several.
+            StructureError: the service is not a driver, or its structure changed.
         """
         origin = self._only_origin()
         if not isinstance(origin.context, Structure):
@@ -214,11 +214,11 @@ class Track:
         return origin.context
 
     def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedSample]:
-        """Every frame, in order; those of a driver are driver frames.
+        """Yield every sample in order; those of a driver as driver snapshots.
 
         Args:
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last.
+            start_s: begin at this time, s since the recording began.
+            end_s: end before this time; None: after the last sample.
         """
         for contents in self._recording.chunks({self.channel}, start_s, end_s):
             for time_s, frame in self.frames_in(contents):
@@ -226,7 +226,7 @@ class Track:
                     yield frame
 
     def frames_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedSample]]:
-        """The frames in a chunk, each with its time, s since the recording began."""
+        """Yield (time, sample) of each sample in a chunk; times in s since the recording began."""
         for part in self._decodable(contents):
             yield from zip(part.time_s.tolist(), frames_of(part.generation, part.run), strict=True)
 
@@ -239,24 +239,26 @@ class Track:
         start_s: float = 0.0,
         end_s: float | None = None,
     ) -> Series:
-        """Whole columns of all frames.
+        """Return whole columns of all samples.
 
         Args:
-            columns: names; default: all, of a driver values, status and times.
-            type_name: only sensors of this type; the series then has a structure of these alone.
-            sensors: of these, only some, in the order of ``structure.index(type_name)``: a region, for instance.
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last.
+            columns: names; default: all columns; for a driver its values, status and times.
+            type_name: only sensors of this type; the series has a structure of these alone.
+            sensors: only some of this type, in the order of ``structure.index(type_name)``: a region, for instance.
+            start_s: begin at this time, s since the recording began.
+            end_s: end before this time; None: after the last sample.
 
         Raises:
-            StructureError: the columns or tables changed in between: read the ``parts`` one by one; or there are no
-                such sensors.
+            StructureError: the columns or tables changed meanwhile (read the ``parts`` one by one), or no such sensors.
             KeyError: no such column.
             BadRecording: a small file becomes more than the limits allow (:meth:`skinware.limits.Limits.room`).
         """
-        asked = self._asked(columns, type_name, sensors)
-        parts, room = [_nothing(asked)], LIMITS.room(self._recording.size)
-        for part in self._blocks(asked, start_s, end_s):
+        request = self._request(columns, type_name, sensors)
+        formats = request.origin.columns
+        nothing = {name: np.zeros((0, *formats[name][0]), formats[name][1]) for name in request.columns}
+        parts = [Series(request.origin, np.zeros(0, HEADER), np.zeros(0), nothing)]
+        room = LIMITS.room(self._recording.size)
+        for part in self._blocks(request, start_s, end_s):
             room -= sum(column.nbytes for column in part.columns.values())
             if room < 0:
                 what = f"{self.name!r} becomes more than {LIMITS.room(self._recording.size)} bytes"
@@ -273,27 +275,25 @@ class Track:
         start_s: float = 0.0,
         end_s: float | None = None,
     ) -> Iterator[Series]:
-        """The same in pieces of a quarter of a second, one after the other; for recordings that memory cannot hold.
+        """Yield whole columns in pieces of a quarter of a second, for recordings that memory cannot hold.
 
-        Args:
-            columns: as for ``read``, which lists the errors.
-            type_name: likewise.
-            sensors: likewise.
-            start_s: likewise.
-            end_s: likewise.
+        The arguments and errors are those of :meth:`read`.
         """
-        return self._blocks(self._asked(columns, type_name, sensors), start_s, end_s)
+        return self._blocks(self._request(columns, type_name, sensors), start_s, end_s)
 
-    def _blocks(self, asked: _Asked, start_s: float, end_s: float | None) -> Iterator[Series]:
+    def _blocks(self, request: _Request, start_s: float, end_s: float | None) -> Iterator[Series]:
         numbers = {column.name: number for number, column in enumerate(self._only_origin().coded)}
-        for part in self._runs(start_s, end_s):
-            rows = _rows(part.time_s, start_s, end_s)
-            arrays = {name: part.column(numbers[name], rows) for name in asked.columns}
-            if asked.positions is not None:
-                arrays |= {name: arrays[name][:, asked.positions] for name in PER_SENSOR if name in arrays}
-            yield Series(asked.origin, part.run.headers[rows], part.time_s[rows], arrays)
+        for contents in self._recording.chunks({self.channel}, start_s, end_s):
+            for part in self._decodable(contents):
+                until_s = np.inf if end_s is None else end_s
+                wanted = np.flatnonzero((part.time_s >= start_s) & (part.time_s < until_s))
+                rows = slice(int(wanted[0]), int(wanted[-1]) + 1) if len(wanted) else slice(0)
+                arrays = {name: part.column(numbers[name], rows) for name in request.columns}
+                if request.positions is not None:
+                    arrays |= {name: arrays[name][:, request.positions] for name in PER_SENSOR if name in arrays}
+                yield Series(request.origin, part.run.headers[rows], part.time_s[rows], arrays)
 
-    def _asked(self, columns: Collection[str] | None, type_name: str | None, sensors: Index | None) -> _Asked:
+    def _request(self, columns: Collection[str] | None, type_name: str | None, sensors: Index | None) -> _Request:
         origin = self._only_origin()
         if columns is not None:
             names = tuple(columns)
@@ -307,24 +307,20 @@ class Track:
         if type_name is None:
             if sensors is not None:
                 raise StructureError("sensors are counted by type: give type_name")
-            return _Asked(origin, names, None)
+            return _Request(origin, names, None)
         positions = np.arange(self.structure.n_sensors)[self.structure.index(type_name)]
         index = as_index(positions if sensors is None else positions[sensors])
-        return _Asked(origin.only(index), names, index)
+        return _Request(origin.only(index), names, index)
 
     def _only_origin(self) -> Generation:
         origins = self.generations
         if not origins:
-            raise BadRecording(f"{self._recording.path}: what the frames of {self.name!r} are made of is lost")
+            raise BadRecording(f"{self._recording.path}: the description of the samples of {self.name!r} is lost")
         if len({origin.digest for origin in origins}) > 1:
             raise StructureError(
                 f"service {self.name!r} changed its columns or tables during the recording: use its parts"
             )
         return origins[0]
-
-    def _runs(self, start_s: float, end_s: float | None) -> Iterator[_PartOfChunk]:
-        for contents in self._recording.chunks({self.channel}, start_s, end_s):
-            yield from self._decodable(contents)
 
     def _decodable(self, contents: ChunkContents) -> Iterator[_PartOfChunk]:
         messages = [message for message in contents.messages if message.channel_id == self.channel]
@@ -332,12 +328,12 @@ class Track:
         for number, which in runs([message.data for message in messages]):
             generation = self._generations.get(number)
             if generation is None:
-                if number not in self._told:
-                    self._recording.note(f"frames of {self.name!r} left out: what they are made of is lost")
+                if number not in self._known:
+                    self._recording.note(f"samples of {self.name!r} left out: their description is lost")
                 continue
             left -= generation.slot_stride * (which.stop - which.start)
             if left < 0:
-                what = f"frames that become more than {LIMITS.frames_size} bytes in one chunk"
+                what = f"samples that become more than {LIMITS.frames_size} bytes in one chunk"
                 self._recording.note(f"{self.name}: {what} left out")
                 continue
             try:
@@ -352,13 +348,13 @@ class Track:
         return f"<Track of {self.name!r}>"
 
 
-class _Asked(NamedTuple):
-    """What is wanted of the frames.
+class _Request(NamedTuple):
+    """Which part of the samples to read.
 
     Attributes:
-        origin: what they are made of, with no other sensors.
+        origin: their generation, reduced to the sensors to read.
         columns: names.
-        positions: in a frame, of the sensors; None: all.
+        positions: of these sensors in a sample; None: all.
     """
 
     origin: Generation
@@ -367,12 +363,7 @@ class _Asked(NamedTuple):
 
 
 class _PartOfChunk(NamedTuple):
-    """Frames of one generation that stand in one chunk.
-
-    Attributes:
-        generation, run: they.
-        time_s: (n,) of each, s since the recording began.
-    """
+    """The samples of one generation in one chunk; ``time_s``: (n,) s since the recording began."""
 
     generation: Generation
     run: Run
@@ -385,15 +376,3 @@ class _PartOfChunk(NamedTuple):
         self.run.decode(number, words)
         wanted = words[rows]
         return wanted.view(np.uint8).view(dtype).reshape(len(wanted), *shape)
-
-
-def _nothing(asked: _Asked) -> Series:
-    formats = asked.origin.columns
-    columns = {name: np.zeros((0, *formats[name][0]), formats[name][1]) for name in asked.columns}
-    return Series(asked.origin, np.zeros(0, HEADER), np.zeros(0), columns)
-
-
-def _rows(time_s: npt.NDArray[np.float64], start_s: float, end_s: float | None) -> slice:
-    """The rows within a time, from the first to the last of them."""
-    wanted = np.flatnonzero((time_s >= start_s) & (time_s < (np.inf if end_s is None else end_s)))
-    return slice(int(wanted[0]), int(wanted[-1]) + 1) if len(wanted) else slice(0)

@@ -1,7 +1,7 @@
-"""What was recorded of wires, as files of other programs: candump's text, and pcapng.
+"""Export recorded wires as files of other programs: candump's text, and pcapng.
 
-Frames of all buses are in one file by time, each with the name of its interface (``can0``). Where two drivers listened
-to one bus, the second one's frames have the name ``can0_2``, and so on.
+A file has the frames of all buses by time, each with the name of its interface (``can0``). If two drivers listened to
+one bus, the second one's frames have the name ``can0_2``, and so on.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import heapq
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -23,7 +22,7 @@ from skinware.wire import IS_CUT, IS_FD, candump_line, channel_name
 SOCKETCAN, SERIAL = 227, 147
 """Link types of interfaces in pcapng: LINKTYPE_CAN_SOCKETCAN, and LINKTYPE_USER0 with :data:`SERIAL_HEADER`."""
 SERIAL_HEADER = struct.Struct("<BBH")
-"""Before the bytes of a packet of a serial line: version (1), 0 received or 1 sent, 0."""
+"""In front of the bytes of a packet of a serial line: version (1), 0 received or 1 sent, 0."""
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _NAME, _DESCRIPTION, _RESOLUTION, _FLAGS = 2, 3, 9, 2
@@ -31,18 +30,18 @@ _INBOUND, _OUTBOUND = 1, 2
 _ASKED_EACH = 1000
 
 _Wires = list[tuple[WireTrack, str]]
-"""Each with the name of its interface."""
+"""(wire, name of its interface)."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What is exported.
+    """The part of the wires to export.
 
     Attributes:
         drivers: names; empty: all.
-        start_s: where to begin, s since the recording began.
-        end_s: where to end, likewise; None: with the last.
-        is_stopped: asked now and then; True ends it with :class:`KeyboardInterrupt`.
+        start_s: begin at this time, s since the recording began.
+        end_s: end before this time; None: at the end of the recording.
+        is_stopped: called now and then; True ends the export with :class:`KeyboardInterrupt`.
     """
 
     drivers: Collection[str] = ()
@@ -53,11 +52,11 @@ class Chosen:
 
 @dataclass
 class Exported:
-    """What came of an export.
+    """The result of an export.
 
     Attributes:
-        counts: frames of each interface; of serial lines, reads and writes.
-        notes: what could not be told in the format.
+        counts: frames of each interface; reads and writes of serial lines.
+        notes: a line for each thing that the format cannot hold.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -68,54 +67,54 @@ def export_candump(recording: Recording, path: Path, chosen: Chosen | None = Non
     """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
 
     Args:
-        recording: with wires.
+        recording: a recording with wires.
         path: of the new file.
-        chosen: what of it; None: all.
+        chosen: the part to export; None: all.
 
     Raises:
         BadRecording: no frame of a CAN bus was recorded.
-        ConfigurationError: no wire of a chosen driver was.
-        OSError: the file is there already, or cannot be written.
+        ConfigurationError: no wire of a chosen driver was recorded.
+        OSError: the file exists already, or cannot be written.
     """
 
-    def write(file: BinaryIO, wires: _Wires, what: Chosen, told: Exported) -> None:
-        for number, item in _in_order(wires, what, told):
+    def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
+        for number, item in _in_order(wires, part, exported):
             channel = wires[number][1]
             fd_flags = item.flags if item.flags & IS_FD else None
             direction = "T" if item.is_sent else "R"
             line = candump_line(item.epoch_ns // 1000, channel, item.identifier or 0, fd_flags, item.data, direction)
             file.write(line.encode() + b"\n")
-            told.counts[channel] += 1
+            exported.counts[channel] += 1
 
     return _export(recording, path, chosen or Chosen(), write, with_serial=False)
 
 
 def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
-    """Write what went over all wires for Wireshark and its like, with times in ns and directions.
+    """Write all wires for Wireshark, with times in ns and directions.
 
     An interface of a CAN bus has the link type :data:`SOCKETCAN`, one of a serial line :data:`SERIAL`.
 
     Args:
-        recording: with wires.
+        recording: a recording with wires.
         path: of the new file.
-        chosen: what of it; None: all.
+        chosen: the part to export; None: all.
 
     Raises:
         BadRecording: no wire was recorded.
-        ConfigurationError: none of a chosen driver was.
-        OSError: the file is there already, or cannot be written.
+        ConfigurationError: no wire of a chosen driver was recorded.
+        OSError: the file exists already, or cannot be written.
     """
 
-    def write(file: BinaryIO, wires: _Wires, what: Chosen, told: Exported) -> None:
+    def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
         file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)))
         for wire, name in wires:
             options = _option(_NAME, name.encode()) + _option(_RESOLUTION, b"\x09")
             options += _option(_DESCRIPTION, f"bus {wire.bus} of {wire.driver}".encode()) + struct.pack("<HH", 0, 0)
             link_type = SERIAL if wire.is_serial else SOCKETCAN
             file.write(_block(_INTERFACE, struct.pack("<HHI", link_type, 0, 0) + options))
-        for number, item in _in_order(wires, what, told):
+        for number, item in _in_order(wires, part, exported):
             file.write(_packet(number, item))
-            told.counts[wires[number][1]] += 1
+            exported.counts[wires[number][1]] += 1
 
     return _export(recording, path, chosen or Chosen(), write, with_serial=True)
 
@@ -133,7 +132,7 @@ def _export(
         if recorded and driver not in recorded:
             there_are = ", ".join(sorted(recorded))
             raise ConfigurationError(f"{recording.path}: no wire of {driver!r} in it; there are: {there_are}")
-    told = Exported()
+    exported = Exported()
     wires: _Wires = []
     for wire, name in _named(recording):
         if chosen.drivers and wire.driver not in chosen.drivers:
@@ -141,25 +140,19 @@ def _export(
         if with_serial or not wire.is_serial:
             wires.append((wire, name))
         else:
-            told.notes.append(f"{wire.bus} of {wire.driver} left out: the format has no serial lines")
+            exported.notes.append(f"{wire.bus} of {wire.driver} left out: the format has no serial lines")
         if wire.lost:
-            told.notes.append(f"{wire.bus} of {wire.driver}: {wire.lost} lost while it was recorded")
+            exported.notes.append(f"{wire.bus} of {wire.driver}: {wire.lost} lost while it was recorded")
     if not wires:
-        what = "nothing of a CAN bus" if told.notes else "no wire"
-        raise BadRecording(f"{recording.path}: {what} was recorded: skin-record --wire records what goes over buses")
-    with _new_file(path) as file:
-        write(file, wires, chosen, told)
-    return told
-
-
-@contextmanager
-def _new_file(path: Path) -> Iterator[BinaryIO]:
+        what = "no frame of a CAN bus" if exported.notes else "no wire"
+        raise BadRecording(f"{recording.path}: {what} was recorded: skin-record --wire records them")
     with path.open("xb") as file:
         try:
-            yield file
+            write(file, wires, chosen, exported)
         except BaseException:
             path.unlink()
             raise
+    return exported
 
 
 def _named(recording: Recording) -> _Wires:
@@ -173,8 +166,8 @@ def _named(recording: Recording) -> _Wires:
     return named
 
 
-def _in_order(wires: _Wires, chosen: Chosen, told: Exported) -> Iterator[tuple[int, WireItem]]:
-    """Everything by time, each with the number of its wire; what is cut is counted in the notes."""
+def _in_order(wires: _Wires, chosen: Chosen, exported: Exported) -> Iterator[tuple[int, WireItem]]:
+    """Yield (number of its wire, item) of all wires by time; note how many frames were cut."""
     cut = 0
     streams = [_numbered(number, wire, chosen) for number, (wire, _) in enumerate(wires)]
     for count, (number, item) in enumerate(heapq.merge(*streams, key=lambda one: one[1].epoch_ns)):
@@ -183,7 +176,7 @@ def _in_order(wires: _Wires, chosen: Chosen, told: Exported) -> Iterator[tuple[i
         cut += bool(item.flags & IS_CUT)
         yield number, item
     if cut:
-        told.notes.append(f"{cut} CAN FD frames without their end: their driver knows none that are so long")
+        exported.notes.append(f"{cut} CAN FD frames without their end: their driver knows none that are so long")
 
 
 def _numbered(number: int, wire: WireTrack, chosen: Chosen) -> Iterator[tuple[int, WireItem]]:

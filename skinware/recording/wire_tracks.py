@@ -1,6 +1,6 @@
-"""What went over the wires of drivers: frames of CAN buses, and bytes of serial lines.
+"""Read the recorded wires of drivers: frames of CAN buses, and bytes of serial lines.
 
-A message is that of a frame of the driver's service (:mod:`skinware.wire`)::
+A message holds a sample of the driver's wire service (:mod:`skinware.wire`)::
 
     header      32 bytes: u8 generation, u8 sequence, i8 published_ns, u8 lost
     pieces      of one bus
@@ -23,11 +23,11 @@ from skinware.recording.tracks import ChunkSource
 from skinware.wire import read_pieces
 
 _HEADER = struct.Struct("<QQqQ")
-"""Generation and sequence of the frame, when it was published, how much of the bus was lost so far."""
+"""Generation and sequence of the sample, its time of publication, frames or bytes lost on the bus so far."""
 _LATEST_S = 1.0
-"""What goes over a wire is published so soon."""
+"""A frame is published at most so long after it crossed the wire."""
 _WINDOW_NS = 2 * NS_PER_S
-"""Within which what was received and sent is put in order."""
+"""Received and sent frames within this time are sorted."""
 
 FRAME = np.dtype(
     [
@@ -44,7 +44,7 @@ FRAME = np.dtype(
 
 
 def message_of(frame: Sample) -> bytes:
-    """The message of a frame of a driver's wire service."""
+    """Return the message of a sample of a driver's wire service."""
     used = int(frame.column("used")[()])
     header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("lost")[()]))
     return header + frame.column("pieces")[:used].tobytes()
@@ -54,11 +54,11 @@ class WirePiece(NamedTuple):
     """Frames of a CAN bus, or bytes of a serial line, that came or were sent together.
 
     Attributes:
-        is_sent: by the driver, not received.
-        time_ns: (n,) int64, CLOCK_MONOTONIC, of each frame; (1,) of bytes.
+        is_sent: the driver sent them; False: it received them.
+        time_ns: (n,) int64, CLOCK_MONOTONIC of each frame; (1,) for bytes.
         epoch_ns: the same times, ns since 1970.
-        frames: (n,) of ``skinware.wire.ROWS``; None of bytes.
-        data: the bytes; empty of frames.
+        frames: (n,) of ``skinware.wire.ROWS``; None for bytes.
+        data: the bytes; empty for frames.
     """
 
     is_sent: bool
@@ -74,8 +74,8 @@ class WireItem(NamedTuple):
     Attributes:
         time_ns: CLOCK_MONOTONIC.
         epoch_ns: the same, ns since 1970.
-        is_sent: by the driver, not received.
-        identifier: with the flags of linux/can.h; None of bytes.
+        is_sent: the driver sent it; False: it received it.
+        identifier: with the flags of linux/can.h; None for bytes.
         flags: of ``skinware.wire.ROWS``.
         data: payload, or bytes.
     """
@@ -89,10 +89,10 @@ class WireItem(NamedTuple):
 
 
 class WireTrack:
-    """What went over one bus of a driver, as the driver received it, and what it sent.
+    """The frames or bytes of one bus of a driver, as the driver received and sent them.
 
     Args:
-        recording: where it is.
+        recording: the source of its chunks.
         driver: name of the driver.
         bus: name of the bus.
         channel: number of its channel.
@@ -109,9 +109,9 @@ class WireTrack:
 
     @property
     def lost(self) -> int:
-        """Frames, or bytes, that the driver had no room for, as far as is recorded.
+        """Frames or bytes that the driver received and had no room to publish.
 
-        What was lost before the driver got it is counted in the frames of the driver (``bus_counters``).
+        Losses before the driver are in its ``bus_counters``.
         """
         lost: dict[int, int] = {}
         for generation, count, _, _ in self._batches(0.0, None):
@@ -119,11 +119,11 @@ class WireTrack:
         return sum(lost.values())
 
     def pieces(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WirePiece]:
-        """Everything, as it came; what is damaged is left out, and said in the recording's ``problems``.
+        """Yield all pieces as they came; damaged ones are left out and named in the recording's ``problems``.
 
         Args:
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last.
+            start_s: begin at this time, s since the recording began.
+            end_s: end before this time; None: after the last piece.
         """
         first_ns = self._recording.start_ns + round(start_s * NS_PER_S) if start_s else None
         end_ns = None if end_s is None else self._recording.start_ns + round(end_s * NS_PER_S)
@@ -146,17 +146,12 @@ class WireTrack:
 
     @property
     def is_serial(self) -> bool:
-        """Whether it is a serial line; False if nothing was recorded."""
+        """Whether the bus is a serial line; False if nothing was recorded."""
         first = next(self.pieces(), None)
         return first is not None and first.frames is None
 
     def items(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WireItem]:
-        """Every frame, or every read and write, by time.
-
-        Args:
-            start_s: as for :meth:`pieces`.
-            end_s: likewise.
-        """
+        """Yield every frame, or every read and write, by time; arguments as for :meth:`pieces`."""
         waiting: list[tuple[int, int, WireItem]] = []
         order = 0
         for piece in self.pieces(start_s=start_s, end_s=end_s):
@@ -170,12 +165,7 @@ class WireTrack:
             yield heapq.heappop(waiting)[2]
 
     def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> npt.NDArray[np.void]:
-        """(n,) of :data:`FRAME`: all frames of a CAN bus by time; none of a serial line.
-
-        Args:
-            start_s: as for :meth:`pieces`.
-            end_s: likewise.
-        """
+        """Return (n,) of :data:`FRAME`: all frames of a CAN bus by time; arguments as for :meth:`pieces`."""
         found = [np.zeros(0, FRAME)]
         for piece in self.pieces(start_s=start_s, end_s=end_s):
             if piece.frames is None:
@@ -191,7 +181,7 @@ class WireTrack:
         return frames[np.argsort(frames["time_ns"], kind="stable")]
 
     def _batches(self, start_s: float, end_s: float | None) -> Iterator[tuple[int, int, int, memoryview]]:
-        """(generation, lost so far, what makes CLOCK_MONOTONIC ns since 1970, pieces) of every message."""
+        """Yield (generation, lost so far, ns since 1970 minus CLOCK_MONOTONIC, pieces) of every message."""
         until_s = None if end_s is None else end_s + _LATEST_S
         for contents in self._recording.chunks({self.channel}, start_s, until_s):
             for message in contents.messages:

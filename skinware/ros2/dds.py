@@ -18,7 +18,7 @@ from xml.sax.saxutils import quoteattr
 from skinware.errors import BridgeError, ConfigurationError, MissingExtra
 from skinware.ros2 import types
 from skinware.ros2.messages import DISCOVERY_TOPIC, PARTICIPANT_DATA, endpoint_data, entities
-from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
+from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
 if find_spec("cyclonedds") is None:
     raise MissingExtra("ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'")
@@ -92,7 +92,7 @@ class DdsNode:
         BridgeError: the domain cannot be joined; the message says why.
     """
 
-    def __init__(self, identity: Identity, interfaces: Sequence[str] = ()) -> None:
+    def __init__(self, identity: NodeIdentity, interfaces: Sequence[str] = ()) -> None:
         self._identity = identity
         configuration = _configuration(interfaces)
         try:
@@ -104,13 +104,13 @@ class DdsNode:
                 " and is CYCLONEDDS_URI in order?"
             ) from None
         self._lock = threading.RLock()
-        self._writers: list[_Writer] = []
-        self._services: list[_Service] = []
-        self._worker: _Worker | None = None
+        self._writers: list[_DdsWriter] = []
+        self._services: list[_DdsService] = []
+        self._worker: _RequestThread | None = None
         self._info = self._writer(DISCOVERY_TOPIC, types.PARTICIPANT, Qos(depth=1, latched=True), is_listed=False)
         self._publish_endpoints()
 
-    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
+    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
         writer = self._writer(f"rt{topic}", message_type, qos)
         self._publish_endpoints()
         return writer
@@ -120,8 +120,8 @@ class DdsNode:
             reader = self._declare(DataReader, f"rq{name}Request", service_type.request, _SERVICE_QOS, with_id=True)
             writer = self._writer(f"rr{name}Reply", service_type.response, _SERVICE_QOS, with_id=True)
             if self._worker is None:
-                self._worker = _Worker(self._participant)
-            service = _Service(reader, writer, handler, self._worker)
+                self._worker = _RequestThread(self._participant)
+            service = _DdsService(reader, writer, handler, self._worker)
             self._services.append(service)
             self._publish_endpoints()
 
@@ -154,10 +154,10 @@ class DdsNode:
         *,
         with_id: bool = False,
         is_listed: bool = True,
-    ) -> _Writer:
+    ) -> _DdsWriter:
         with self._lock:
             declared = self._declare(DataWriter, topic, message_type, qos, with_id=with_id)
-            writer = _Writer(declared, self._closed if is_listed else lambda _: None, qos.latched)
+            writer = _DdsWriter(declared, self._closed if is_listed else lambda _: None, qos.latched)
             if is_listed:
                 self._writers.append(writer)
             return writer
@@ -183,7 +183,7 @@ class DdsNode:
         except DDSException as error:
             raise BridgeError(f"{topic}: {_reason(error)}") from None
 
-    def _closed(self, writer: _Writer) -> None:
+    def _closed(self, writer: _DdsWriter) -> None:
         with self._lock:
             if writer in self._writers:
                 self._writers.remove(writer)
@@ -197,8 +197,8 @@ class DdsNode:
                 self._info.publish(entities(self._identity, self._participant.guid.bytes, readers, writers))
 
 
-class _Writer:
-    def __init__(self, writer: DataWriter[Any], closed: Callable[[_Writer], None], is_latched: bool) -> None:
+class _DdsWriter:
+    def __init__(self, writer: DataWriter[Any], closed: Callable[[_DdsWriter], None], is_latched: bool) -> None:
         self._writer: DataWriter[Any] | None = writer
         self._ref: int = writer._ref  # noqa: SLF001, for writing bytes
         self._closed, self._is_latched = closed, is_latched
@@ -239,8 +239,8 @@ class _Writer:
             self._closed(self)
 
 
-class _Service:
-    def __init__(self, reader: DataReader[Any], writer: _Writer, handler: Handler, worker: _Worker) -> None:
+class _DdsService:
+    def __init__(self, reader: DataReader[Any], writer: _DdsWriter, handler: Handler, worker: _RequestThread) -> None:
         self._reader: DataReader[Any] | None = reader
         self._writer, self._handler, self._worker = writer, handler, worker
         self.id: bytes = reader.guid.bytes
@@ -267,7 +267,7 @@ class _Service:
         self._writer.close()
 
 
-class _Worker:
+class _RequestThread:
     def __init__(self, participant: DomainParticipant) -> None:
         self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
         self._waitset.attach(self._woken)

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from skinware.conversion.ros_messages import Cdr
-from skinware.ros2.transport import Distro, Identity
+from skinware.ros2.transport import Distro, NodeIdentity
 
 DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""
@@ -17,7 +17,7 @@ _AT_ITS_ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 """x, y, z (m), and the quaternion x, y, z, w of no rotation."""
 
 
-class Level(IntEnum):
+class DiagnosticLevel(IntEnum):
     """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
 
     OK = 0
@@ -26,17 +26,17 @@ class Level(IntEnum):
     STALE = 3
 
 
-class Status(NamedTuple):
+class DiagnosticStatus(NamedTuple):
     """A ``diagnostic_msgs/DiagnosticStatus``; ``values``: further facts, by name."""
 
-    level: Level
+    level: DiagnosticLevel
     name: str
     message: str
     hardware: str
     values: dict[str, str]
 
 
-def diagnostics(statuses: Collection[Status], time_ns: int) -> bytes:
+def diagnostics(statuses: Collection[DiagnosticStatus], time_ns: int) -> bytes:
     """Return a ``diagnostic_msgs/DiagnosticArray``; ``time_ns``: wall clock."""
     cdr = Cdr().header(time_ns, "").numbers("I", len(statuses))
     for status in statuses:
@@ -65,7 +65,7 @@ def endpoint_data(type_hash: str, distro: Distro) -> bytes:
     return b"" if distro is Distro.HUMBLE else f"typehash={type_hash};".encode()
 
 
-def entities(identity: Identity, participant: bytes, readers: Sequence[bytes], writers: Sequence[bytes]) -> bytes:
+def entities(identity: NodeIdentity, participant: bytes, readers: Sequence[bytes], writers: Sequence[bytes]) -> bytes:
     """Return a ``rmw_dds_common/ParticipantEntitiesInfo`` of a participant with one node; ids have 16 bytes."""
     size = 24 if identity.distro is Distro.HUMBLE else 16
     cdr = Cdr().numbers("B", *participant.ljust(size, b"\0")).numbers("I", 1)

@@ -21,8 +21,8 @@ import zenoh.ext
 from skinware.bridge.endpoints import endpoints
 from skinware.bridge.link import directly, open_session
 from skinware.errors import BridgeError
-from skinware.ros2.rmw_zenoh_keys import Attachment, Kind, endpoint_token, gid, key, node_token
-from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
+from skinware.ros2.rmw_zenoh_keys import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token
+from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
 ROUTER = "tcp/localhost:7447"
 """The router of a machine."""
@@ -63,7 +63,7 @@ class ZenohNode:
 
     def __init__(
         self,
-        identity: Identity,
+        identity: NodeIdentity,
         *,
         connect: Sequence[str] = (ROUTER,),
         router_changed: Callable[[bool, str], None] = lambda _is_there, _line: None,
@@ -74,7 +74,7 @@ class ZenohNode:
         self._session = open_session(replace(places, listen=(_LISTEN,), security=_SETTINGS))
         self._zid = str(self._session.info.zid())
         self._numbers = itertools.count(_NODE + 1)
-        self._endpoints: set[_Publisher | _Service] = set()
+        self._endpoints: set[_ZenohPublisher | _ZenohService] = set()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._answering = threading.RLock()
         self.is_seen: bool = True
@@ -86,17 +86,17 @@ class ZenohNode:
             raise
         self._worker.start()
 
-    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
+    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
         """Return a publisher of an absolute topic.
 
         Raises:
             BridgeError: there cannot be such a publisher.
         """
         at = key(self._identity, topic, message_type)
-        token = self._endpoint_token(Kind.PUBLISHER, topic, message_type, qos)
+        token = self._endpoint_token(EndpointKind.PUBLISHER, topic, message_type, qos)
         with _as_bridge_error(topic):
             declared = _declare_publisher(self._session, at, qos)
-        made = _Publisher(declared, self._announce(token), gid(token), qos, self._endpoints.discard)
+        made = _ZenohPublisher(declared, self._announce(token), gid(token), qos, self._endpoints.discard)
         self._endpoints.add(made)
         return made
 
@@ -110,8 +110,8 @@ class ZenohNode:
             BridgeError: there cannot be such a service.
         """
         at = key(self._identity, name, service_type)
-        token = self._endpoint_token(Kind.SERVICE, name, service_type, _SERVICE_QOS)
-        made = _Service(at, handler, self._answering, self._endpoints.discard)
+        token = self._endpoint_token(EndpointKind.SERVICE, name, service_type, _SERVICE_QOS)
+        made = _ZenohService(at, handler, self._answering, self._endpoints.discard)
         with _as_bridge_error(name):
             asked = directly(lambda query: self._asked(made, query))
             made.declared.append(self._session.declare_queryable(at, asked, complete=True))
@@ -128,14 +128,14 @@ class ZenohNode:
             self._worker.join()
         self._close_session()
 
-    def _endpoint_token(self, kind: Kind, name: str, of_type: MessageType, qos: Qos) -> str:
+    def _endpoint_token(self, kind: EndpointKind, name: str, of_type: MessageType, qos: Qos) -> str:
         return endpoint_token(self._identity, self._zid, _NODE, next(self._numbers), kind, name, of_type, qos)
 
     def _announce(self, token: str) -> zenoh.LivelinessToken:
         with _as_bridge_error(token):
             return self._session.liveliness().declare_token(token)
 
-    def _asked(self, service: _Service, query: zenoh.Query) -> None:
+    def _asked(self, service: _ZenohService, query: zenoh.Query) -> None:
         if self._jobs.qsize() < _MOST_REQUESTS:
             self._jobs.put(lambda: service.answer(query))
         else:
@@ -171,14 +171,14 @@ class ZenohNode:
             self._session.close()  # type: ignore[no-untyped-call]
 
 
-class _Publisher:
+class _ZenohPublisher:
     def __init__(
         self,
         publisher: Any,
         token: zenoh.LivelinessToken,
         identity: bytes,
         qos: Qos,
-        closed: Callable[[_Publisher], None],
+        closed: Callable[[_ZenohPublisher], None],
     ) -> None:
         self._publisher, self._token, self._gid, self._qos, self._closed = publisher, token, identity, qos, closed
         self._sequence = 0
@@ -194,7 +194,7 @@ class _Publisher:
         if not self._is_open:
             return False
         self._sequence += 1
-        attachment = Attachment(self._sequence, time.time_ns(), self._gid).packed()
+        attachment = MessageAttachment(self._sequence, time.time_ns(), self._gid).packed()
         try:
             self._publisher.put(message, attachment=attachment)
         except zenoh.ZError:  # the session is closed
@@ -208,11 +208,11 @@ class _Publisher:
             self._closed(self)
 
 
-class _Service:
+class _ZenohService:
     """Answers requests under a key, one at a time of all services that share a lock."""
 
     def __init__(
-        self, at: str, handler: Handler, answering: threading.RLock, closed: Callable[[_Service], None]
+        self, at: str, handler: Handler, answering: threading.RLock, closed: Callable[[_ZenohService], None]
     ) -> None:
         self._at, self._handler, self._answering, self._closed = at, handler, answering, closed
         self._is_open = True
@@ -223,11 +223,11 @@ class _Service:
             if not self._is_open:
                 return _refuse(query, "the service ended")
             try:
-                asked = Attachment.of(_bytes(query.attachment))
+                asked = MessageAttachment.of(_bytes(query.attachment))
             except ValueError as error:
                 return _refuse(query, str(error))
             response = self._handler(_bytes(query.payload))
-        attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
+        attachment = MessageAttachment(asked.sequence, time.time_ns(), asked.gid).packed()
         with contextlib.suppress(zenoh.ZError), query:
             query.reply(self._at, response, attachment=attachment, express=True)
         return None

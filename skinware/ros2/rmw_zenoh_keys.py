@@ -12,7 +12,7 @@ from enum import Enum
 from importlib.util import find_spec
 
 from skinware.errors import BridgeError, MissingExtra
-from skinware.ros2.transport import Distro, Identity, MessageType, Qos
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 
 if find_spec("xxhash") is None:
     raise MissingExtra("ROS 2 over zenoh needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
@@ -28,7 +28,7 @@ _DEFAULT_DEPTH = 42
 """Depth that is not written."""
 
 
-class Kind(Enum):
+class EndpointKind(Enum):
     """Kinds of endpoints."""
 
     PUBLISHER = "MP"
@@ -36,7 +36,7 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True)
-class Attachment:
+class MessageAttachment:
     """The attachment of a message, request or response.
 
     Attributes:
@@ -54,7 +54,7 @@ class Attachment:
         return _ATTACHMENT.pack(self.sequence, self.time_ns, _GID_BYTES, self.gid)
 
     @classmethod
-    def of(cls, data: bytes) -> Attachment:
+    def of(cls, data: bytes) -> MessageAttachment:
         """Read an attachment.
 
         Raises:
@@ -69,7 +69,7 @@ class Attachment:
         return cls(sequence, time_ns, gid)
 
 
-def key(identity: Identity, name: str, of_type: MessageType) -> str:
+def key(identity: NodeIdentity, name: str, of_type: MessageType) -> str:
     """Return the key of the messages of a topic, or of the requests to a service.
 
     Raises:
@@ -80,17 +80,17 @@ def key(identity: Identity, name: str, of_type: MessageType) -> str:
     return f"{identity.domain}{name}/{of_type.dds_name}/{_hash(identity, of_type)}"
 
 
-def node_token(identity: Identity, session: str, node: int) -> str:
+def node_token(identity: NodeIdentity, session: str, node: int) -> str:
     """Return the token of a node, which has a number in a session of zenoh."""
     return "/".join((_TOKENS, str(identity.domain), session, str(node), str(node), "NN", *_of_node(identity)))
 
 
 def endpoint_token(
-    identity: Identity,
+    identity: NodeIdentity,
     session: str,
     node: int,
     endpoint: int,
-    kind: Kind,
+    kind: EndpointKind,
     name: str,
     of_type: MessageType,
     qos: Qos,
@@ -113,7 +113,7 @@ def gid(token: str) -> bytes:
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
-def _of_node(identity: Identity) -> tuple[str, str, str]:
+def _of_node(identity: NodeIdentity) -> tuple[str, str, str]:
     return "%", _mangled(identity.namespace), identity.name
 
 
@@ -121,5 +121,5 @@ def _mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def _hash(identity: Identity, of_type: MessageType) -> str:
+def _hash(identity: NodeIdentity, of_type: MessageType) -> str:
     return _NO_HASH if identity.distro is Distro.HUMBLE else of_type.hash

@@ -13,7 +13,7 @@ from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
 from skinware.ros2 import types
-from skinware.ros2.messages import Level, Status, diagnostics, trigger_response
+from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus, diagnostics, trigger_response
 from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service import ServiceReader
@@ -28,11 +28,11 @@ GONE = "gone"
 _LIFE_NS = NS_PER_S // 5
 _TARE_S = 10.0
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
-_LEVEL_OF_LIFE = {SILENT: Level.STALE, PAUSED: Level.WARN, DEAD: Level.ERROR}
+_LEVEL_OF_LIFE = {SILENT: DiagnosticLevel.STALE, PAUSED: DiagnosticLevel.WARN, DEAD: DiagnosticLevel.ERROR}
 _LEVEL_OF_BUS = {
-    bus_state_name(BusState.LIVE): Level.OK,
-    bus_state_name(BusState.CONNECTING): Level.WARN,
-    bus_state_name(BusState.SILENT): Level.WARN,
+    bus_state_name(BusState.LIVE): DiagnosticLevel.OK,
+    bus_state_name(BusState.CONNECTING): DiagnosticLevel.WARN,
+    bus_state_name(BusState.SILENT): DiagnosticLevel.WARN,
 }
 
 
@@ -58,7 +58,7 @@ class ServedReport:
 
 
 @dataclass
-class _Served:
+class _ServedDriver:
     """A driver that was found at any time.
 
     Attributes:
@@ -121,7 +121,7 @@ class Ros2Server:
         self._with_tare = with_tare
         self._transforms = Transforms(node, root_frame) if root_frame else None
         self._live = LiveDrivers(namespace, names)
-        self._served: dict[str, _Served] = {}
+        self._served: dict[str, _ServedDriver] = {}
         self._troubles: set[str] = set()
         self._diagnostics = node.publisher("/diagnostics", types.DIAGNOSTICS, Qos())
         self._stopping = False
@@ -205,13 +205,13 @@ class Ros2Server:
                 served.publish_last()
         return found
 
-    def _serve(self, name: str) -> _Served | None:
+    def _serve(self, name: str) -> _ServedDriver | None:
         topic = in_topic(name)
         if any(in_topic(other) == topic for other in self._served):
             self._report_once(f"driver {name!r} is left out: another one has its topics, /skin/{topic}/...")
             return None
         topics = DriverTopics(self._node, self._prefix, name)
-        self._served[name] = served = _Served(topics)
+        self._served[name] = served = _ServedDriver(topics)
         if self._with_tare:
             served.end_tare = self._node.service(f"{topics.base}/tare", types.TRIGGER, lambda _: self._tare(name))
         return served
@@ -240,23 +240,23 @@ class Ros2Server:
             return trigger_response(False, str(error))
         return trigger_response(True, "")
 
-    def _statuses(self) -> Iterator[Status]:
+    def _statuses(self) -> Iterator[DiagnosticStatus]:
         for name in self._served:
             live = self._live.get(name)
             if live is None:
-                yield Status(Level.ERROR, f"skin: {name}", GONE, "", {})
+                yield DiagnosticStatus(DiagnosticLevel.ERROR, f"skin: {name}", GONE, "", {})
             else:
                 yield from _statuses_of(live)
 
 
-def _statuses_of(driver: LiveDriver) -> Iterator[Status]:
+def _statuses_of(driver: LiveDriver) -> Iterator[DiagnosticStatus]:
     """Yield the status of a driver, and of each of its buses while it lives."""
     report = driver.report()
     is_live = report.life == LIVE
     words = f"{report.fresh} of {report.sensors} sensors are fresh" if is_live else report.life
-    level = _LEVEL_OF_LIFE.get(report.life, Level.WARN)
+    level = _LEVEL_OF_LIFE.get(report.life, DiagnosticLevel.WARN)
     if is_live and report.age_ns is not None and report.fresh == report.sensors:
-        level = Level.OK
+        level = DiagnosticLevel.OK
     values = {"state": report.life, "sensors": str(report.sensors)}
     if report.rate_hz is not None:
         values["rate_hz"] = f"{report.rate_hz:.1f}"
@@ -265,7 +265,8 @@ def _statuses_of(driver: LiveDriver) -> Iterator[Status]:
     patches = {f"patches {state}": n for state, n in report.patch_states.items()}
     counts = {**report.statuses, **patches, **report.counters}
     values |= {name: str(count) for name, count in counts.items() if count}
-    yield Status(level, f"skin: {driver.name}", words, driver.reader.driver_type, values)
+    yield DiagnosticStatus(level, f"skin: {driver.name}", words, driver.reader.driver_type, values)
     for bus in report.buses if is_live else ():
         words = ": ".join(filter(None, (bus.state, bus.reason)))
-        yield Status(_LEVEL_OF_BUS.get(bus.state, Level.ERROR), f"skin: {driver.name}: {bus.name}", words, bus.name, {})
+        level = _LEVEL_OF_BUS.get(bus.state, DiagnosticLevel.ERROR)
+        yield DiagnosticStatus(level, f"skin: {driver.name}: {bus.name}", words, bus.name, {})

@@ -12,7 +12,7 @@ from skinware.conversion.tables import sensor_names
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import now_ns
 from skinware.ros2 import messages, types
-from skinware.ros2.transport import Node, Publisher, Qos
+from skinware.ros2.transport import Node, Qos, TopicPublisher
 from skinware.status import Status
 from skinware.structure import Structure
 
@@ -35,7 +35,7 @@ class DriverTopics:
         self._structure: Structure | None = None
         self._generation = 0
         self._showing: Showing | None = None
-        self._pictures: dict[str, Publisher] = {}
+        self._pictures: dict[str, TopicPublisher] = {}
         self._frames = node.publisher(f"{self.base}/frame", types.SKIN_FRAME, Qos())
         self._sensors = node.publisher(f"{self.base}/sensors", types.SENSORS, _LATCHED)
 
@@ -82,7 +82,7 @@ class DriverTopics:
         sensors = ros_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
         self._send(self._sensors, sensors)
 
-    def _send(self, publisher: Publisher, message: bytes) -> None:
+    def _send(self, publisher: TopicPublisher, message: bytes) -> None:
         if publisher.publish(message):
             self.messages += 1
         else:

@@ -1,6 +1,6 @@
-"""The node of a ROS 2 graph that Skinware needs, whatever carries it. Messages are bytes (CDR), types only names.
+"""The node of a ROS 2 graph, independent of its carrier. Messages are bytes (CDR), and types only names.
 
-A carrier (DDS, zenoh) is a module with one class that is a :class:`Node`, made of an :class:`Identity`.
+A carrier (DDS, zenoh) is a module with one class that is a :class:`Node`, made of an :class:`NodeIdentity`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Distro(Enum):
 
 
 @dataclass(frozen=True)
-class Identity:
+class NodeIdentity:
     """A node and its graph.
 
     Attributes:
@@ -112,7 +112,7 @@ class Qos:
     latched: bool = False
 
 
-class Publisher(Protocol):
+class TopicPublisher(Protocol):
     """Sends messages under one topic; for one thread at a time."""
 
     @property
@@ -133,7 +133,7 @@ class Publisher(Protocol):
 class Node(Protocol):
     """A node of a graph. Publishers and services end with it."""
 
-    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
+    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
         """Return a publisher of an absolute topic: ``/skin/arm/points``.
 
         Raises:

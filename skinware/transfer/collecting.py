@@ -28,7 +28,7 @@ _MOST_AT_ONCE = 64
 """Frames of one service that are taken before those of the others."""
 
 
-class Listener(Protocol):
+class FrameListener(Protocol):
     """Gets frames and events. None of its methods may wait for long."""
 
     def began(self, service: str, head: bytes) -> None:
@@ -76,7 +76,7 @@ class Collector:
     """
 
     def __init__(
-        self, namespace: Namespace, names: Collection[str] | None, listener: Listener, *, with_wires: bool = False
+        self, namespace: Namespace, names: Collection[str] | None, listener: FrameListener, *, with_wires: bool = False
     ) -> None:
         self._wish = Announcement(namespace, WISH) if with_wires else None
         if names is not None and with_wires:

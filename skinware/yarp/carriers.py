@@ -148,7 +148,7 @@ class Carrier(Enum):
         )
 
 
-class Message:
+class VectorMessage:
     """A vector with its envelope; each form is made once, when the first reader needs it.
 
     Args:

@@ -27,7 +27,7 @@ _LONGEST_ANSWER = 1 << 16
 _LONGEST_NAME = 200
 
 
-class Contact(NamedTuple):
+class PortAddress(NamedTuple):
     """Address of a port.
 
     Attributes:
@@ -76,7 +76,7 @@ class NameServer:
     def __str__(self) -> str:
         return f"YARP's name server at {self.host}:{self.port}"
 
-    def query(self, name: str) -> Contact | None:
+    def query(self, name: str) -> PortAddress | None:
         """Return the address of a port; None: there is none of that name.
 
         Raises:
@@ -85,7 +85,7 @@ class NameServer:
         """
         return self._ask(name, f"query {name}")
 
-    def register(self, name: str, host: str, port: int) -> Contact:
+    def register(self, name: str, host: str, port: int) -> PortAddress:
         """Register a port in place of any other of that name; host ``...``: the address that the server sees."""
         contact = self._ask(name, f"register {name} tcp {host} {port}")
         if contact is None:
@@ -100,7 +100,7 @@ class NameServer:
     def unregister(self, name: str) -> None:
         self._ask(name, f"unregister {name}")
 
-    def _ask(self, name: str, command: str) -> Contact | None:
+    def _ask(self, name: str, command: str) -> PortAddress | None:
         if not is_port_name(name):
             raise ValueError(f"{name!r} is no name of a YARP port: write /name, without spaces")
         until_s = time.monotonic() + _PATIENCE_S
@@ -120,10 +120,10 @@ class NameServer:
         return found[0] if found else None
 
 
-def _contact(line: bytes) -> Contact | None:
+def _contact(line: bytes) -> PortAddress | None:
     """Return the port that a line of an answer is about; None: it is about no port."""
     match = _REGISTRATION.fullmatch(line.strip())
     if match is None or not 0 < int(match["port"]) < 1 << 16:
         return None
     name, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
-    return Contact(name, host, int(match["port"]), carrier)
+    return PortAddress(name, host, int(match["port"]), carrier)

@@ -19,8 +19,19 @@ import socket
 import struct
 from dataclasses import dataclass, field
 
-from skinware.yarp.carriers import Carrier, Message, Value, Word, framed, in_text, of_text, packed, unframed, unpacked
-from skinware.yarp.names import Contact, NameServer, is_port_name
+from skinware.yarp.carriers import (
+    Carrier,
+    Value,
+    VectorMessage,
+    Word,
+    framed,
+    in_text,
+    of_text,
+    packed,
+    unframed,
+    unpacked,
+)
+from skinware.yarp.names import NameServer, PortAddress, is_port_name
 
 log: logging.Logger = logging.getLogger("skinware.yarp")
 
@@ -76,7 +87,7 @@ class Receiver:
     passed_over: int = 0
     is_busy: bool = False
 
-    def offer(self, message: Message) -> None:
+    def offer(self, message: VectorMessage) -> None:
         """Send a message, unless another is still on its way."""
         if self.is_busy or self.writer.transport.get_write_buffer_size():
             self.passed_over += 1
@@ -115,7 +126,7 @@ class OutputPort:
         self._number = self._server.sockets[0].getsockname()[1]
         return self._number
 
-    def send(self, message: Message) -> None:
+    def send(self, message: VectorMessage) -> None:
         """Send a message to all readers that can take it now."""
         for receiver in self.receivers:
             receiver.offer(message)
@@ -285,7 +296,7 @@ class OutputPort:
         task.add_done_callback(self._conversations.discard)
         return f"Added connection from {self.name} to {name}"
 
-    async def _call(self, contact: Contact, carrier: Carrier) -> tuple[asyncio.StreamReader, Receiver]:
+    async def _call(self, contact: PortAddress, carrier: Carrier) -> tuple[asyncio.StreamReader, Receiver]:
         reader, writer = await asyncio.open_connection(contact.host, contact.port, limit=_LONGEST_LINE)
         try:
             writer.write(carrier.greeting(self.name))

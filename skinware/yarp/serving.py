@@ -26,8 +26,8 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.regions import Region
 from skinware.transfer.collecting import Collector
 from skinware.transfer.generation import Generation
-from skinware.yarp.carriers import Carrier, Message
-from skinware.yarp.names import Contact, NameServer, is_port_name
+from skinware.yarp.carriers import Carrier, VectorMessage
+from skinware.yarp.names import NameServer, PortAddress, is_port_name
 from skinware.yarp.port import OutputPort
 from skinware.yarp.vectors import Vector, vectors_of
 
@@ -64,7 +64,7 @@ class Settings:
     yarp: int | None = None
 
 
-class _Served:
+class _ServedPort:
     """A port in the event loop; other threads call ``offer`` and read its attributes."""
 
     def __init__(
@@ -75,11 +75,11 @@ class _Served:
         self._yarp = settings.yarp or _NEWEST_YARP
         self.messages = 0
         self.values = 0
-        self.registered: Contact | None = None
+        self.registered: PortAddress | None = None
         self.trouble = ""
         self._names, self._host, self._loop = names, settings.host, loop
         self._lock = threading.Lock()
-        self._newest: Message | None = None
+        self._newest: VectorMessage | None = None
         self._over = asyncio.Event()
 
     def offer(self, values: npt.NDArray[np.float64], acquired_ns: int) -> None:
@@ -89,7 +89,7 @@ class _Served:
         if not self.port.receivers:
             return
         since_s = (now_ns() - acquired_ns) / NS_PER_S
-        message = Message(values, self.messages, time.time() - since_s, self._yarp)
+        message = VectorMessage(values, self.messages, time.time() - since_s, self._yarp)
         with self._lock:
             waits, self._newest = self._newest is not None, message
         if not waits:
@@ -164,9 +164,9 @@ class YarpServer:
         if not is_port_name(f"{settings.prefix}/x"):
             raise ConfigurationError(f"prefix {settings.prefix!r}: write /name, or /name/name, without spaces")
         self._settings, self._names, self._on_event = settings, names, on_event
-        self._ports: dict[str, _Served] = {}
+        self._ports: dict[str, _ServedPort] = {}
         self._lives: list[Future[None]] = []
-        self._vectors: dict[str, list[tuple[_Served, Vector]]] = {}
+        self._vectors: dict[str, list[tuple[_ServedPort, Vector]]] = {}
         self._troubles: dict[str, str] = {}
         self._collector = Collector(namespace, set(settings.names) or None, self)
         self._loop = asyncio.new_event_loop()
@@ -229,7 +229,7 @@ class YarpServer:
             for name, served in self._ports.items()
         }
 
-    # -- a skinware.transfer.collecting.Listener ------------------------------------------------------------------
+    # -- a skinware.transfer.collecting.FrameListener -------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
         self._vectors[service] = []
@@ -263,10 +263,10 @@ class YarpServer:
     def happened(self, event: dict[str, Any]) -> None:
         """Ports stay when their drivers go."""
 
-    def _port(self, part: str, driver: str) -> _Served:
+    def _port(self, part: str, driver: str) -> _ServedPort:
         name = f"{self._settings.prefix}/{_NOT_IN_A_NAME.sub('_', part)}"
         if name not in self._ports:
-            served = self._ports[name] = _Served(name, driver, self._names, self._settings, self._loop)
+            served = self._ports[name] = _ServedPort(name, driver, self._names, self._settings, self._loop)
             self._on_event({"event": "port", "port": name, "driver": driver})
             self._lives.append(asyncio.run_coroutine_threadsafe(served.live(), self._loop))
         return self._ports[name]

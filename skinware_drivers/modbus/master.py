@@ -414,10 +414,13 @@ class Listener(Talk):
                 self._asked = message
                 continue
             self._asked = None
-            if wire.exception_of(message.data):
-                self._counters.errors += 1
-            elif asked.data[0] in wire.READS:
-                self.rows += self._overheard.take(asked, message.data[2:], time_ns)
+            self._pair(asked, message, time_ns)
+
+    def _pair(self, asked: Message, reply: Message, time_ns: int) -> None:
+        if wire.exception_of(reply.data):
+            self._counters.errors += 1
+        elif asked.data[0] in wire.READS and wire.is_reply(asked.data, reply.data):
+            self.rows += self._overheard.take(asked, reply.data[2:], time_ns)
 
 
 def _advice(code: int, read: Read) -> str:

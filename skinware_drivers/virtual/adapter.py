@@ -1,4 +1,4 @@
-"""The adapter of skins whose values a program makes."""
+"""The base class of drivers of skins whose values a program makes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinware_drivers.options import OptionsT
 class VirtualAdapter(Adapter[OptionsT]):
     """One emulated bus of a driver, ``--bus virtual``; see :class:`skinware_drivers.adapter.Adapter`.
 
-    Nothing is sent over a wire: the payloads of frames can have any length that the layout says.
+    There is no wire: payloads can have any length that the layout declares.
     """
 
     medium: ClassVar[str] = "virtual"

@@ -33,19 +33,19 @@ DEFAULT_EMULATOR = "roboskin"
 
 _AT_ONCE = 0
 _SHORTEST_SLEEP_NS = 4_000_000
-"""Between two wake-ups: frames that follow each other on the wire are taken together, as USB interfaces do."""
+"""Shortest time between two wake-ups, so that frames come together as from a USB interface."""
 _LONGEST_BACKLOG_NS = 1_000_000_000
-"""What nobody fetched for longer is lost, as in a receive buffer that runs over."""
+"""Frames that wait longer are dropped, as from a full receive buffer."""
 
 
 class VirtualCanBus(Bus):
     """Emulated hardware as a bus.
 
-    Frames are stamped with the moment at which they went onto the emulated wire, and arrive in that order. None is
-    lost unless nobody fetches them for a second; ``counters.lost`` then says how many.
+    Frames are stamped with the time at which they went onto the emulated wire, and arrive in that order. Frames that
+    are not fetched for a second are dropped and counted in ``counters.lost``.
 
-    Its name is ``virtual:NAME?key=value``: NAME is that of an emulator (entry points of the group
-    ``skinware.emulators``; ``roboskin`` if empty), the pairs are the emulator's options.
+    Its name is ``virtual:NAME?key=value``, with an emulator as NAME (an entry point of the group
+    ``skinware.emulators``; ``roboskin`` if empty) and the emulator's options.
 
     Args:
         channel: name of the emulator.
@@ -53,8 +53,8 @@ class VirtualCanBus(Bus):
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
-        clock: tells CLOCK_MONOTONIC ns.
-        make_timer: makes what ``fileno`` stands for; another clock needs another timer.
+        clock: returns CLOCK_MONOTONIC ns.
+        make_timer: makes the timer behind ``fileno``; another clock needs another timer.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
@@ -100,7 +100,7 @@ class VirtualCanBus(Bus):
         clock: Callable[[], int] = time.monotonic_ns,
         make_timer: Callable[[], Timer] = MonotonicTimer,
     ) -> Self:
-        """A bus with devices of the caller's, for tests."""
+        """Make a bus with devices of the caller, for tests."""
         return cls(
             "",
             payload_size=payload_size,
@@ -125,7 +125,7 @@ class VirtualCanBus(Bus):
         return emulators_instead(medium) or super().instead(medium)
 
     def open(self) -> None:
-        """Listen to the devices. They are powered up by the first time; what they sent meanwhile is gone.
+        """Listen to the devices. The first call powers them up; frames sent before a later one are gone.
 
         Raises:
             BusNotAvailable: after :meth:`vanish`, until :meth:`come_back`.
@@ -166,7 +166,7 @@ class VirtualCanBus(Bus):
         return len(frames)
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Let the devices hear one frame.
+        """Send one frame to the devices.
 
         Raises:
             BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
@@ -184,7 +184,7 @@ class VirtualCanBus(Bus):
         self._wake_when_due()
 
     def close(self) -> None:
-        """Stop to listen; the devices live on. Idempotent."""
+        """Stop listening; the devices live on. Idempotent."""
         if self._timer is not None:
             self._timer.close()
             self._timer = None
@@ -202,7 +202,7 @@ class VirtualCanBus(Bus):
         self.fail_next_receive(BusNotAvailable(f"{self.name}: the emulated interface went away"))
 
     def come_back(self) -> None:
-        """End :meth:`vanish`. Who has not noticed it yet is still told once."""
+        """End :meth:`vanish`. A driver that has not noticed it yet still gets the error once."""
         self._present = True
 
     # Within
@@ -251,7 +251,7 @@ class VirtualCanBus(Bus):
 
 @cache
 def _packer(payload_size: int) -> Callable[[int, int, bytes], bytes]:
-    """Makes a row of a batch of (identifier, length, payload)."""
+    """Return the function that packs (identifier, length, payload) as a row of a batch."""
     if wire_dtype(payload_size)["length"].itemsize > 1:
         return struct.Struct(f"=II{payload_size}s").pack
     return struct.Struct(f"=IB3x{payload_size}s").pack
@@ -279,6 +279,6 @@ class PlacedCanBus(VirtualCanBus):
         """Press the emulated skin at a place for a while.
 
         Raises:
-            ValueError: the numbers make no sense, or nothing of the skin would feel it.
+            ValueError: the numbers make no sense, or no taxel would feel it.
         """
         return self.hardware.press(Pressing.of(at_m, force_n, radius_m, seconds), self._clock())

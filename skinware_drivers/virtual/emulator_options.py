@@ -1,4 +1,4 @@
-"""The options that every emulator of small devices has (imports nothing slow: ``--help`` shows them)."""
+"""The options that every emulator has."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is felt and what goes wrong; an emulator adds which devices there are.
+    """Touch and faults; an emulator adds options for its devices.
 
     Raises:
         ConfigurationError: an option is out of its limits.

@@ -1,12 +1,8 @@
-"""What the emulated skin writes down: every fault it injected, exactly, and every command that it got.
-
-An event is a small struct; as a JSON line it carries its kind under ``event``. ``time_ns`` is CLOCK_MONOTONIC ns
-of the carrier. A ``board`` is its CAN address, a ``cycle`` the number of a board's burst since power-up, from 0.
-"""
+"""The log of emulated hardware: every fault that it injected, exactly, and every command that it received."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,146 +11,93 @@ import msgspec
 from skinware.errors import ConfigurationError
 
 Half = Literal["head", "tail"]
-FrameDamage = Literal["lost", "truncated", "corrupted", "repeated", "unsent"]
-"""``unsent``: the device lost its power, or its queue was full; nobody heard it either."""
+FrameDamage = Literal["lost", "truncated", "corrupted", "repeated", "wrong_length", "unsent"]
+"""``unsent``: the device lost its power, or its queue was full; no program received it either."""
+EventName = Literal[
+    "lost_half",
+    "frame_fault",
+    "wrong_length",
+    "burst_delayed",
+    "board_died",
+    "board_restarted",
+    "board_silenced",
+    "error_reported",
+    "recalibrated",
+    "triangle_fault",
+    "taxel_out_of_range",
+    "foreign_frame",
+    "command_received",
+]
 
 
-def _snake(name: str) -> str:
-    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")
+class Event(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One event; as a JSON line it has the fields of its kind.
 
+    ======================  ============================================================================================
+    event                   meaning, and fields besides ``time_ns``
+    ======================  ============================================================================================
+    ``frame_fault``         a data frame was damaged: board, cycle, position, identifier, fault, payload; for a half of
+                            a triangle also triangle, half
+    ``lost_half``           no program received a half of a triangle: board, triangle, cycle, half, reason (``random``,
+                            ``overflow`` of the board's queue, ``died``, ``restarted``)
+    ``wrong_length``        a half of a triangle had a wrong ``length``: board, triangle, cycle, half, length
+    ``burst_delayed``       a burst began ``delay_ns`` late, the next one on time: board, cycle, delay_ns
+    ``board_died``          the board sends and hears nothing from now on: board
+    ``board_restarted``     the board lost power for a moment and is deaf until ``ready_ns``: board, ready_ns
+    ``board_silenced``      a discovery silenced a streaming MTB3, as it does to real ones: board
+    ``error_reported``      a device reported an error (CANopen EMCY), or with code 0 its end: board, code
+    ``recalibrated``        a board took new baselines, so that values jump: board, cycle (the first with them), reason
+                            (``power_up``, ``command``, ``no_ack``)
+    ``triangle_fault``      a triangle changed: board, triangle, cycle (the first that shows it), fault (``unplugged``,
+                            ``plugged_in``, ``no_ack``, ``ack``)
+    ``taxel_out_of_range``  a taxel is broken from power-up on: board, triangle, taxel
+    ``foreign_frame``       another device on the bus sent a frame: identifier, length
+    ``command_received``    boards obeyed or answered a frame of the host: identifier, payload, boards
+    ======================  ============================================================================================
 
-class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event", tag=_snake):
-    """Base of all events."""
+    Attributes:
+        event: its kind.
+        time_ns: CLOCK_MONOTONIC ns of the bus that carries the frames.
+        board: number of the device; of ROBOSKIN boards, the CAN address.
+        cycle: number of the device's burst since power-up, from 0.
+        position: of the frame in its burst, from 0; of ``unsent`` ones, in the burst after its other faults.
+        identifier: with ``EXTENDED_FLAG`` for 29-bit identifiers.
+        payload: hexadecimal digits, as it was sent; of lost frames, as it would have been.
+        boards: the devices that obeyed or answered, by their numbers before that.
+    """
 
+    event: EventName
     time_ns: int
+    board: int = -1
+    triangle: int = -1
+    taxel: int = -1
+    cycle: int = -1
+    position: int = -1
+    identifier: int = -1
+    half: Half | None = None
+    fault: str | None = None
+    reason: str | None = None
+    payload: str | None = None
+    length: int = -1
+    delay_ns: int = -1
+    ready_ns: int = -1
+    code: int = -1
+    boards: Sequence[int] = ()
 
 
-class LostHalf(Event, frozen=True):
-    """One of the two frames of a triangle was sent by nobody, or heard by nobody."""
-
-    board: int
-    triangle: int
-    cycle: int
-    half: Half
-    reason: Literal["random", "overflow", "died", "restarted"]
-    """``overflow``: the board's transmit queue was full, because the bus or the period was too short."""
-
-
-class FrameFault(Event, frozen=True):
-    """Something was wrong with one data frame of a small device."""
-
-    board: int
-    cycle: int
-    position: int
-    """Of the frame in its burst, from 0 (of ``unsent`` ones, in what the burst had become)."""
-    identifier: int
-    fault: FrameDamage
-    payload: str
-    """What went out (of lost ones: what would have gone), in hexadecimal digits."""
-
-
-class WrongLength(Event, frozen=True):
-    """A data frame went out with ``length`` payload bytes instead of its own number."""
-
-    board: int
-    triangle: int
-    cycle: int
-    half: Half
-    length: int
-
-
-class BurstDelayed(Event, frozen=True):
-    """A burst began ``delay_ns`` later than its period says; the one after it is on time again."""
-
-    board: int
-    cycle: int
-    delay_ns: int
-
-
-class BoardDied(Event, frozen=True):
-    """From here on the board sends and hears nothing."""
-
-    board: int
-
-
-class BoardRestarted(Event, frozen=True):
-    """The board lost power for a moment: configuration gone, silent; deaf until ``ready_ns``."""
-
-    board: int
-    ready_ns: int
-
-
-class BoardSilenced(Event, frozen=True):
-    """A discovery made a streaming MTB3 fall silent, as it does to real ones."""
-
-    board: int
-
-
-class ErrorReported(Event, frozen=True):
-    """A device reported an error (CANopen EMCY), or with code 0 that it has none."""
-
-    board: int
-    code: int
-
-
-class Recalibrated(Event, frozen=True):
-    """A board took new baselines for all of its triangles: values jump without notice."""
-
-    board: int
-    cycle: int
-    """The first burst with the new baselines."""
-    reason: Literal["power_up", "command", "no_ack"]
-
-
-class TriangleFault(Event, frozen=True):
-    """A triangle was unplugged or plugged in, or stopped or began again to acknowledge on its I2C line."""
-
-    board: int
-    triangle: int
-    cycle: int
-    """The first burst that shows it."""
-    fault: Literal["unplugged", "plugged_in", "no_ack", "ack"]
-
-
-class TaxelOutOfRange(Event, frozen=True):
-    """A taxel of the board is broken from power-up on: far out of range, whatever the baseline."""
-
-    board: int
-    triangle: int
-    taxel: int
-
-
-class ForeignFrame(Event, frozen=True):
-    """Some other device on the bus sent a frame."""
-
-    identifier: int
-    """With ``EXTENDED_FLAG`` for 29-bit identifiers."""
-    length: int
-
-
-class CommandReceived(Event, frozen=True):
-    """A frame from the host that at least one board obeyed or answered."""
-
-    identifier: int
-    payload: str
-    """In hexadecimal digits."""
-    boards: list[int]
-    """The boards that did, by the address they had before."""
-
-
-def spoilt_bursts(events: Iterable[msgspec.Struct]) -> set[tuple[int, int]]:
-    """The (board, cycle) of small devices of which a host cannot have got every frame intact."""
+def spoilt_bursts(events: Iterable[Event]) -> set[tuple[int, int]]:
+    """Return (board, cycle) of the bursts of which a host cannot have received every frame intact."""
     spoilt = {"lost", "truncated", "corrupted", "unsent"}
-    return {(e.board, e.cycle) for e in events if isinstance(e, FrameFault) and e.fault in spoilt}
+    return {(e.board, e.cycle) for e in events if e.fault in spoilt}
 
 
-def damaged_cycles(events: Iterable[msgspec.Struct]) -> set[tuple[int, int, int]]:
-    """The (board, triangle, cycle) of which a host cannot have got both halves intact."""
-    return {(event.board, event.triangle, event.cycle) for event in events if isinstance(event, LostHalf | WrongLength)}
+def damaged_cycles(events: Iterable[Event]) -> set[tuple[int, int, int]]:
+    """Return (board, triangle, cycle) of the triangles of which a host cannot have received both halves intact."""
+    return {(e.board, e.triangle, e.cycle) for e in events if e.half is not None and e.fault != "repeated"}
 
 
 class JsonLinesLog:
-    """Writes events to a file, one JSON object a line, each as soon as it happens.
+    """Write events to a file, one JSON object a line, each as soon as it happens.
 
     Args:
         path: the file; an existing one is replaced.
@@ -170,7 +113,7 @@ class JsonLinesLog:
         except OSError as error:
             raise ConfigurationError(f"cannot write the log {path}: {error.strerror}") from error
 
-    def append(self, event: msgspec.Struct) -> None:
+    def append(self, event: Event) -> None:
         """Write one event."""
         self._file.write(self._encoder.encode(event) + b"\n")
 

@@ -1,4 +1,4 @@
-"""Wake at moments of CLOCK_MONOTONIC (timerfd), or in a time that passes only when nothing is left to do."""
+"""Timers of CLOCK_MONOTONIC (timerfd), and a clock for tests that passes only when nothing is left to do."""
 
 from __future__ import annotations
 
@@ -91,18 +91,18 @@ _NAP_S = 0.05
 
 
 class NeverEnds(BaseException):
-    """Something blocks, loops without end, or waits for what can never come: in such a time, that is for ever.
+    """A driver blocks, loops without end, or waits for an event that cannot come: such time never passes.
 
-    The message says what, and what to do. It is no :class:`Exception`: nothing of a driver catches it.
+    The message gives the cause and the remedy. It is no :class:`Exception`, so that no code of a driver catches it.
     """
 
 
 class HandClock:
-    """CLOCK_MONOTONIC as a test has it, ns. Called, it tells the time.
+    """CLOCK_MONOTONIC of a test, ns. A call returns the time.
 
     Attributes:
         now_ns: the time.
-        before_passing: called before every jump: everything of this moment has happened.
+        before_passing: called before every jump, when everything of this moment has happened.
         turns: of the event loop so far.
     """
 
@@ -121,7 +121,7 @@ class HandClock:
         return (self.now_ns - _BEGINNING_NS) / 1e9
 
     def timer(self) -> HandTimer:
-        """A descriptor that becomes readable at a moment of this clock."""
+        """Make a timer of this clock."""
         timer = HandTimer(self)
         self._timers.add(timer)
         return timer
@@ -142,7 +142,7 @@ class HandClock:
 
 
 class HandTimer:
-    """What :class:`skinware_drivers.virtual.hand_clock.MonotonicTimer` is, for a :class:`HandClock`."""
+    """A :class:`MonotonicTimer` for a :class:`HandClock`."""
 
     def __init__(self, clock: HandClock) -> None:
         self._clock = clock
@@ -175,7 +175,7 @@ class HandTimer:
 
 
 class _PassingTime(selectors.EpollSelector):
-    """Where the event loop would sleep, time passes instead."""
+    """A selector that lets time pass where the event loop would sleep."""
 
     def __init__(self, clock: HandClock) -> None:
         super().__init__()
@@ -195,7 +195,7 @@ class _PassingTime(selectors.EpollSelector):
         timer_ns = self._clock.next_timer_ns()
         if timer_ns is not None:
             moments.append(timer_ns)
-        if not moments:  # only another thread can go on
+        if not moments:  # only another thread can continue
             self._naps += 1
             if self._naps > _NAPS_WITHOUT_TIMER:
                 raise NeverEnds("the driver waits indefinitely: give the wait a timeout")
@@ -222,7 +222,7 @@ class HandLoop(asyncio.SelectorEventLoop):
 
 @contextmanager
 def package_on(clock: HandClock) -> Iterator[None]:
-    """Everything that asks ``skinware.realtime.now_ns`` gets the time of a clock; ``time.sleep`` raises."""
+    """Let ``skinware.realtime.now_ns`` return the time of a clock everywhere, and ``time.sleep`` raise."""
     real_now_ns, real_sleep, thread = skinware.realtime.now_ns, time.sleep, threading.get_ident()
     users = [module for module in sys.modules.values() if vars(module).get("now_ns") is real_now_ns]
 

@@ -1,4 +1,4 @@
-"""The contract of emulated hardware: frames in, frames out, driven by a clock that the caller owns."""
+"""The contract of emulated hardware: frames in and frames out, at times that the caller passes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import msgspec
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.loading import Kind, load, registered
+from skinware_drivers.virtual.events import Event
 
 if TYPE_CHECKING:  # needs numpy: commands show the options of emulators fast
     from skinware.geometry import Geometry
 
 EMULATORS = "skinware.emulators"
-"""The entry point group in which emulators register, under the name of the driver they serve."""
+"""The entry point group of emulators; each registers under the name of its driver."""
 
 
 _FARTHEST_M, _STRONGEST_N, _WIDEST_M, _SHORTEST_S, _LONGEST_S = 100.0, 100.0, 0.1, 0.05, 3600.0
@@ -36,62 +37,62 @@ class WireFrame(NamedTuple):
 
 
 class EventLog(Protocol):
-    """Where emulated hardware writes down what it did: a plain list will do."""
+    """The receiver of the events of emulated hardware, for example a list."""
 
-    def append(self, event: msgspec.Struct, /) -> None:
+    def append(self, event: Event, /) -> None:
         """Take one event. Events come in order of time, except those of a burst, which come together."""
 
 
 @runtime_checkable
 class EmulatedHardware(Protocol):
-    """Devices on one bus. They never sleep and read no clock: whoever carries their frames tells the time.
+    """Devices on one bus. They never sleep and read no clock: the bus passes the time to each call.
 
-    The devices are powered up by the first call that tells a time (so a carrier starts with ``skip``). A time
-    earlier than one told before counts as that one.
+    The first call with a time powers the devices up, so a bus begins with ``skip``. A time before that of an earlier
+    call counts as that one.
 
-    ``Options`` is a ``msgspec.Struct`` whose fields are the emulator's options: ``skin-emulate`` turns them
-    into command-line options, ``--bus virtual?key=value`` into bus options.
+    ``Options`` is a ``msgspec.Struct`` whose fields are the emulator's options: ``skin-emulate`` makes command-line
+    options of them, ``--bus virtual?key=value`` bus options.
     """
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """Take one frame from the bus. Frames that mean nothing to the devices are ignored."""
 
     def next_due_ns(self) -> int | None:
-        """When ``emit`` is worth calling again; None while everything is silent.
+        """Return when ``emit`` is worth calling again; None while everything is silent.
 
-        No frame is due earlier. It can turn out that nothing is due (a burst of which every frame got lost).
+        No frame is due earlier. Possibly none is due then either, for example if every frame of a burst was lost.
         """
 
     def emit(self, now_ns: int) -> list[WireFrame]:
-        """Everything due at ``now_ns`` that was not given before, oldest first, stamped with when it was due."""
+        """Return the frames due by ``now_ns`` that were not returned before, oldest first, with their due times."""
 
     def skip(self, now_ns: int) -> int:
-        """Let the devices run on to ``now_ns`` with nobody listening: cheap, however long it was.
+        """Let the devices run on to ``now_ns`` without a listener: cheap, however long that is.
 
         Returns:
             The number of frames that went unheard.
         """
 
     def totals(self) -> dict[str, int]:
-        """Exact counts since power-up; at least ``frames`` (given by ``emit``), ``bursts``, ``commands``."""
+        """Return exact counts since power-up; at least ``frames`` (returned by ``emit``), ``bursts``, ``commands``."""
 
 
 class Pressing(NamedTuple):
-    """Somebody presses."""
+    """A press on the emulated skin."""
 
     at_m: Point
-    """Where, in the frame of the places, m."""
+    """Place, in the coordinate frame of the sensors, m."""
     force_n: float = 3.0
     radius_m: float = 0.006
-    """Of the thing that presses."""
+    """Radius of the pressing object."""
     seconds: float = 1.0
 
     @classmethod
     def of(cls, at_m: Any, force_n: Any, radius_m: Any, seconds: Any) -> Pressing:
-        """What a program asks for.
+        """Check the arguments of a program.
 
         Raises:
-            ValueError: it makes no sense.
+            ValueError: they make no sense.
         """
         if not isinstance(at_m, list | tuple) or len(at_m) != 3:
             raise ValueError(f"at_m {at_m!r}: give x, y and z in m")
@@ -109,16 +110,16 @@ class PlacedHardware(EmulatedHardware, Protocol):
     """Emulated hardware whose sensors have places, at which it can be pressed."""
 
     def pressing(self, now_ns: int) -> Sequence[tuple[Point, float]]:
-        """What presses it at ``now_ns``: where, in the frame of the places, m, and with how many newtons."""
+        """Return place (m, in the coordinate frame of the sensors) and force (N) of each press at ``now_ns``."""
 
     def geometry(self) -> Geometry:
-        """Where the sensors are, by the types and uids of their driver."""
+        """Return the places of the sensors, by the types and uids of their driver."""
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
-        """Press from ``now_ns`` on; tells what is nearest, in whatever words the hardware has for it.
+        """Press from ``now_ns`` on; return the nearest sensor, in the hardware's own terms.
 
         Raises:
-            ValueError: nothing would feel it, or there are too many presses at a time.
+            ValueError: no sensor would feel it, or there are too many presses at a time.
         """
 
 
@@ -129,12 +130,12 @@ def _number(name: str, value: Any, least: float, most: float) -> float:
 
 
 class HardwareFactory(Protocol):
-    """What the entry points of group ``skinware.emulators`` name: a class with ``Options``."""
+    """A class with ``Options``, as the entry points of group ``skinware.emulators`` name it."""
 
     Options: type[msgspec.Struct]
 
     def __call__(self, options: Any, *, log: EventLog | None = None) -> EmulatedHardware:
-        """Make the devices. ``options`` is an instance of ``Options``; ``log`` takes what they do."""
+        """Make the devices. ``options`` is an instance of ``Options``; ``log`` receives their events."""
 
 
 _EMULATOR = Kind(
@@ -147,18 +148,18 @@ _EMULATOR = Kind(
 
 
 def medium_of(emulator: HardwareFactory) -> str:
-    """What the devices are connected by: ``can``, unless the class says otherwise in its attribute ``medium``."""
+    """Return the medium of the devices: the attribute ``medium`` of the class, or ``can``."""
     medium: str = getattr(emulator, "medium", "can")
     return medium
 
 
 def next_read(hardware: EmulatedHardware, waiting: list[bytes], size: int) -> bytes:
-    """What a read at the other end of an emulated line gives: all that waits, or one datagram.
+    """Return the bytes of one read at the other end of an emulated line: all that wait, or one datagram.
 
     Args:
-        hardware: with an attribute ``datagrams`` that is true: what it sends are datagrams.
-        waiting: payloads that were sent and not read yet, which are taken out.
-        size: bytes that are read at the most.
+        hardware: its attribute ``datagrams`` says whether it sends datagrams.
+        waiting: payloads that were sent and not read yet; those that are read are removed.
+        size: most bytes of a read.
     """
     if getattr(hardware, "datagrams", False):
         return waiting.pop(0)[:size] if waiting else b""
@@ -168,19 +169,19 @@ def next_read(hardware: EmulatedHardware, waiting: list[bytes], size: int) -> by
 
 
 def emulators_instead(medium: str) -> str:
-    """The emulators that drivers of a medium can use instead, for people; empty if there are none."""
+    """Name the emulators that drivers of a medium can use instead, for people; empty if there are none."""
     fitting = []
     for name in sorted(registered(EMULATORS)):
-        with contextlib.suppress(ConfigurationError):  # one that cannot be loaded is no help
+        with contextlib.suppress(ConfigurationError):  # an emulator that cannot be loaded is no help
             if medium_of(load_emulator(name)) == medium:
                 fitting.append(f"virtual:{name}")
     return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
 
 
 def load_emulator(name: str) -> HardwareFactory:
-    """The emulator of a name; see :func:`skinware_drivers.loading.load`.
+    """Return the emulator of a name; see :func:`skinware_drivers.loading.load`.
 
     Raises:
-        ConfigurationError: there is none of that name, or it cannot be loaded.
+        ConfigurationError: there is no such emulator, or it cannot be loaded.
     """
     return cast("HardwareFactory", load(_EMULATOR, name))

@@ -1,20 +1,121 @@
-"""The bus ``virtual``: which one, of those for each kind of wire."""
+"""The bus ``virtual``: an emulated CAN bus, serial line or Modbus line in the driver's own process.
+
+On a line, the payloads of the emulator's frames are the bytes, framing and all; their identifier is 0.
+"""
 
 from __future__ import annotations
 
+import time
+
 from skinware_drivers.bus import Bus, chosen_by
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.registers import Wanted
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, PlacedCanBus, VirtualCanBus
-from skinware_drivers.virtual.hardware import PlacedHardware, load_emulator, medium_of
+from skinware_drivers.virtual.hand_clock import MonotonicTimer
+from skinware_drivers.virtual.hardware import (
+    EmulatedHardware,
+    PlacedHardware,
+    emulators_instead,
+    load_emulator,
+    medium_of,
+    next_read,
+)
+
+_LONGEST_BACKLOG_NS = 1_000_000_000
+"""Bytes that wait longer are dropped, as from a full buffer of the kernel."""
+
+
+class _EmulatedLine(Bus):
+    """A bus of lines with emulated devices at the other end.
+
+    Args:
+        channel: name of the emulator.
+        options: of the emulator, as texts.
+        payload_size: longest body that fits into a batch.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        emulator = load_emulator(channel)
+        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
+
+    @property
+    def name(self) -> str:
+        return f"bus virtual:{self.channel}"
+
+    def instead(self, medium: str) -> str:
+        return emulators_instead(medium) or super().instead(medium)
+
+    def _open_port(self) -> Port:
+        return _EmulatedPort(self.hardware)
+
+
+class VirtualSerialBus(_EmulatedLine, SerialBus):
+    """Emulated serial devices as a bus, with a name as that of ``VirtualCanBus``."""
+
+
+class VirtualModbusBus(_EmulatedLine, ModbusBus):
+    """Emulated Modbus devices as a bus, with a name as that of ``VirtualCanBus``."""
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
+        """Return 0: it has no baud rate."""
+        return 0.0
+
+
+class _EmulatedPort(Port):
+    """The host's end of a line with emulated devices at the other."""
+
+    def __init__(self, hardware: EmulatedHardware) -> None:
+        self._hardware = hardware
+        self._timer = MonotonicTimer()
+        self._unread: list[bytes] = []
+        hardware.skip(time.monotonic_ns())
+        self._wake_when_due()
+
+    def fileno(self) -> int:
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:
+        now_ns = time.monotonic_ns()
+        due_ns = self._hardware.next_due_ns()
+        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        self._unread += [frame.payload for frame in self._hardware.emit(now_ns)]
+        data = next_read(self._hardware, self._unread, size)
+        self._wake_when_due()
+        return data
+
+    def write(self, data: bytes) -> int:
+        self._hardware.receive(0, data, time.monotonic_ns())
+        self._wake_when_due()
+        return len(data)
+
+    def close(self) -> None:
+        self._timer.close()
+
+    def _wake_when_due(self) -> None:
+        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
 def _class_of(channel: str, _options: object) -> type[Bus]:
     emulator = load_emulator(channel or DEFAULT_EMULATOR)
-    if (medium := medium_of(emulator)) in ("serial", "modbus"):
-        from skinware_drivers.virtual.emulated_line import VirtualModbusBus, VirtualSerialBus
-
-        return VirtualSerialBus if medium == "serial" else VirtualModbusBus
+    kinds: dict[str, type[Bus]] = {"serial": VirtualSerialBus, "modbus": VirtualModbusBus}
     has_places = isinstance(emulator, type) and issubclass(emulator, PlacedHardware)
-    return PlacedCanBus if has_places else VirtualCanBus
+    return kinds.get(medium_of(emulator), PlacedCanBus if has_places else VirtualCanBus)
 
 
 @chosen_by(_class_of)

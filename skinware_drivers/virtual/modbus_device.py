@@ -1,7 +1,7 @@
-"""Emulators of Modbus devices: a unit says which registers it has, and what is in them.
+"""The base class of emulators of Modbus devices, which declare their registers and the content.
 
-They answer a question in the way in which it was asked, as on a serial line (RTU) or as over TCP, so that one emulator
-serves both. Nothing here is shared with the drivers.
+They answer a question in the form in which it came, as on a serial line (RTU) or as over TCP, so that one emulator
+serves both. They share no code with the drivers.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from skinware_drivers.virtual.emulator import Device
 from skinware_drivers.virtual.serial_device import OptionsT, SerialEmulator
+from skinware_drivers.virtual.stage import Device
 
 _HEADER_OF_TCP = 6
 _READS, _WRITE_ONE, _WRITE_MANY = (3, 4), 6, 16
@@ -21,7 +21,7 @@ _SAMPLE, _ASKED = "sample", "asked"  # in the memory of a device
 
 
 class _Asked(NamedTuple):
-    """A question: with its number over TCP, else None."""
+    """A question; its number is None on a serial line."""
 
     number: bytes | None
     unit: int
@@ -31,41 +31,39 @@ class _Asked(NamedTuple):
 class ModbusEmulator(SerialEmulator[OptionsT]):
     """Emulated Modbus units, whose numbers are their addresses.
 
-    A unit samples its sensors when it is asked for their lowest register, or for others before any sample. Until then,
-    questions for the others are answered from the same sample: a whole round of questions is one burst.
+    A unit samples its sensors when it is asked for their lowest register, or for another one before the first sample.
+    Other questions are answered from the newest sample, so that a whole round of questions is one burst.
 
     Attributes:
-        step: by how much the address grows from one register to the next.
-        function: with which the registers are read, 3 or 4.
+        step: from the address of one register to the next.
+        function: that reads the registers, 3 or 4.
     """
 
     medium = "modbus"
+    streams = "never"
     step: int = 1
     function: int = 3
 
     @abstractmethod
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
-        """What is in the registers while the sensors feel this: address -> 16 bits."""
+        """Return the content of the registers for values of the sensors: address -> 16 bits."""
 
     def beside(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
-        """What is in registers that do not belong to its sensors, in the same way. By default there are none."""
+        """Return the content of registers that do not belong to its sensors. By default there are none."""
         return {}
 
     def of_other_function(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
-        """What is in the registers that the other function reads, 3 or 4. By default there are none."""
+        """Return the content of the registers that the other function reads, 3 or 4. By default there are none."""
         return {}
 
     def written(self, device: Device, address: int, value: int) -> bool:  # noqa: ARG002
-        """A register is written; tells whether it can be. By default none can."""
+        """Write a register; return whether it can be written. By default none can."""
         return False
 
-    # What it need not care about
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        """Wait to be asked."""
+    # Within
 
     def kinds(self) -> Sequence[str]:
-        """Name the registers with data: a question for one that is silent has no answer."""
+        """Name the registers with data; a question for a silent one gets no answer."""
         device = Device(self.numbers[0], self, self.wire.attach(), 0)
         return [str(address) for address in sorted(self.registers(device, self._each("rest").tolist()))]
 
@@ -82,7 +80,7 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         return found, b""
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Obey a question to this unit."""
+        """Answer a question to this unit."""
         asked = _read(command)
         if asked.unit != device.number:
             return None
@@ -105,7 +103,7 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         return _reply(asked, bytes([function | 0x80, _NO_SUCH_FUNCTION]))
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """A new sample, and the answer to the question that wanted it."""
+        """Take a new sample; return the answer to the question that asked for it."""
         device.memory[_SAMPLE] = self.registers(device, values)
         return [_read_from({**self.beside(device), **device.memory[_SAMPLE]}, device.memory[_ASKED], self.step)]
 
@@ -133,21 +131,21 @@ def _read_from(known: Mapping[int, int], asked: _Asked, step: int) -> bytes:
 
 
 def _size_on_line(heard: bytes) -> int:
-    """Bytes of the question as on a line that begins here; 0: none does, as far as is known."""
+    """Return the bytes of the question as on a line that begins here; 0: none does, or it is not whole yet."""
     size = 9 + heard[6] if len(heard) > 6 and heard[1] == _WRITE_MANY else 8
     whole = heard[:size]
     return size if len(whole) == size and _crc(whole[:-2]) == whole[-2:] else 0
 
 
 def _size_over_tcp(heard: bytes) -> int | None:
-    """Bytes of the question as over TCP that begins here; 0: none can, None: this is not known yet."""
+    """Return the bytes of the question as over TCP that begins here; 0: none does, None: not known yet."""
     if any(heard[2:4]):
         return 0
     if len(heard) < _HEADER_OF_TCP:
         return None
     size = _HEADER_OF_TCP + int.from_bytes(heard[4:6], "big")
     if not _HEADER_OF_TCP + 6 <= size <= _HEADER_OF_TCP + 254:
-        return None if len(heard) < 8 else 0  # it may be one of a line that is not whole
+        return None if len(heard) < 8 else 0  # possibly half a question of a line
     return size if len(heard) >= size else None
 
 
@@ -158,14 +156,14 @@ def _read(command: bytes) -> _Asked:
 
 
 def _reply(asked: _Asked, message: bytes) -> bytes:
-    told = bytes([asked.unit]) + message
+    body = bytes([asked.unit]) + message
     if asked.number is None:
-        return told + _crc(told)
-    return asked.number + b"\0\0" + len(told).to_bytes(2, "big") + told
+        return body + _crc(body)
+    return asked.number + b"\0\0" + len(body).to_bytes(2, "big") + body
 
 
 def _crc(data: bytes) -> bytes:
-    """Of Modbus: polynomial 8005, reflected, from FFFF, low byte first."""
+    """Return the checksum of Modbus: polynomial 8005, reflected, from FFFF, low byte first."""
     remainder = 0xFFFF
     for byte in data:
         remainder ^= byte

@@ -1,30 +1,35 @@
-"""The bus ``replay``: what went over a wire when it was recorded, again, as the bus of a driver.
+"""The bus ``replay``: the recorded traffic of a wire as the bus of a driver.
 
-The driver decodes it with the times that it had, moved to now. What devices answer comes when this driver has asked: at
-a frame that was sent, the recording waits until one with the same identifier is sent again. On Modbus the questions are
-those that were recorded, and the driver need not ask.
+The driver decodes it with the recorded times, moved to now. An answer of a device comes when this driver has asked: at
+a frame that was sent, the recording waits until one with the same identifier is sent again. On Modbus the questions
+come from the recording, and the driver need not ask.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import msgspec
 
-from skinware.errors import ConfigurationError
-from skinware_drivers.bus import Bus, chosen_by
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.realtime import now_ns
+from skinware_drivers.bus import Bus, FrameBatch, chosen_by
 from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.counters import BusCounters, FramerCounters
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.master import ANSWERS, Listener
+from skinware_drivers.modbus.registers import Row, Wanted
+from skinware_drivers.modbus.wire import Message, TcpMessages, is_question
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
-from skinware_drivers.virtual.recorded_modbus import ReplayedModbusBus, was_over_tcp
-from skinware_drivers.virtual.recorded_wire import Note, RecordedPort, RecordedWire
+from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedPort, RecordedWire
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireItem, WireTrack
@@ -33,18 +38,21 @@ if TYPE_CHECKING:
 class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a recorded bus."""
 
-    bus: Annotated[str, msgspec.Meta(description="which one, if several were recorded")] = ""
-    driver: Annotated[str, msgspec.Meta(description="of which driver, if several had it")] = ""
+    bus: Annotated[str, msgspec.Meta(description="name of the bus, if several were recorded")] = ""
+    driver: Annotated[str, msgspec.Meta(description="driver of the bus, if several had it")] = ""
     speed: Annotated[float, msgspec.Meta(description="2: twice as fast", gt=0)] = 1.0
-    start: Annotated[float, msgspec.Meta(description="begin there, s since the recording began", ge=0)] = 0.0
-    end: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, msgspec.Meta(description="end there")] = None
+    start: Annotated[float, msgspec.Meta(description="where to begin, s since the recording began", ge=0)] = 0.0
+    end: Annotated[
+        Annotated[float, msgspec.Meta(ge=0)] | None,
+        msgspec.Meta(description="where to end, as start"),
+    ] = None
 
 
 class Recorded(NamedTuple):
-    """What a driver said of itself when its wire was recorded.
+    """The driver that ran when its wire was recorded.
 
     Attributes:
-        driver_type: as ``--driver`` takes it; empty: the file does not say.
+        driver_type: as ``--driver`` takes it; empty: not in the file.
         listen_only: it sent nothing.
         options: of the driver for this bus.
     """
@@ -55,11 +63,11 @@ class Recorded(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """Time in which something is replayed.
+    """The time of a replay.
 
     Attributes:
-        now_ns: tells CLOCK_MONOTONIC ns.
-        timer: makes what wakes readers.
+        now_ns: returns CLOCK_MONOTONIC ns.
+        timer: makes the timers that wake readers.
     """
 
     now_ns: Callable[[], int] = time.monotonic_ns
@@ -109,6 +117,140 @@ class ReplayedSerialBus(SerialBus):
             self._hear(chunk, self._recorded.read_ns)
 
 
+class Conversation(Listener):
+    """Pair recorded questions with their replies, and answer a driver's own questions by them.
+
+    Args:
+        wanted: the registers to look for in the replies.
+        counters: of the bus.
+        over_tcp: the recording is of a connection, not of a serial line.
+    """
+
+    def __init__(self, wanted: Wanted, counters: BusCounters, *, over_tcp: bool) -> None:
+        super().__init__(wanted, counters)
+        self._over_tcp = over_tcp
+        self._asking, self._answering = TcpMessages(counters.framing), TcpMessages(counters.framing)
+        self._numbered: dict[int, Message] = {}
+        self._replies: dict[tuple[int, bytes], bytes] = {}
+        self._waiting: list[Message] = []
+
+    def take(self, chunk: bytes, time_ns: int, *, is_sent: bool) -> None:
+        """Take recorded bytes."""
+        if not self._over_tcp:
+            self.heard(chunk, time_ns)
+            return
+        try:
+            for message in (self._asking if is_sent else self._answering).feed(chunk):
+                if is_sent:
+                    self._numbered[message.number] = message
+                elif (asked := self._numbered.pop(message.number, None)) is not None:
+                    self._pair(asked, message, time_ns)
+                else:
+                    self._counters.refused += 1
+        except ValueError:  # it is counted, and the connection was given up
+            self._numbered.clear()
+
+    def command(self, message: Message, time_ns: int) -> None:
+        """Answer a question by its recorded reply: at once, or when that comes."""
+        reply = self._replies.get((message.unit, message.data))
+        if reply is None:
+            self._waiting.append(message)
+        else:
+            self.rows.append(Row(time_ns, ANSWERS | message.unit, reply))
+
+    def _pair(self, asked: Message, reply: Message, time_ns: int) -> None:
+        key = asked.unit, asked.data
+        self._replies[key] = reply.data
+        if any((one.unit, one.data) == key for one in self._waiting):
+            self._waiting = [one for one in self._waiting if (one.unit, one.data) != key]
+            self.rows.append(Row(time_ns, ANSWERS | asked.unit, reply.data))
+        super()._pair(asked, reply, time_ns)
+
+
+class ReplayedModbusBus(ModbusBus):
+    """A recorded Modbus line or connection. It asks nothing, because the recording has the questions.
+
+    Args:
+        open_port: begins the recording, in both directions.
+        name: as a user writes it.
+        over_tcp: it was a connection.
+        payload_size: longest frame.
+        listen_only: refuse every ``send``.
+    """
+
+    opens_slowly = False
+    is_recorded = True
+
+    def __init__(
+        self,
+        open_port: Callable[[], RecordedPort],
+        name: str,
+        *,
+        over_tcp: bool,
+        payload_size: int,
+        listen_only: bool,
+    ) -> None:
+        super().__init__("recorded", payload_size=payload_size, listen_only=listen_only)
+        self._begin_port, self._name, self._over_tcp = open_port, name, over_tcp
+        self._recorded: RecordedPort | None = None
+        self._conversation = Conversation(self._wanted, self.counters, over_tcp=over_tcp)
+
+    @property
+    def name(self) -> str:
+        return f"bus {self._name}"
+
+    @property
+    def asks(self) -> bool:
+        return False
+
+    @property
+    def reads_natively(self) -> bool:
+        return False
+
+    def use(self, wanted: Wanted, *timing: Any) -> None:
+        """Set the registers to look for; the recording has the timing."""
+        super().use(wanted, *timing)
+        self._conversation = Conversation(self._wanted, self.counters, over_tcp=self._over_tcp)
+
+    def open(self) -> None:
+        if self._recorded is None:
+            self._recorded = self._begin_port()
+
+    def fileno(self) -> int:
+        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
+        return -1 if self._recorded is None else self._recorded.fileno()
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        port, talk = self._recorded, self._conversation
+        if port is None:
+            raise BusNotAvailable(f"{self!r} is not open")
+        while len(talk.rows) < batch.free and (item := port.next_frame()) is not None:
+            is_sent = item.identifier == SENT
+            self.tap.keep_bytes(item.time_ns, item.payload, is_sent=is_sent)
+            talk.take(item.payload, item.time_ns, is_sent=is_sent)
+        taken = 0
+        while talk.rows and batch.free:
+            row = talk.rows.popleft()
+            if len(row.payload) <= batch.payload_size:
+                batch.append(ordinal, *row)
+                taken += 1
+        self.counters.frames += taken
+        if talk.rows:
+            port.wake()
+        return taken
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Send a question of the driver's own; see :class:`skinware_drivers.modbus.bus.ModbusBus`."""
+        port = self.may_send_by(self._recorded)
+        self._conversation.command(Message(identifier, payload), now_ns())
+        port.wake()
+
+    def close(self) -> None:
+        port, self._recorded = self._recorded, None
+        if port is not None:
+            port.close()
+
+
 _CLASSES: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": ReplayedModbusBus}
 
 
@@ -129,19 +271,19 @@ def replayed_bus(
     clock: Clock | None = None,
     note: Note | None = None,
 ) -> Bus:
-    """The bus ``replay``: what was recorded of one in the file ``channel``.
+    """Make the bus ``replay`` of a recorded bus in the file ``channel``.
 
     Args:
         channel: the file.
         options: see :class:`ReplayOptions`.
-        payload_size: longest payload that the layout knows.
+        payload_size: longest payload of the layout.
         listen_only: refuse to send, and wait for no question.
-        clock: in whose time; default: in real time.
-        note: is told of all that is given; see :class:`.recorded_wire.RecordedWire`.
+        clock: of the replay; default: real time.
+        note: is called for each frame; see :class:`.recorded_wire.RecordedWire`.
 
     Raises:
-        ConfigurationError: an option is unknown or has a bad value, the file cannot be read, or nothing, or more than
-            one bus, is meant.
+        ConfigurationError: an option is unknown or has a bad value, the file cannot be read, or the options fit no bus
+            or more than one.
         BadRecording: the file is no recording.
         MissingExtra: recordings need packages that are not installed.
     """
@@ -157,14 +299,14 @@ def replayed_bus(
     if medium_of(recording, wire) == "modbus":
         recorded = play(waits=False, with_sent=True)
         begin = partial(RecordedPort, recorded, clock.now_ns, clock.timer)
-        return ReplayedModbusBus(begin, name, over_tcp=was_over_tcp(wire.items()), **more)
+        return ReplayedModbusBus(begin, name, over_tcp=_was_over_tcp(wire.items()), **more)
     recorded = play(waits=not listen_only)
     kind = ReplayedSerialBus if medium_of(recording, wire) == "serial" else ReplayedCanBus
     return kind(recorded, name, clock, **more)
 
 
 def recorded_driver(bus_name: str) -> Recorded:
-    """What the driver said of itself whose wire a bus' name means.
+    """Return the driver of the recorded bus that a bus' name means.
 
     Args:
         bus_name: ``replay:FILE?key=value``.
@@ -191,38 +333,38 @@ def _open(path: str) -> Recording:
 
 
 def medium_of(recording: Recording, wire: WireTrack) -> str:
-    """``can``, ``serial`` or ``modbus``: as the driver said, or by what was recorded."""
+    """Return ``can``, ``serial`` or ``modbus``: of the recorded driver, else by the recorded items."""
     known = recording.about(wire.driver).get("buses", {}).get(wire.bus, {}).get("medium")
     return str(known or ("serial" if wire.is_serial else "can"))
 
 
 def first_of(wires: Sequence[WireTrack], start_s: float = 0.0) -> int:
-    """When something first went over one of these, CLOCK_MONOTONIC ns of then; 0: nothing did.
+    """Return the time of the first item on any of these wires, in the recording's CLOCK_MONOTONIC ns; 0: none.
 
     Args:
         wires: of one recording.
-        start_s: from when on, s since the recording began.
+        start_s: earliest time, s since the recording began.
     """
     firsts = (next(wire.items(start_s=start_s), None) for wire in wires)
     return min((first.time_ns for first in firsts if first is not None), default=0)
 
 
 def _items(recording: Recording, wire: WireTrack, wanted: ReplayOptions) -> Iterator[WireItem]:
-    """What is wanted of a wire; the recording is closed after it, or when nobody wants more."""
+    """Yield the wanted items of a wire, then close the recording."""
     with recording:
         yield from wire.items(start_s=wanted.start, end_s=wanted.end)
 
 
 def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
-    """The wire that is meant.
+    """Return a recorded wire.
 
     Args:
-        recording: where it is.
-        bus: its name; empty: there is only one.
-        driver: whose it was; empty: only one had it.
+        recording: that has it.
+        bus: its name; empty: any.
+        driver: its driver; empty: any.
 
     Raises:
-        ConfigurationError: there is none, or more than one.
+        ConfigurationError: none fits, or more than one.
     """
     wires = recording.wires
     if not wires:
@@ -234,3 +376,13 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     of_driver = f" of {driver}" if driver else ""
     what = "which bus?" if found else f"no bus {bus}{of_driver};"
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")
+
+
+def _was_over_tcp(items: Iterable[WireItem]) -> bool:
+    """Return whether a recorded conversation was over a connection: a question shows it, whatever the bus' name."""
+    asked = next((item.data for item in items if item.is_sent), b"")
+    try:
+        messages = list(TcpMessages(FramerCounters()).feed(asked))
+    except ValueError:
+        return False
+    return bool(messages) and is_question(messages[0].data)

@@ -1,4 +1,4 @@
-"""What went over a wire when it was recorded, again: with the times that it had, and answers after questions."""
+"""Play the recorded traffic of a wire again, with its own times, and answers after this driver's questions."""
 
 from __future__ import annotations
 
@@ -19,28 +19,85 @@ if TYPE_CHECKING:
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 SENT = 1
-"""Identifier of what was sent, where that is given too."""
+"""Identifier of sent frames, where those are returned too."""
 Note = Callable[[int, int], None]
-"""Takes the time stamp of what is given, and the time that it had when it was recorded."""
+"""Takes the time stamp of a returned frame, and its time in the recording."""
 _PATIENCE_NS = 2_000_000_000
-"""So long a question is waited for that was asked when it was recorded; the next one of its kind is not, after that."""
+"""Longest wait for a question that was asked in the recording; later ones of its kind are not waited for then."""
 _EARLIEST_NS = 250_000_000
-"""A question may come so long before its time."""
+"""Longest time by which a question may come early."""
 _ANSWERED_WITHIN_NS = 20_000_000
-"""An answer comes so soon after its question, or sooner: one that came later was read late, or this device is slow."""
+"""Longest time from a question to its answer; a later one was read late, or this device is slow."""
+_MOST_QUESTIONS = 1000
+
+
+class Questions:
+    """The questions of this driver, by identifier, and the recorded ones that they meet.
+
+    Attributes:
+        last_ns: when this driver asked last.
+    """
+
+    def __init__(self) -> None:
+        self.last_ns = 0
+        self._asked: dict[int, deque[tuple[int, bytes]]] = {}
+        self._answered: dict[int, bytes] = {}
+        self._given_up: set[int] = set()
+        self._met_ns, self._is_unanswered = 0, False
+
+    def ask(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        self.last_ns = now_ns
+        self._asked.setdefault(identifier, deque(maxlen=_MOST_QUESTIONS)).append((now_ns, payload))
+        self._given_up.discard(identifier)
+
+    def like(self, item: WireItem) -> deque[tuple[int, bytes]]:
+        """Return time and payload of the questions with the identifier of a recorded one.
+
+        A question that was asked again before its answer came counts only where the recording repeats it, too.
+        """
+        kind = item.identifier or 0
+        asked, answered = self._asked.setdefault(kind, deque(maxlen=_MOST_QUESTIONS)), self._answered.get(kind)
+        while asked and asked[0][1] == answered != item.data:
+            asked.popleft()
+        return asked
+
+    def is_awaited(self, item: WireItem) -> bool:
+        return item.is_sent and (item.identifier or 0) not in self._given_up
+
+    def meet(self, item: WireItem, now_ns: int) -> int:
+        """Let the first question like a recorded one meet it; return when it was asked."""
+        asked_ns, self._answered[item.identifier or 0] = self.like(item).popleft()
+        self._met_ns, self._is_unanswered = now_ns, True
+        return asked_ns
+
+    def give_up(self, item: WireItem) -> None:
+        self._given_up.add(item.identifier or 0)
+
+    def answered(self) -> None:
+        self._is_unanswered = False
+
+    def is_missed(self, item: WireItem) -> bool:
+        """Return whether an item is the answer to a question after which this driver has asked again already."""
+        return not item.is_sent and self._is_unanswered and self.last_ns > self._met_ns
+
+    def is_answered_by(self, item: WireItem | None) -> bool:
+        return self._is_unanswered and item is not None and not item.is_sent
 
 
 class RecordedWire:
     """The devices at the other end of a recorded wire; see :class:`.hardware.EmulatedHardware`.
 
     Args:
-        items: what went over it, by time.
-        first_ns: time of the recording, CLOCK_MONOTONIC of then, at which it begins.
+        items: of the recording, by time.
+        first_ns: time of the recording, in its CLOCK_MONOTONIC, at which it begins.
         speed: 2.0: twice as fast.
-        waits: for the questions that were asked when it was recorded.
-        with_sent: what was sent is given too, with the identifier :data:`SENT`.
-        name: that the end is logged under; empty: it is not.
-        note: is told of all that is given.
+        waits: for the questions that were asked in the recording.
+        with_sent: return sent items too, with the identifier :data:`SENT`.
+        name: for the log message at the end; empty: none.
+        note: is called for each returned item.
+
+    Attributes:
+        is_over: every item was returned.
     """
 
     def __init__(
@@ -54,43 +111,38 @@ class RecordedWire:
         name: str = "",
         note: Note | None = None,
     ) -> None:
-        self._items, self._speed, self._waits, self._name, self._note = items, speed, waits, name, note
-        self._with_sent = with_sent
+        self._items, self._first_ns, self._speed, self._waits = items, first_ns, speed, waits
+        self._with_sent, self._name, self._note = with_sent, name, note
+        self._questions = Questions()
         self._next: WireItem | None = None
-        self._first_ns = first_ns
         self._begun_ns = self._given_ns = self._looked_ns = 0
-        self._has_begun = self._is_over = False
-        self._asked_ns = self._met_ns = 0
-        self._is_unanswered = False
-        self._asked: dict[int, deque[tuple[int, bytes]]] = {}
-        self._answered: dict[int, bytes] = {}
-        self._unasked: set[int] = set()
+        self._has_begun = self.is_over = False
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        """Take a question of this driver."""
         self._counts["commands"] += 1
-        self._asked_ns = now_ns
-        self._asked.setdefault(identifier, deque(maxlen=1000)).append((now_ns, payload))
-        self._unasked.discard(identifier)
+        self._questions.ask(identifier, payload, now_ns)
 
     def next_due_ns(self) -> int | None:
-        """When there is something, or a question was waited for long enough; None: at the end."""
+        """Return when an item is due, or a question was waited for long enough; None: at the end."""
         item = self._next
         if item is None or not self._has_begun:
             return None
         due_ns = self._due_ns(item)
         if not self._is_waited_for(item):
-            return min(due_ns, self._asked_ns) if self._is_missed(item) else due_ns
-        asked = self._questions(item)
+            return min(due_ns, self._questions.last_ns) if self._questions.is_missed(item) else due_ns
+        asked = self._questions.like(item)
         if not asked:
             return due_ns + _PATIENCE_NS
         is_early = asked[0][1] == item.data and asked[0][0] > self._looked_ns - _EARLIEST_NS
         return asked[0][0] if is_early else max(due_ns, asked[0][0])
 
     def emit(self, now_ns: int) -> list[WireFrame]:
+        """Return the items that are due."""
         found: list[WireFrame] = []
         self._looked_ns = now_ns
-        while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._is_hurried(item, now_ns)):
+        while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._hurry(item, now_ns)):
             if item.is_sent:
                 if self._is_waited_for(item) and not self._is_asked(item, now_ns):
                     break
@@ -98,10 +150,12 @@ class RecordedWire:
                     found.append(self._given(item, SENT))
             elif item.identifier is None or not item.identifier & (ERROR_FLAG | REMOTE_FLAG):
                 found.append(self._given(item, item.identifier or 0))
-                self._is_unanswered = False
+                self._questions.answered()
             self._take_next()
-            if item.is_sent:
-                self._hasten(item)
+            if item.is_sent and self._next is not None and self._questions.is_answered_by(self._next):
+                # the recording driver waited for this answer, however late it read it; this one need not wait so long
+                later_ns = self._due_ns(self._next) - self._due_ns(item)
+                self._begun_ns -= max(0, later_ns - _ANSWERED_WITHIN_NS)
         self._counts["frames"] += len(found)
         return found
 
@@ -112,10 +166,6 @@ class RecordedWire:
         self._has_begun, self._begun_ns = True, now_ns
         self._take_next()
         return 0
-
-    @property
-    def is_over(self) -> bool:
-        return self._is_over
 
     def totals(self) -> dict[str, int]:
         return dict(self._counts)
@@ -130,88 +180,56 @@ class RecordedWire:
         return WireFrame(self._given_ns, identifier, item.data)
 
     def _is_waited_for(self, item: WireItem) -> bool:
-        return self._waits and item.is_sent and _kind(item) not in self._unasked
+        return self._waits and self._questions.is_awaited(item)
 
     def _is_asked(self, item: WireItem, now_ns: int) -> bool:
-        """Whether the question was asked, or is waited for no more; if it was asked late, all that follows is late."""
-        due_ns, asked = self._due_ns(item), self._questions(item)
+        """Return whether a question was asked, or is waited for no more; a late one delays all that follows."""
+        due_ns, asked = self._due_ns(item), self._questions.like(item)
         while asked and asked[0][0] < due_ns - _EARLIEST_NS:
             asked.popleft()
-            asked = self._questions(item)
+            asked = self._questions.like(item)
         if asked:
-            asked_ns, self._answered[_kind(item)] = asked.popleft()
-            self._begun_ns += max(0, asked_ns - due_ns)
-            self._met_ns, self._is_unanswered = now_ns, True
+            self._begun_ns += max(0, self._questions.meet(item, now_ns) - due_ns)
             return True
         if now_ns < due_ns + _PATIENCE_NS:
             return False
         self._begun_ns += _PATIENCE_NS
-        self._unasked.add(_kind(item))
+        self._questions.give_up(item)
         return True
 
-    def _is_hurried(self, item: WireItem, now_ns: int) -> bool:
-        """Whether it has to come before its time; all that follows is earlier then.
+    def _hurry(self, item: WireItem, now_ns: int) -> bool:
+        """Return whether an item has to come before its time; then all that follows comes earlier, too.
 
-        A driver that was held up when it was recorded asked late, and read an answer late that was there in time. This
-        driver asks when it should, and would give up an answer that came as late as it was read.
+        A driver that was held up in the recording asked late, and read late an answer that was there in time. This
+        driver asks in time, and would give up an answer that came as late as it was read then.
         """
-        if self._is_missed(item):
-            self._begun_ns -= max(0, self._due_ns(item) - self._asked_ns)
+        if self._questions.is_missed(item):
+            self._begun_ns -= max(0, self._due_ns(item) - self._questions.last_ns)
             return True
-        asked = self._questions(item) if self._is_waited_for(item) else deque()
-        if not asked or asked[0][1] != item.data:
+        asked = self._questions.like(item) if self._is_waited_for(item) else None
+        if not asked or asked[0][1] != item.data or asked[0][0] < now_ns - _EARLIEST_NS:
             return False
-        asked_ns = asked[0][0]
-        if asked_ns < now_ns - _EARLIEST_NS:
-            return False
-        self._begun_ns -= self._due_ns(item) - asked_ns
+        self._begun_ns -= self._due_ns(item) - asked[0][0]
         return True
-
-    def _is_missed(self, item: WireItem) -> bool:
-        """Whether it is the answer to a question after which this driver has asked again already."""
-        return not item.is_sent and self._is_unanswered and self._asked_ns > self._met_ns
-
-    def _hasten(self, question: WireItem) -> None:
-        """Where nothing was asked between a question and its answer, the driver of then had not given it up.
-
-        However late the answer was read, by a driver that was held up: this one has not to wait for it for so long.
-        """
-        if self._is_unanswered and self._next is not None and not self._next.is_sent:
-            later_ns = self._due_ns(self._next) - self._due_ns(question)
-            self._begun_ns -= max(0, later_ns - _ANSWERED_WITHIN_NS)
-
-    def _questions(self, item: WireItem) -> deque[tuple[int, bytes]]:
-        """What was asked of its kind, when.
-
-        One that was asked again before its answer came is none, unless this is where it was so when it was recorded.
-        """
-        asked, answered = self._asked.setdefault(_kind(item), deque(maxlen=1000)), self._answered.get(_kind(item))
-        while asked and asked[0][1] == answered != item.data:
-            asked.popleft()
-        return asked
 
     def _take_next(self) -> None:
         self._next = next(self._items, None)
-        if self._next is None and not self._is_over:
-            self._is_over = True
+        if self._next is None and not self.is_over:
+            self.is_over = True
             if self._name:
                 log.warning("%s: the recording is over", self._name)
 
 
-def _kind(item: WireItem) -> int:
-    return item.identifier or 0
-
-
 class RecordedPort(Port):
-    """A port that gives what was read, read by read.
+    """A port that returns the bytes of the recording, read by read.
 
     Args:
-        wire: that is read.
-        clock: tells CLOCK_MONOTONIC ns.
-        make_timer: makes what wakes the reader; another clock needs another timer.
+        wire: of the recording.
+        clock: returns CLOCK_MONOTONIC ns.
+        make_timer: makes the timer that wakes the reader; another clock needs another timer.
 
     Attributes:
-        read_ns: when what was given last was read.
+        read_ns: when the newest returned bytes were read.
     """
 
     def __init__(

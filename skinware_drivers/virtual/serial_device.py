@@ -1,4 +1,4 @@
-"""Emulators of devices on serial lines: what a new one need not say, beyond what :mod:`.emulator` does for all."""
+"""The base class of emulators of devices on serial lines."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator import CanFrame, Emulator
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.stage import Device
 
-_HEARD = "heard"  # in the memory of a device: the beginning of a command whose end it did not hear yet, and when
+_HEARD = "heard"  # in the memory of a device: the beginning of a command, and when it came
 _LONGEST_PAUSE_NS = 200_000_000
-"""Within a command. What was begun longer ago is forgotten: its host has gone, or it was meant for another device."""
+"""Longest pause within a command. An older beginning is forgotten: its host has gone, or meant another device."""
 
 
 class SerialEmulatorOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How often a device sends; an emulator adds what the device is."""
+    """The period of a device; an emulator adds options for the device itself."""
 
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two bursts until the host changes it, ms")] = 10
 
@@ -29,15 +30,15 @@ OptionsT = TypeVar("OptionsT", bound=SerialEmulatorOptions)
 class SerialEmulator(Emulator[OptionsT]):
     """Emulated devices on one serial line, by default one with the number 1.
 
-    A subclass says which :meth:`messages` a device sends and where the values are felt (``places``); one whose devices
-    hear something says how to :meth:`cut` commands out of what they hear, and how they :meth:`answer`.
+    A subclass defines the :meth:`messages` of a device and the ``places`` of its values. If its devices take commands,
+    it also defines how to :meth:`cut` them out of the bytes on the line, and how to :meth:`answer` them.
 
     Attributes:
         speed_mbit_s: of the line.
-        datagrams: each message is a datagram of its own, as over UDP, and no part of a stream.
+        datagrams: each message is a datagram of its own, as over UDP, not part of a stream.
 
     Raises:
-        ConfigurationError: the options want frames of other devices, of which a line has none.
+        ConfigurationError: the options ask for frames of other devices, which a line does not have.
     """
 
     medium = "serial"
@@ -52,32 +53,31 @@ class SerialEmulator(Emulator[OptionsT]):
         super().__init__(options, **more)
         self.wire.speed = self.speed_mbit_s
 
-    # What a subclass says
+    # A subclass defines these
 
     @abstractmethod
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """What a device sends in one burst, with beginning, checksum and all."""
+        """Return the whole messages of one burst, checksums included."""
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:  # noqa: ARG002
         """Cut commands out of a stream; by default there are none. See :func:`cut_packets`.
 
         Args:
-            heard: what was heard, from the end of the last command on.
+            heard: bytes after the last command.
 
         Returns:
-            The whole commands, whether or not their checksums are right; and what must be heard again with more behind
-            it.
+            The whole commands, whatever their checksums; and the rest, which comes again with more bytes after it.
         """
         return [], b""
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:  # noqa: ARG002
-        """Obey a whole command; gives what the device answers, or None if the command means nothing to it."""
+        """Obey a whole command; return the answer, or None if the command means nothing to the device."""
         return None
 
-    # What it may use
+    # A subclass may use these
 
     def say(self, device: Device, message: bytes, now_ns: int) -> None:
-        """Send a message beside the data."""
+        """Send a message besides the data."""
         self.reply(device, (0, message), now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
@@ -88,33 +88,33 @@ class SerialEmulator(Emulator[OptionsT]):
         """Name the kinds of messages with data; by default there is one."""
         return ["data"]
 
-    # What it need not care about
+    # Within
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
-        """Take what the host wrote, in whatever pieces it comes."""
+        """Take bytes of the host, in any pieces."""
         begun, heard_ns = device.memory.get(_HEARD, (b"", now_ns))
         commands, rest = self.cut(payload if now_ns - heard_ns > _LONGEST_PAUSE_NS else begun + payload)
         device.memory[_HEARD] = rest, now_ns
         obeyed = False
         for command in commands:
-            said = self.answer(device, command, now_ns)
-            obeyed |= said is not None
-            if said:
-                self.say(device, said, now_ns)
+            answer = self.answer(device, command, now_ns)
+            obeyed |= answer is not None
+            if answer:
+                self.say(device, answer, now_ns)
         return obeyed
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        """The messages."""
+        """Return the messages as frames."""
         return [(0, message) for message in self.messages(device, values)]
 
 
 def cut_packets(heard: bytes, begin: bytes, total: Callable[[bytes], int]) -> tuple[list[bytes], bytes]:
-    """Cut commands that begin with known bytes; what a ``SerialEmulator.cut`` returns.
+    """Cut commands that begin with known bytes; return them and the rest, as ``SerialEmulator.cut`` does.
 
     Args:
-        heard: what was heard, from the end of the last command on.
+        heard: bytes after the last command.
         begin: first bytes of every command.
-        total: tells from the bytes of a command how many it has; 0: too few to tell.
+        total: returns the length of a command from its first bytes; 0: they are too few.
     """
     found: list[bytes] = []
     while (at := heard.find(begin)) >= 0:

@@ -1,38 +1,114 @@
-"""What all emulated hardware on a bus does alike: it keeps devices in order of time on one wire.
+"""Emulated devices on one wire: their time, power and commands, and the faults of the frames that they send.
 
-See :class:`skinware_drivers.virtual.hardware.EmulatedHardware` for what a carrier may ask of it.
+:class:`skinware_drivers.virtual.hardware.EmulatedHardware` is the contract with the bus that carries the frames.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import msgspec
+import numpy as np
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual import events
+from skinware_drivers.options import HasOptions
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.events import Event, FrameDamage
 from skinware_drivers.virtual.hardware import EventLog, WireFrame
-from skinware_drivers.virtual.wire import Wire
+from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Transmitter, Wire
+
+OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
+DATA = "data"
+"""The timer of a device's bursts."""
 
 _IDENTIFIER_MASK = 0x1FFF_FFFF
 _MOST_LISTED = 40
+_REPLY_NS = 200_000
 _LONGEST_CATCH_UP_NS = 1_000_000_000
-"""What ``skip`` still emulates frame by frame; the time before it is jumped over."""
+"""Time that ``skip`` still emulates frame by frame; earlier time is jumped over."""
 
 
 class Actor(Protocol):
-    """A device on the wire that does things by itself."""
+    """Something on the wire that does things by itself."""
 
     def next_event_ns(self) -> int | None:
-        """When ``run`` has something to do."""
+        """Return the time at which ``run`` has something to do."""
 
     def run(self, now_ns: int) -> None:
         """Do what is due: queue frames on the wire."""
 
     def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; returns how many frames that would have been."""
+        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
+
+
+class Device:
+    """One emulated device.
+
+    Attributes:
+        number: its name in the emulator's options.
+        stage: the emulator.
+        memory: settings by commands; gone after a restart.
+        cycle: bursts sent since the first power-up; the number of the next one.
+        alive: it has power.
+        ready_ns: since when it can hear and send, after it last got power.
+        streams_from_ns: when it began to send by itself; None: it does not.
+        sampled_ns: when the values of its last burst were felt.
+        random: source of the faults of its frames.
+    """
+
+    def __init__(self, number: int, stage: Stage[Any], transmitter: Transmitter, now_ns: int) -> None:
+        self.number = number
+        self.stage = stage
+        self.transmitter = transmitter
+        self.memory: dict[str, Any] = {}
+        self.cycle: int = 0
+        self.alive = True
+        self.ready_ns = now_ns
+        self.streams_from_ns: int | None = None
+        self.sampled_ns = now_ns
+        self.random = np.random.default_rng([stage.options.seed, number, 1])
+        self._timers: dict[str, tuple[int, int]] = {}  # name -> next, period
+
+    def every(self, name: str, period_ns: int, first_ns: int) -> None:
+        """Start a timer that calls ``on_timer`` of the emulator with ``name``, first at ``first_ns``."""
+        self._timers[name] = first_ns, period_ns
+
+    def stop(self, name: str) -> None:
+        """Stop a timer. Idempotent."""
+        self._timers.pop(name, None)
+
+    def runs(self, name: str) -> bool:
+        """Return whether a timer runs."""
+        return name in self._timers
+
+    def clear(self) -> None:
+        """Forget everything, as without power."""
+        self.memory = {}
+        self._timers = {}
+        self.streams_from_ns = None
+
+    def next_event_ns(self) -> int | None:
+        """Return the time at which ``run`` has something to do."""
+        return min((next_ns for next_ns, _ in self._timers.values()), default=None)
+
+    def run(self, now_ns: int) -> None:
+        """Do what is due."""
+        for name, (next_ns, period_ns) in list(self._timers.items()):
+            if next_ns <= now_ns and name in self._timers:
+                self._timers[name] = next_ns + period_ns, period_ns
+                self.stage.on_timer(self, name, next_ns)
+
+    def skip_to(self, now_ns: int) -> int:
+        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
+        skipped = 0
+        for name, (next_ns, period_ns) in self._timers.items():
+            times = max(0, -((next_ns - now_ns) // period_ns))
+            self._timers[name] = next_ns + times * period_ns, period_ns
+            skipped += self.stage.skipped(self, name, times)
+        return skipped
 
 
 class _Scheduled(NamedTuple):
@@ -40,110 +116,152 @@ class _Scheduled(NamedTuple):
     action: Callable[[int], object]
 
 
-class Stage(ABC):
-    """Emulated devices on one bus, powered up by the first call that tells a time.
+class Stage(ABC, HasOptions[OptionsT]):
+    """Emulated devices on one bus, powered up by the first call that has a time.
 
     Args:
-        log: takes the :mod:`.events`; a list will do.
-        counted: names of the totals beside ``frames`` given by ``emit``, ``bursts`` of a device, ``commands`` that some
-            device obeyed or answered, ``silenced`` frames, and ``unheard`` frames of ``skip``.
+        options: of the devices and their faults.
+        log: receives the :mod:`.events`, for example a list.
 
     Attributes:
+        Options: class of the options; they become those of ``skin-emulate`` and of ``--bus virtual?...``.
+        medium: kind of bus.
+        numbers: of the devices.
+        numbered_by: name of the option that has these numbers, or the one number; empty: no option has them.
+        counted: names of the totals besides ``frames`` of ``emit``, ``bursts`` of devices, ``commands`` that a device
+            obeyed or answered, ``silenced`` frames, and ``unheard`` frames of ``skip``.
+        frame_faults: the damage that each option with a probability does to data frames.
+        longest_queue: frames that a device keeps for the wire; more are lost.
         wire: what the devices share.
-        log: where events go.
+        log: receives the events.
         counts: the totals.
         silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
+        devices: by number, once powered up.
     """
 
-    def __init__(self, log: EventLog | None, counted: Sequence[str]) -> None:
+    medium: ClassVar[str] = "can"
+    Options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    least_options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    options_command = "skin-emulate"
+    reserved_options = frozenset(("bus", "driver", "geometry", "help", "json", "log", "name", "namespace", "version"))
+    numbers: Sequence[int] = (0,)
+    numbered_by: ClassVar[str] = ""
+    counted: ClassVar[Sequence[str]] = ("lost", "repeated", "truncated", "corrupted", "foreign")
+    frame_faults: ClassVar[Mapping[str, FrameDamage]] = {
+        "lose": "lost",
+        "truncate": "truncated",
+        "corrupt": "corrupted",
+        "repeat": "repeated",
+    }
+    longest_queue: ClassVar[int] = 256
+
+    def __init__(self, options: OptionsT, *, log: EventLog | None = None) -> None:
+        HasOptions.__init__(self, options)
+        if self.numbered_by:
+            numbers = getattr(options, self.numbered_by)
+            self.numbers = numbers if isinstance(numbers, tuple) else (numbers,)
         self.wire: Wire = Wire()
         self.log: EventLog = _Unlogged() if log is None else log
-        self.counts: dict[str, int] = dict.fromkeys(
-            ("frames", "bursts", "commands", *counted, "silenced", "unheard"), 0
-        )
+        counted = ("frames", "bursts", "commands", *self.counted, "silenced", "unheard")
+        self.counts: dict[str, int] = dict.fromkeys(counted, 0)
         self.silent: set[str] = set()
+        self.devices: dict[int, Device] = {}
         self._actors: list[Actor] = []
         self._scheduled: list[_Scheduled] = []
         self._now_ns: int | None = None
         self._event_ns: int | None = None
+        for name in ("dead", "restart", "faulty"):
+            for number in getattr(options, name, ()):
+                if number not in self.numbers:
+                    known = ",".join(map(str, self.numbers))
+                    raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")
+
+    # A subclass defines these
 
     @abstractmethod
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
-        """Make the devices."""
+    def boot(self, device: Device, now_ns: int) -> None:
+        """Begin what a device does once it has power."""
 
     @abstractmethod
-    def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
-        """Let the devices hear a frame of the host; returns the addresses of those that obeyed or answered it."""
+    def on_timer(self, device: Device, name: str, time_ns: int) -> None:
+        """Do what a device does by itself when one of its timers is due."""
+
+    @abstractmethod
+    def kinds(self) -> Sequence[str]:
+        """Name the kinds of frames with data that the devices send, for the option ``silence``."""
+
+    @abstractmethod
+    def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:
+        """Return the identifiers of other devices on the bus, for the option ``foreign_hz``."""
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
+        """Take a command; return whether the device obeyed or answered. By default it knows none."""
+        return False
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Name the kind of a frame that a device sends, as the option ``silence`` does; by default its identifier."""
         return f"0x{identifier & _IDENTIFIER_MASK:03x}"
 
-    # EmulatedHardware
+    def make_device(self, number: int, now_ns: int) -> Device:
+        return Device(number, self, self.wire.attach(), now_ns)
 
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        """Take one frame from the bus. Frames that mean nothing to the devices are ignored."""
-        now_ns = self.run_to(now_ns)
-        obeyed = self.hear(identifier, payload, now_ns)
-        self.find_next_event()
-        if obeyed:
-            self.counts["commands"] += 1
-            self.log.append(
-                events.CommandReceived(time_ns=now_ns, identifier=identifier, payload=payload.hex(), boards=obeyed)
-            )
+    # A subclass may use these
 
-    def next_due_ns(self) -> int | None:
-        """When ``emit`` is worth calling again; None while all devices are silent."""
-        if self.wire.heard:
-            return self.wire.heard[0].time_ns
-        event_ns, start_ns = self._event_ns, self.wire.next_start_ns()
-        if event_ns is None or start_ns is None:
-            return start_ns if event_ns is None else event_ns
-        return min(event_ns, start_ns)
+    def reply(self, device: Device, frame: tuple[int, bytes], now_ns: int) -> None:
+        """Send one frame besides the data."""
+        self.check_frame(frame)
+        device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        """The frames that began by ``now_ns`` and were not given before, oldest first."""
-        self.run_to(now_ns)
-        frames, self.wire.heard = self.wire.heard, []
-        if self.silent:
-            spoken = [frame for frame in frames if self.kind_of(frame.identifier, frame.payload) not in self.silent]
-            self.counts["silenced"] += len(frames) - len(spoken)
-            frames = spoken
-        self.counts["frames"] += len(frames)
-        return frames
+    def send_burst(
+        self,
+        device: Device,
+        identifiers: Sequence[int],
+        payloads: Sequence[bytes],
+        time_ns: int,
+        *,
+        usual: bool = False,
+    ) -> None:
+        """Hand the frames of a burst to the wire; faults happen here.
 
-    def skip(self, now_ns: int) -> int:
-        """Let the devices run on with nobody listening; returns the number of frames that went unheard."""
-        unheard = 0
-        if self._now_ns is not None and now_ns - self._now_ns > _LONGEST_CATCH_UP_NS:
-            self.wire.run(now_ns - _LONGEST_CATCH_UP_NS)
-            unheard += sum(actor.skip_to(now_ns - _LONGEST_CATCH_UP_NS) for actor in self._actors)
-            self.find_next_event()
-        self.run_to(now_ns)
-        unheard += len(self.wire.heard)
-        self.wire.heard = []
-        self.counts["unheard"] += unheard
-        return unheard
-
-    def totals(self) -> dict[str, int]:
-        """Exact counts since power-up."""
-        return dict(self.counts)
-
-    # For those who make devices
-
-    def plan_silence(self, kinds: Collection[str], known: Collection[str], after_s: float, now_ns: int) -> None:
-        """Stop frames of these kinds, at a time from now.
-
-        Raises:
-            ConfigurationError: the devices send no frames of such a kind.
+        Args:
+            device: that sends them.
+            identifiers: of the frames.
+            payloads: of the frames.
+            time_ns: when they are ready, unless the option ``jitter_us`` delays them.
+            usual: all have 8 bytes and 11-bit identifiers.
         """
-        for kind in kinds:
-            if kind not in known:
-                raise ConfigurationError(f"option silence: {kind!r} is no kind of frame; there are {_shortened(known)}")
-        self.schedule(now_ns + round(after_s * 1e9), lambda _: self.silent.update(kinds))
+        ready_ns = time_ns + self._delay_ns(device, time_ns)
+        chances = [getattr(self.options, name) for name in self.frame_faults]
+        lost: set[int] = set()
+        if any(chances) or len(device.transmitter) + len(identifiers) > self.longest_queue:
+            identifiers, payloads, lost = self._with_faults(device, identifiers, payloads, time_ns, chances)
+            usual = usual and all(len(payload) == 8 for payload in payloads)
+        if identifiers:
+            burst = Transmission(ready_ns, identifiers, payloads, lost, usual=usual, cycle=device.cycle)
+            device.transmitter.queue.append(burst)
+        device.cycle += 1
+        self.counts["bursts"] += 1
+
+    def lose_power_for_a_moment(self, device: Device, now_ns: int) -> None:
+        """Restart a device, as a command may do."""
+        self._lose_power(device, now_ns, "restarted")
+        ready_ns = now_ns + round(self.options.boot_s * 1e9)
+        self.log.append(Event("board_restarted", now_ns, board=device.number, ready_ns=ready_ns))
+        device.alive, device.ready_ns = True, ready_ns
+
+        def boot(time_ns: int) -> None:
+            if device.alive and device.ready_ns == ready_ns:  # else it lost its power again
+                self.boot(device, time_ns)
+
+        self.schedule(ready_ns, boot)
+
+    def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
+        """Call ``action`` with the time when it has come."""
+        self._scheduled.append(_Scheduled(time_ns, action))
+        self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
 
     def run_to(self, now_ns: int) -> int:
-        """Bring everything to ``now_ns``, in order of time; returns the time that holds."""
+        """Bring everything to ``now_ns``, in order of time; return the time that holds, which never goes back."""
         if self._now_ns is None:
             self._now_ns = now_ns
             self._actors = list(self.power_up(now_ns))
@@ -162,24 +280,225 @@ class Stage(ABC):
             self.find_next_event()
 
     def find_next_event(self) -> None:
-        """To be called whenever a device may have changed its mind about when it has something to do."""
+        """Look up the next event again, after a device may have changed its timers."""
         times_ns = [time_ns for actor in self._actors if (time_ns := actor.next_event_ns()) is not None]
         if self._scheduled:
             times_ns.append(self._scheduled[0].time_ns)
         self._event_ns = min(times_ns, default=None)
 
-    def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
-        self._scheduled.append(_Scheduled(time_ns, action))
-        self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
+    # Faults at a moment of the caller's choice
 
+    def kill(self, number: int, now_ns: int) -> None:
+        """Make a device fall silent and deaf for good; frames that wait for the wire are lost.
 
-def _shortened(names: Collection[str]) -> str:
-    listed = list(names)
-    return ", ".join(listed if len(listed) <= _MOST_LISTED else [*listed[:_MOST_LISTED], "..."])
+        Raises:
+            ConfigurationError: there is no such device.
+        """
+        now_ns = self.run_to(now_ns)
+        self.die(self.device(number), now_ns)
+        self.find_next_event()
+
+    def restart(self, number: int, now_ns: int) -> None:
+        """Cut a device's power for a moment (a dead one lives again): it forgets its settings and is deaf for a while.
+
+        Raises:
+            ConfigurationError: there is no such device.
+        """
+        now_ns = self.run_to(now_ns)
+        self.lose_power_for_a_moment(self.device(number), now_ns)
+        self.find_next_event()
+
+    # EmulatedHardware
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        """Take one frame from the bus. Frames that mean nothing to the devices are ignored."""
+        now_ns = self.run_to(now_ns)
+        obeyed = [
+            number
+            for number, device in [(device.number, device) for device in self.devices.values()]
+            if device.alive and now_ns >= device.ready_ns and self.obey(device, identifier, payload, now_ns)
+        ]
+        self.find_next_event()
+        if obeyed:
+            self.counts["commands"] += 1
+            command = payload.hex()
+            self.log.append(Event("command_received", now_ns, identifier=identifier, payload=command, boards=obeyed))
+
+    def next_due_ns(self) -> int | None:
+        """Return when ``emit`` is worth calling again; None while all devices are silent."""
+        if self.wire.heard:
+            return self.wire.heard[0].time_ns
+        event_ns, start_ns = self._event_ns, self.wire.next_start_ns()
+        if event_ns is None or start_ns is None:
+            return start_ns if event_ns is None else event_ns
+        return min(event_ns, start_ns)
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        """Return the frames that began by ``now_ns`` and were not returned before, oldest first."""
+        self.run_to(now_ns)
+        frames, self.wire.heard = self.wire.heard, []
+        if self.silent:
+            spoken = [frame for frame in frames if self.kind_of(frame.identifier, frame.payload) not in self.silent]
+            self.counts["silenced"] += len(frames) - len(spoken)
+            frames = spoken
+        self.counts["frames"] += len(frames)
+        return frames
+
+    def skip(self, now_ns: int) -> int:
+        """Let the devices run on without a listener; return the number of frames that went unheard."""
+        unheard = 0
+        if self._now_ns is not None and now_ns - self._now_ns > _LONGEST_CATCH_UP_NS:
+            self.wire.run(now_ns - _LONGEST_CATCH_UP_NS)
+            unheard += sum(actor.skip_to(now_ns - _LONGEST_CATCH_UP_NS) for actor in self._actors)
+            self.find_next_event()
+        self.run_to(now_ns)
+        unheard += len(self.wire.heard)
+        self.wire.heard = []
+        self.counts["unheard"] += unheard
+        return unheard
+
+    def totals(self) -> dict[str, int]:
+        """Return exact counts since power-up."""
+        return dict(self.counts)
+
+    # Within
+
+    def power_up(self, now_ns: int) -> Sequence[Actor]:
+        """Make the devices and everything else on the bus.
+
+        Raises:
+            ConfigurationError: the option ``silence`` names a kind of frame that does not exist.
+        """
+        options = self.options
+        for number in self.numbers:
+            self.devices[number] = self.make_device(number, now_ns)
+        for device in self.devices.values():
+            self.boot(device, now_ns)
+        for number in self.dying():
+            self.schedule(now_ns + round(options.dead_after_s * 1e9), partial(self.die, self.devices[number]))
+        for number in options.restart:
+            restart = partial(self.lose_power_for_a_moment, self.devices[number])
+            self.schedule(now_ns + round(options.restart_after_s * 1e9), restart)
+        known = self.kinds()
+        for kind in options.silence:
+            if kind not in known:
+                listed = ", ".join([*known[:_MOST_LISTED], *(["..."] if len(known) > _MOST_LISTED else [])])
+                raise ConfigurationError(f"option silence: {kind!r} is no kind of frame; there are {listed}")
+        silence_ns = now_ns + round(options.silence_after_s * 1e9)
+        self.schedule(silence_ns, lambda _: self.silent.update(options.silence))
+        actors: list[Actor] = [*self.devices.values()]
+        if options.foreign_hz:
+            random = np.random.default_rng([options.seed, 2])
+            identifiers, place = self.foreign_identifiers(random), self.wire.attach()
+            actors.append(ForeignTraffic(identifiers, options.foreign_hz, random, place, self.log, self.counts, now_ns))
+        return actors
+
+    def dying(self) -> Sequence[int]:
+        """Return the devices that die at the time of the option ``dead_after_s``."""
+        return self.options.dead
+
+    def device(self, number: int) -> Device:
+        for device in self.devices.values():
+            if device.number == number:
+                return device
+        known = ",".join(str(device.number) for device in self.devices.values())
+        raise ConfigurationError(f"there is no emulated device {number}; there are {known}")
+
+    def die(self, device: Device, now_ns: int) -> None:
+        self._lose_power(device, now_ns, "died")
+        self.log.append(Event("board_died", now_ns, board=device.number))
+
+    def check_frame(self, frame: tuple[int, bytes]) -> None:
+        """Refuse a frame that the medium cannot carry."""
+
+    def skipped(self, device: Device, name: str, times: int) -> int:
+        """Count what a timer would have done ``times``; return how many frames that would have been."""
+        if name == DATA:
+            device.cycle += times
+            self.counts["bursts"] += times
+        return times
+
+    def spoil(self, fault: FrameDamage, payload: bytes, random: np.random.Generator) -> bytes:
+        """Return the payload of a frame after its fault."""
+        if fault == "truncated":
+            return payload[: int(random.integers(0, max(1, len(payload))))]
+        return random.bytes(len(payload)) if fault == "corrupted" else payload
+
+    def note_fault(
+        self,
+        device: Device,
+        time_ns: int,
+        where: tuple[int, int],
+        frame: tuple[int, bytes],
+        fault: FrameDamage,
+        reason: str,  # noqa: ARG002
+    ) -> None:
+        """Count and log a fault of a frame at ``where``: cycle, and position in the burst."""
+        self.counts["lost" if fault == "unsent" else fault] += 1
+        (cycle, position), (identifier, payload) = where, frame
+        self.log.append(
+            Event(
+                "frame_fault",
+                time_ns,
+                board=device.number,
+                cycle=cycle,
+                position=position,
+                identifier=identifier,
+                fault=fault,
+                payload=payload.hex(),
+            )
+        )
+
+    def _delay_ns(self, device: Device, time_ns: int) -> int:
+        if not self.options.jitter_us:
+            return 0
+        delay_ns = int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
+        if delay_ns:
+            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+            self.log.append(late)
+        return delay_ns
+
+    def _with_faults(
+        self,
+        device: Device,
+        identifiers: Sequence[int],
+        payloads: Sequence[bytes],
+        time_ns: int,
+        chances: Sequence[float],
+    ) -> tuple[list[int], list[bytes], set[int]]:
+        """Return the frames that go to the wire, and the positions of those that take their time there and are lost."""
+        faults = list(self.frame_faults.values())
+        hit = device.random.random((len(identifiers), len(faults))) < chances
+        sent_as: list[int] = []
+        sent: list[bytes] = []
+        lost: set[int] = set()
+        for position, (identifier, whole) in enumerate(zip(identifiers, payloads, strict=True)):
+            fault: FrameDamage | None = faults[int(hit[position].argmax())] if hit[position].any() else None
+            if len(device.transmitter) + len(sent_as) >= self.longest_queue:
+                fault = "unsent"
+            payload = whole
+            if fault is not None:
+                payload = self.spoil(fault, whole, device.random)
+                reason = "overflow" if fault == "unsent" else "random"
+                self.note_fault(device, time_ns, (device.cycle, position), (identifier, payload), fault, reason)
+            if fault == "lost":
+                lost.add(len(sent_as))
+            times = {"unsent": 0, "repeated": 2}.get(fault or "", 1)
+            sent_as += [identifier] * times
+            sent += [payload] * times
+        return sent_as, sent, lost
+
+    def _lose_power(self, device: Device, now_ns: int, reason: str) -> None:
+        device.alive = False
+        for burst in device.transmitter.queue:
+            for at in range(burst.sent, len(burst.identifiers)):
+                if burst.cycle >= 0 and at not in burst.lost:
+                    frame = burst.identifiers[at], burst.payloads[at]
+                    self.note_fault(device, now_ns, (burst.cycle, at), frame, "unsent", reason)
+        device.transmitter.queue.clear()
+        device.clear()
 
 
 class _Unlogged:
-    """The log of those who want none."""
-
-    def append(self, event: msgspec.Struct) -> None:
-        """Forget the event."""
+    def append(self, event: Event) -> None:
+        """Drop the event."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from skinware_drivers.virtual import events
-from skinware_drivers.virtual.events import Half
+from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.hardware import EventLog, WireFrame
 
 _EXTENDED_FLAG = 0x8000_0000
@@ -18,13 +17,13 @@ _BIT_NS, _NS_PER_S = 1000, 1_000_000_000
 """1 Mbit/s (icub-main:src/libraries/icubmod/canBusSkin/CanBusSkin.cpp)."""
 
 _wire_frame = partial(tuple.__new__, WireFrame)
-"""Makes a WireFrame of a tuple at a third of the cost."""
+"""Make a WireFrame of a tuple at a third of the cost."""
 
 
 def frame_time_ns(identifier: int, length: int) -> int:
-    """How long a frame occupies the wire, with an ordinary number of stuff bits (ISO 11898-1).
+    """Return how long a frame occupies the wire at 1 Mbit/s, with an ordinary number of stuff bits (ISO 11898-1).
 
-    130 us for eight bytes under an 11-bit identifier.
+    A frame of eight bytes with an 11-bit identifier takes 130 us.
     """
     overhead, stuffed = (67, 54) if identifier & _EXTENDED_FLAG else (47, 34)
     return (overhead + 8 * length + (stuffed + 8 * length - 1) // 5) * _BIT_NS
@@ -41,10 +40,10 @@ class Transmission:
         ready_ns: when the first of them can go.
         identifiers: of each frame.
         payloads: of each frame.
-        lost: positions of frames that take their time on the wire, but that nobody hears.
+        lost: positions of frames that take their time on the wire without being heard.
         usual: all have 8 bytes and 11-bit identifiers.
-        cycle: the burst that this is; -1 if it is none. The frames of a burst are HEAD, TAIL, HEAD ...
-        sent: how many have gone.
+        cycle: number of the burst; -1 if this is none.
+        sent: frames that have gone.
     """
 
     ready_ns: int
@@ -57,13 +56,6 @@ class Transmission:
 
     def __len__(self) -> int:
         return len(self.identifiers) - self.sent
-
-    def unsent_halves(self) -> Iterator[tuple[int, Half]]:
-        """(triangle, half) of the frames of a burst that still wait and would be heard."""
-        if self.cycle >= 0:
-            for position in range(self.sent, len(self.identifiers)):
-                if position not in self.lost:
-                    yield self.identifiers[position] & 0xF, "tail" if position % 2 else "head"
 
 
 class Transmitter:
@@ -81,7 +73,7 @@ class Wire:
 
     Attributes:
         transmitters: all devices.
-        heard: frames that went over the wire and were not taken away yet, oldest first.
+        heard: frames that went over the wire and were not fetched yet, oldest first.
         speed: in Mbit/s.
     """
 
@@ -106,12 +98,12 @@ class Wire:
         return transmitter
 
     def next_start_ns(self) -> int | None:
-        """When the next frame begins; None while nothing waits."""
+        """Return the time at which the next frame begins; None while none waits."""
         ready_ns = [transmitter.queue[0].ready_ns for transmitter in self.transmitters if transmitter.queue]
         return max(self._free_ns, min(ready_ns)) if ready_ns else None
 
     def run(self, until_ns: int) -> None:
-        """Send everything that begins before ``until_ns``, under the assumption that nothing more is queued."""
+        """Send the frames that begin before ``until_ns``, assuming that no more are queued."""
         while True:
             waiting = [transmitter.queue for transmitter in self.transmitters if transmitter.queue]
             if not waiting:
@@ -151,7 +143,7 @@ class Wire:
 
 
 def _next_in_arbitration(queue: deque[Transmission]) -> int:
-    """Sorts as the wire does: 11 bits decide first, then a standard frame wins over an extended one."""
+    """Return a key that sorts as the wire does: by 11 bits first, then a standard frame before an extended one."""
     transmission = queue[0]
     identifier = transmission.identifiers[transmission.sent]
     if identifier & _EXTENDED_FLAG:
@@ -160,14 +152,14 @@ def _next_in_arbitration(queue: deque[Transmission]) -> int:
 
 
 class ForeignTraffic:
-    """Devices that send at random moments, ``rate_hz`` frames a second on average.
+    """Other devices, which send at random moments, ``rate_hz`` frames a second on average.
 
     Args:
         identifiers: of their frames.
         rate_hz: more than 0.
-        random: all chance comes from here.
-        transmitter: place on the wire.
-        log: takes the events.
+        random: the source of chance.
+        transmitter: their place on the wire.
+        log: receives the events.
         counts: totals, of which ``foreign`` is counted.
         now_ns: when the devices begin.
     """
@@ -201,11 +193,11 @@ class ForeignTraffic:
             payload = self._random.bytes(int(self._random.integers(0, 8, endpoint=True)))
             self._transmitter.queue.append(Transmission(self._next_ns, [identifier], [payload]))
             self._counts["foreign"] += 1
-            self._log.append(events.ForeignFrame(time_ns=self._next_ns, identifier=identifier, length=len(payload)))
+            self._log.append(Event("foreign_frame", self._next_ns, identifier=identifier, length=len(payload)))
             self._wait()
 
     def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; returns how many frames that would have been, on average."""
+        """Leave out what is due before ``now_ns``; return how many frames that would have been, on average."""
         missed_ns = now_ns - self._next_ns
         if missed_ns <= 0:
             return 0

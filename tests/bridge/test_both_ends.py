@@ -10,7 +10,7 @@ import pytest
 from skinware import DriverReader, DriverWriter, Skin
 from skinware.bridge.link import Question
 from skinware.bridge.messages import FrameMessage, split_frame
-from skinware.bridge.streaming import Stream
+from skinware.bridge.streaming import FrameStream
 from skinware.errors import Paused, PeerGone, RequestError, RequestFailed, RequestRefused, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
@@ -140,7 +140,7 @@ def test_each_of_several_open_questions_has_a_frame_of_its_own(namespace: Namesp
     class NoSender:
         is_heard = False
 
-    stream = Stream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
+    stream = FrameStream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
     with driver(namespace) as writer, ServiceReader[Sample]("arm", namespace=namespace) as reader:
         publish(writer)
         first = reader.read()

@@ -33,7 +33,7 @@ from skinware.bridge.messages import (
 )
 from skinware.bridge.mirror import MemoryBudget
 from skinware.bridge.peer import Jobs
-from skinware.bridge.streaming import Stream
+from skinware.bridge.streaming import FrameStream
 from skinware.bridge.watching import Watcher
 from skinware.errors import BridgeError, RequestError
 from skinware.memory.namespace import Namespace
@@ -283,7 +283,7 @@ class NoSender:
 
 
 def test_pullers_and_their_questions_are_bounded() -> None:
-    stream = Stream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
+    stream = FrameStream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
     many = [Asked(who=f"w{number}") for number in range(500)]
     for question in many:
         stream.asked(question.question)

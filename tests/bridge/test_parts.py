@@ -27,7 +27,7 @@ from skinware.bridge.messages import (
     split_generation,
 )
 from skinware.bridge.pacing import Pacing
-from skinware.bridge.parts import Head
+from skinware.bridge.parts import ServiceFile
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
@@ -247,7 +247,7 @@ def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
                 expected = FrameMessage(CODED, frame.generation, memoryview(coded), keeps)
                 assert split_frame(coded_message(coded, keeps)) == expected
     about = About({"tare": "Take the present load as none."})
-    head = Head("arm", b"head" * 1000)
+    head = ServiceFile("arm", b"head" * 1000)
     assert split_generation(generation_message(about, head.packed)) == (about, head.raw)
     assert head.packed is head.packed, "it is packed once for all who ask"
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import click
-import msgspec
 import pytest
 
 from skinware import Namespace
@@ -18,6 +17,7 @@ from skinware_drivers.can import roboskin, roboskin_boards
 from skinware_drivers.cli.config import command
 from skinware_drivers.finding import running, without_driver
 from skinware_drivers.finding.running import RunningDriver, driver_on, running_drivers, same_bus
+from skinware_drivers.virtual.events import Event
 from tests.finding.fakes import see_only
 from tests.sdk.driving import commands, driving, emulated
 
@@ -86,7 +86,7 @@ def test_a_person_is_asked_before_anything_is_changed(capsys: pytest.CaptureFixt
     person.append(False)
     assert "nothing was changed" in configured(capsys, VIRTUAL, "rebaseline", status=1)
     configured(capsys, VIRTUAL, "rebaseline")
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7,))):
         before = len(commands(log))
         person.append(False)
@@ -103,7 +103,7 @@ def test_a_script_must_say_yes(capsys: pytest.CaptureFixture[str], monkeypatch: 
 
 
 def test_a_running_drivers_bus_is_set_up_through_the_driver(capsys: pytest.CaptureFixture[str]) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7, 8)), emulated(boards=(9,))):
         before = len(commands(log))
         data = configured_data(capsys, "bus0", "rebaseline", "patch=board 8", "--yes")

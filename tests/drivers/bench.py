@@ -10,7 +10,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import msgspec
 import numpy as np
 
 from skinware import Status
@@ -21,9 +20,9 @@ from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
 from skinware_drivers.polling import Notice
+from skinware_drivers.virtual import Emulator
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.emulator import Emulator
-from skinware_drivers.virtual.events import FrameFault
+from skinware_drivers.virtual.events import Event
 
 MS = 1_000_000
 EXAMPLE_EDS = Path(str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds"))
@@ -80,7 +79,7 @@ class Case:
     def adapter(self) -> AnyAdapter:
         return self.driver(self.driver.Options(**self.options))
 
-    def devices(self, log: list[msgspec.Struct] | None = None, **faults: Any) -> Emulator[Any]:
+    def devices(self, log: list[Event] | None = None, **faults: Any) -> Emulator[Any]:
         options = self.emulator.Options(**self.emulated, **faults)
         return self.emulator(options, log=log, source=self.felt)
 
@@ -103,7 +102,7 @@ class Bench:
 
     def __init__(self, case: Case, **faults: Any) -> None:
         self.case = case
-        self.log: list[msgspec.Struct] = []
+        self.log: list[Event] = []
         loop = asyncio.get_running_loop()
         assert isinstance(loop, BenchLoop)
         self._loop = loop
@@ -195,8 +194,8 @@ class Bench:
             return int(state.bus_counters[0, BUS_COUNTERS.index(name)])
         return int(state.patch_counters[:, PATCH_COUNTERS.index(name)].sum())
 
-    def faults(self, kind: str = "") -> list[FrameFault]:
-        return [e for e in self.log if isinstance(e, FrameFault) and kind in ("", e.fault)]
+    def faults(self, kind: str = "") -> list[Event]:
+        return [e for e in self.log if e.event == "frame_fault" and kind in ("", e.fault)]
 
     @property
     def attends(self) -> bool:

@@ -19,9 +19,7 @@ from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 NODES = (3, 0xC8)
 PERIOD_S = 0.02

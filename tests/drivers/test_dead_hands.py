@@ -12,6 +12,7 @@ from skinware.status import Status
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.virtual import Emulator
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5, EmulatedAllegroV5Tips
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
@@ -20,7 +21,6 @@ from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.xela import EmulatedXelaServer
-from skinware_drivers.virtual.emulator import Emulator
 
 pytestmark = pytest.mark.usefixtures("namespace")
 

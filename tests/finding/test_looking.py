@@ -1,4 +1,4 @@
-"""Listening and asking, on emulated boards: who is found, and what is (not) sent to whom."""
+"""Listening and asking, on emulated boards: the boards that are found, and the frames that are sent."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import pytest
 
 from skinware.errors import BusNotAvailable, HandshakeTimeout
@@ -35,6 +34,7 @@ from skinware_drivers.virtual.devices.allegro_v5 import (
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
+from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.hardware import EmulatedHardware
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -63,13 +63,13 @@ def asked_on(bus: Bus, monkeypatch: pytest.MonkeyPatch, **how: Any) -> Answer:
     return asyncio.run(ask(heard, DRIVERS, **how))
 
 
-def sent(log: list[msgspec.Struct]) -> set[int]:
+def sent(log: list[Event]) -> set[int]:
     """Identifiers that boards reacted to."""
     return {identifier for _, identifier, _ in commands(log)}
 
 
 def test_streaming_boards_are_heard_and_nothing_is_sent() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), streaming=True)
     heard = heard_on(bus)
     assert [(one.driver, one.patches) for one in heard.guesses] == [("roboskin", ("board 7", "board 8"))]
@@ -96,7 +96,7 @@ def test_the_load_is_as_the_bus_counts_it_while_it_is_heard() -> None:
 
 
 def test_live_boards_are_asked_one_by_one_and_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(8,), streaming=True)
     answer = asked_on(bus, monkeypatch)
     assert answer.answers == {"roboskin": "ROBOSKIN: board 7 (mtb4 1.25.0), board 8 (mtb 2.10.14)"}
@@ -105,7 +105,7 @@ def test_live_boards_are_asked_one_by_one_and_go_on(monkeypatch: pytest.MonkeyPa
 
 
 def test_force_sends_the_discovery_that_silences(monkeypatch: pytest.MonkeyPatch) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(8,), streaming=True)
     answer = asked_on(bus, monkeypatch, force=True)
     assert "board 8 (mtb 2.10.14)" in answer.answers["roboskin"]
@@ -114,7 +114,7 @@ def test_force_sends_the_discovery_that_silences(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_silent_bus_is_asked_by_discovery(monkeypatch: pytest.MonkeyPatch) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     answer = asked_on(emulated(log, boards=(3, 12)), monkeypatch)
     assert answer.answers == {"roboskin": "ROBOSKIN: board 3 (mtb4 1.25.0), board 12 (mtb4 1.25.0)"}
     assert sent(log) == {DISCOVERY}
@@ -137,7 +137,7 @@ def test_a_bus_of_strangers_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_bus_that_a_driver_has_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     answer = asked_on(emulated(log), monkeypatch, owner="driver 'torso'")
     assert answer.refused.startswith("driver 'torso' has it")
     assert commands(log) == []

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import pytest
 
 from skinware.errors import BusError, BusSendError, ConfigurationError, HandshakeTimeout
@@ -17,6 +16,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.finding import without_driver
 from skinware_drivers.finding.without_driver import carry_out
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 
 MTB4 = {"type": "mtb4", "runs": "application", "firmware": "1.25.0", "protocol": "2.0"}
@@ -36,7 +36,7 @@ def done(bus: VirtualCanBus, operation: str, how: dict[str, Any] | None = None, 
     return asyncio.run(carry_out(bus, "bus", adapter, operation, arguments, **how or {}))
 
 
-def told(log: list[msgspec.Struct]) -> list[tuple[int, str]]:
+def told(log: list[Event]) -> list[tuple[int, str]]:
     return [(identifier, payload.upper()) for _, identifier, payload in commands(log)]
 
 
@@ -45,7 +45,7 @@ def test_versions_of_a_silent_bus() -> None:
 
 
 def test_versions_of_a_live_bus_disturb_nobody() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(8,), streaming=True)
     found = done(bus, "versions")
     assert found["7"] == MTB4
@@ -59,7 +59,7 @@ def test_nobody_there_has_no_versions() -> None:
 
 
 def test_an_address_is_moved_and_checked() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     agreed: list[Sequence[Patch]] = []
     bus = emulated(log, boards=(7, 8))
     moved = done(bus, "set_address", {"agree": agreed.append}, address=9, patch="board 7")
@@ -87,7 +87,7 @@ def test_the_only_board_need_not_be_named() -> None:
     ],
 )
 def test_addresses_that_cannot_be_are_refused_before_anything_is_told(arguments: dict[str, Any], words: str) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with pytest.raises(ConfigurationError, match=words):
         done(emulated(log, boards=(7, 8)), "set_address", **arguments)
     assert not [payload for _, payload in told(log) if payload.startswith("32")]
@@ -134,14 +134,14 @@ def test_a_board_without_skin_keeps_its_address() -> None:
 
 
 def test_what_was_silent_is_silent_again() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7,))
     assert done(bus, "rebaseline") is None
     assert [payload for _, payload in told(log)] == ["FF", "4D0032F0", "50000F02010022", "0700", "0701"]
 
 
 def test_a_bus_on_which_boards_send_is_not_touched_without_force() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7,), streaming=True)
     with pytest.raises(ConfigurationError, match="another program may be using the bus"):
         done(bus, "rebaseline")
@@ -154,7 +154,7 @@ def test_who_does_not_agree_changes_nothing() -> None:
     def refuse(_patches: object) -> None:
         raise BusError("never mind")
 
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with pytest.raises(BusError, match="never mind"):
         done(emulated(log, boards=(7,)), "rebaseline", {"agree": refuse})
     assert [payload for _, payload in told(log)] == ["FF"]

@@ -13,7 +13,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.master import ANSWERS, Listener, Talk
 from skinware_drivers.modbus.registers import Registers, Row, Wanted
 from skinware_drivers.modbus.wire import Message
-from skinware_drivers.virtual.recorded_modbus import Conversation as RecordedConversation
+from skinware_drivers.virtual.recorded import Conversation as RecordedConversation
 from tests.modbus.conversation import (
     MS,
     ONE,
@@ -424,7 +424,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_cycle_is_not_torn(begins: in
                 continue
             message = Message(1, data, number + 1)
             frame = wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
-            recorded.heard(frame, (1000 + 20 * cycle + address // 125) * MS, is_sent=is_sent)
+            recorded.take(frame, (1000 + 20 * cycle + address // 125) * MS, is_sent=is_sent)
         found += [np.frombuffer(row.payload, ">u2") for row in recorded.rows]
         recorded.rows.clear()
     assert all((row == row[0]).all() for row in found)

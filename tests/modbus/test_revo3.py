@@ -17,8 +17,8 @@ from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options, places
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import driving_lines, emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
-from skinware_drivers.virtual.emulator import Device
 from tests.modbus.peers import Action, rtu_server
 from tests.modbus.peers import device as server_device
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
@@ -214,10 +214,10 @@ def test_a_hand_that_does_not_say_its_mapping_is_refused_until_an_option_says_it
 
 
 class Fingertips(EmulatedRevo3):
-    """Of forces and torques, says its maker's program."""
+    """A hand of forces and torques, by its maker's program."""
 
-    def _said(self, device: Device) -> dict[int, int]:
-        return {**super()._said(device), 135: 3}
+    def _settings(self, device: Device) -> dict[int, int]:
+        return {**super()._settings(device), 135: 3}
 
 
 def test_a_family_that_is_not_read_is_refused_by_its_number(caplog: Any) -> None:

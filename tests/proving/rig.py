@@ -23,10 +23,8 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.proof import Proof
 from skinware_drivers.proving.walk import Manner, Step, walk
 from skinware_drivers.testing.driving import driving_lines
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
 
 NAMES = ("index tip", "middle tip")
 ROWS, COLUMNS = 4, 6
@@ -60,7 +58,7 @@ class Hand(CanAdapter[NoOptions]):
 
 
 class TaringHand(Hand):
-    """One that can be told to tare.
+    """A hand that can tare.
 
     Attributes:
         on_tare: does it.
@@ -70,7 +68,7 @@ class TaringHand(Hand):
 
     @operation()
     async def tare(self, link: Link, patches: object) -> None:
-        """Take what is felt now for nothing."""
+        """Take the present values as zero."""
         self.on_tare()
 
 
@@ -111,7 +109,7 @@ class EmulatedHand(Emulator[EmulatorOptions]):
 
 @dataclass
 class PressingPerson:
-    """Does at once what it is asked for, but for what it does not want.
+    """Do each step at once, without those to skip or ignore.
 
     Attributes:
         skipped: modules that it leaves out.

@@ -274,14 +274,14 @@ def wanted(structure: Structure, number: int) -> npt.NDArray[np.int64]:
         (Selection(types=["force"]), "no sensor type 'force'; there are: pressure, temperature"),
         (Selection(patches=["board 1"]), "no patch 'board 1'; there are: board 7, board 8"),
         (Selection(in_regions=["palm"]), "no region 'palm'; there are: none"),
-        (Selection(["pose"], types=["pressure"]), "no sensor in it is of what was asked for"),
+        (Selection(["pose"], types=["pressure"]), "no sensor in it is selected"),
     ],
 )
 def test_what_there_is_not_is_one_line(path: Path, tmp_path: Path, selection: Selection, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words) as raised:
         convert(path, tmp_path / "x.npz", "npz", selection)
     assert "\n" not in str(raised.value)
-    with pytest.raises(ConfigurationError, match="nothing was recorded of what was asked for in that time"):
+    with pytest.raises(ConfigurationError, match="no sample of the selection was recorded in that time"):
         convert(path, tmp_path / "x.npz", "npz", start_s=1e5)
     assert list(tmp_path.iterdir()) == [path]
 
@@ -403,7 +403,7 @@ def test_what_went_over_wires_is_said_to_be_left_out(
 ) -> None:
     monkeypatch.setattr(Recording, "wires", (object(),))
     converted = convert(path, tmp_path / "x.npz", "npz")
-    assert converted.notes == [f"{path}: what went over wires is left out: candump and pcapng have it"]
+    assert converted.notes == [f"{path}: wires are left out: convert them to candump or pcapng"]
 
 
 @pytest.mark.parametrize(

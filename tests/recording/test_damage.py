@@ -126,8 +126,8 @@ def test_frames_without_their_generation_are_left_out_and_told(original: Origina
     file.write_bytes(data)
     with skinware.recording.open(file) as opened:
         assert list(opened["torso"].frames()) == []
-        assert "frames of 'torso' left out: what they are made of is lost" in opened.problems
-        with pytest.raises(BadRecording, match="what the frames of 'torso' are made of is lost"):
+        assert "samples of 'torso' left out: their description is lost" in opened.problems
+        with pytest.raises(BadRecording, match="the description of the samples of 'torso' is lost"):
             opened["torso"].read()
 
 

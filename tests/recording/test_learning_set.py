@@ -374,10 +374,10 @@ def joined(tmp_path: Path, text: str, name: str = "joints.csv", feature: str = "
 
 
 def test_times_that_do_not_overlap(made: Made, tmp_path: Path) -> None:
-    words = r"no time in it has everything .* torso from 0\.000 to 1\.990 s, .*joints\.csv from 50\.000 to 51\.000 s"
+    words = r"no time in it has all the data .* torso from 0\.000 to 1\.990 s, .*joints\.csv from 50\.000 to 51\.000 s"
     with pytest.raises(ConfigurationError, match=words):
         learn(made, joined(tmp_path, "time_s,a\n50,1\n51,2\n"))
-    with pytest.raises(ConfigurationError, match=r"no time in the episode 5\.\.6 has everything"):
+    with pytest.raises(ConfigurationError, match=r"no time in the episode 5\.\.6 has all the data"):
         learn(made, LearningSet(intervals=[Interval(5, 6)]))
 
 
@@ -459,7 +459,7 @@ def test_several_recordings_that_do_not_fit(made: Made, tmp_path: Path) -> None:
         learn([made.path, arm.path])
     with pytest.raises(ConfigurationError, match=r"joints.csv: time_s is of one recording: with several, give time_ns"):
         learn([made.path, others.path], joined(tmp_path, "time_s,a\n0,1\n2,1\n"))
-    with pytest.raises(ConfigurationError, match=r"the episode 0\.\.1 does not tell of which recording"):
+    with pytest.raises(ConfigurationError, match=r"the episode 0\.\.1 does not name its recording"):
         learn([made.path, others.path], LearningSet(intervals=[Interval(0, 1)]))
     with pytest.raises(ConfigurationError, match=r"of 'x': that is not the name of one of the recordings"):
         learn(made, LearningSet(intervals=[Interval(0, 1, None, "x")]))
@@ -467,7 +467,7 @@ def test_several_recordings_that_do_not_fit(made: Made, tmp_path: Path) -> None:
 
 def test_clocks_that_are_not_told(tmp_path: Path) -> None:
     made = write(tmp_path / "walk.mcap", table_of("torso", fake_structure(1, 1), range(100)))
-    with pytest.raises(ConfigurationError, match=r"does not tell both clocks: .*joints.csv needs time_ns or unix_s"):
+    with pytest.raises(ConfigurationError, match=r"has no readings of clocks: .*joints.csv needs time_ns or unix_s"):
         learn(made, joined(tmp_path, f"monotonic_ns,a\n{MONOTONIC_NS},1\n"))
 
 
@@ -617,7 +617,7 @@ def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: in
         features._LEAST_ROWS = least
     for part in np.split(rows, np.cumsum(lengths)[:-1]):
         each.add(part, Moments.of(part))
-    told, exact = each.told(), rows.astype(np.float64)
+    told, exact = each.result(), rows.astype(np.float64)
     np.testing.assert_allclose(told["mean"], exact.mean(axis=0), rtol=1e-9)
     np.testing.assert_allclose(told["std"], exact.std(axis=0), rtol=1e-6, atol=1e-6)
     assert np.array_equal(told["min"], exact.min(axis=0))

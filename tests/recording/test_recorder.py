@@ -258,9 +258,9 @@ def test_a_file_that_is_disturbed_ends_the_recording(
             disturb(path)
             disturbed = True
 
-    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    monkeypatch.setattr("skinware.recording.recorder._REPORT_NS", NS_PER_S // 50)
     with publishing(FakeSkin("torso")) if comes else nullcontext(), pytest.raises(OSError, match=says) as raised:
-        Recorder(target).run(tell=tell)
+        Recorder(target).run(report=tell)
     assert raised.value.filename == str(path)
     assert target.paths == [path] * (disturb is _truncate)  # nothing else of ours is there
     if disturb is _move:
@@ -271,7 +271,7 @@ def test_a_file_that_is_disturbed_ends_the_recording(
 
 
 def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    monkeypatch.setattr("skinware.recording.recorder._REPORT_NS", NS_PER_S // 50)
     target = Files(path)
 
     def tell() -> None:
@@ -279,7 +279,7 @@ def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pyt
             _truncate(path)
 
     with publishing(FakeSkin("torso")), pytest.raises(OSError, match="changed by another program"):
-        Recorder(target).run(tell=tell)
+        Recorder(target).run(report=tell)
     with skinware.recording.open(path) as opened:
         assert not opened.is_whole
         sequence = opened["torso"].read(["status"]).sequence

@@ -220,7 +220,7 @@ def test_serial_lines_are_in_pcapng_and_not_in_candump(recording: Callable[..., 
     first, second = read_pcapng(path)
     assert first == Packet("ttyUSB0", SERIAL, EPOCH_NS, 1, SERIAL_HEADER.pack(1, 0, 0) + b"hello")
     assert second == Packet("ttyUSB0", SERIAL, EPOCH_NS + 5, 2, SERIAL_HEADER.pack(1, 1, 0) + b"you")
-    with pytest.raises(BadRecording, match="nothing of a CAN bus was recorded"):
+    with pytest.raises(BadRecording, match="no frame of a CAN bus was recorded"):
         export_candump(opened, tmp_path / "wire.log")
     assert not (tmp_path / "wire.log").exists()
 
@@ -287,7 +287,7 @@ def test_skin_convert_writes_them(
     for arguments, words in {
         ("--to", "pcapng"): "walk.pcapng: exists already",
         ("nobody", "--to", "candump", "-o", "x"): "no wire of 'nobody' in it; there are: hand, torso",
-        ("--type", "pressure", "--to", "candump", "-o", "x"): "frames, not sensors, can be selected",
+        ("--type", "pressure", "--to", "candump", "-o", "x"): "select drivers, not sensors",
     }.items():
         assert exit_status(convert, ["walk.mcap", *arguments]) in (1, 2)
         assert words in capsys.readouterr().err

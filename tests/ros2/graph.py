@@ -18,7 +18,7 @@ _REQUEST = Cdr().numbers("B", 0).done()
 
 
 class FakePublisher:
-    """See :class:`skinware.ros2.transport.Publisher`."""
+    """See :class:`skinware.ros2.transport.TopicPublisher`."""
 
     def __init__(self, graph: Graph, topic: str, message_type: MessageType, qos: Qos) -> None:
         self._graph, self.topic, self.type, self.qos = graph, topic, message_type, qos

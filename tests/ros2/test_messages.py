@@ -14,7 +14,8 @@ from skinware.conversion.ros_messages import Cdr
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.ros2 import messages, types
-from skinware.ros2.transport import Distro, Identity, MessageType
+from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.test_viewers import placed
 from tests.ros2.store import OURS, PACKAGE, typestore, with_chars_of_ros
@@ -157,8 +158,10 @@ def test_ages_of_points_are_those_of_their_modules() -> None:
 
 def test_diagnostics() -> None:
     told = [
-        messages.Status(messages.Level.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}),
-        messages.Status(messages.Level.OK, "skin: arm: can0", "live", "can0", {}),
+        messages.DiagnosticStatus(
+            messages.DiagnosticLevel.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}
+        ),
+        DiagnosticStatus(DiagnosticLevel.OK, "skin: arm: can0", "live", "can0", {}),
     ]
     status = [
         made(
@@ -184,7 +187,7 @@ def test_answers_of_a_service(text: str) -> None:
 @pytest.mark.parametrize("distro", Distro)
 def test_what_tells_which_node_has_which_endpoints(distro: Distro) -> None:
     ids = [bytes(range(first, first + 16)) for first in range(4)]
-    told = messages.entities(Identity("skin", "/robot", distro=distro), ids[0], [ids[1]], ids[2:])
+    told = messages.entities(NodeIdentity("skin", "/robot", distro=distro), ids[0], [ids[1]], ids[2:])
     size = 24 if distro is Distro.HUMBLE else 16
 
     def gid(data: bytes) -> Any:

@@ -18,7 +18,7 @@ from skinware import DriverReader, Namespace
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.ros2 import dds, types
-from skinware.ros2.transport import Distro, Identity, Qos
+from skinware.ros2.transport import Distro, NodeIdentity, Qos
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import Running, refused, running
@@ -149,7 +149,7 @@ def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: 
 
 def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
     monkeypatch.setattr(dds, "_write_bytes", None)
-    node = dds.DdsNode(Identity("skin", domain=domain))
+    node = dds.DdsNode(NodeIdentity("skin", domain=domain))
     try:
         with peer(domain, "--listen", "rt/x", types.SKIN_FRAME.name) as theirs:
             publisher = node.publisher("/x", types.SKIN_FRAME, Qos())
@@ -192,7 +192,7 @@ def test_a_network_that_is_not_there(domain: int, monkeypatch: pytest.MonkeyPatc
         "</Domain></CycloneDDS>",
     )
     with pytest.raises(BridgeError, match=rf"domain {domain} of DDS cannot be joined"):
-        dds.DdsNode(Identity("skin", domain=domain))
+        dds.DdsNode(NodeIdentity("skin", domain=domain))
 
 
 def udp_addresses() -> set[str]:
@@ -210,7 +210,7 @@ def test_this_machine_alone_by_default(domain: int, monkeypatch: pytest.MonkeyPa
     monkeypatch.delenv("CYCLONEDDS_URI")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     before = udp_addresses()
-    node = dds.DdsNode(Identity("skin", domain=domain))
+    node = dds.DdsNode(NodeIdentity("skin", domain=domain))
     try:
         assert udp_addresses() - before == {"127.0.0.1"}
     finally:
@@ -221,13 +221,13 @@ def test_this_machine_alone_by_default(domain: int, monkeypatch: pytest.MonkeyPa
 def test_an_interface_is_chosen_by_name_or_address(name: str, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CYCLONEDDS_URI")
     before = udp_addresses()
-    node = dds.DdsNode(Identity("skin", domain=domain), [name])
+    node = dds.DdsNode(NodeIdentity("skin", domain=domain), [name])
     try:
         assert udp_addresses() - before == {"127.0.0.1"}
     finally:
         node.close()
     with pytest.raises(BridgeError, match="cannot be joined"):
-        dds.DdsNode(Identity("skin", domain=domain), ["none'0"])
+        dds.DdsNode(NodeIdentity("skin", domain=domain), ["none'0"])
 
 
 def test_an_interface_beside_a_configuration_is_refused(domain: int) -> None:
@@ -253,5 +253,5 @@ def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("fields", [{"name": "1st"}, {"name": "a b"}, {"namespace": "x"}, {"domain": -1}])
 def test_identities_that_ros_does_not_know(fields: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError):
-        Identity(**{"name": "skin", **fields})
-    assert Identity("skin", "/", 0, Distro.HUMBLE).prefix == ""
+        NodeIdentity(**{"name": "skin", **fields})
+    assert NodeIdentity("skin", "/", 0, Distro.HUMBLE).prefix == ""

@@ -21,7 +21,7 @@ import pytest
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.ros2.rmw_zenoh import ZenohNode
-from skinware.ros2.transport import Distro, Identity, MessageType, Node, Qos, ServiceType
+from skinware.ros2.transport import Distro, MessageType, Node, NodeIdentity, Qos, ServiceType
 from skinware_drivers.testing.waiting import PATIENCE_S, wait_until
 from tests.ros2.graph_peer import GID, Found, GraphPeer, Heard, Message, peer
 from tests.ros2.router import Router, router, sockets
@@ -41,7 +41,7 @@ READY = b"ready"
 
 
 @contextmanager
-def node(at: Router, identity: Identity, tell: Callable[[bool, str], None] = print) -> Iterator[ZenohNode]:
+def node(at: Router, identity: NodeIdentity, tell: Callable[[bool, str], None] = print) -> Iterator[ZenohNode]:
     one = ZenohNode(identity, connect=[at.endpoint], router_changed=tell)
     try:
         yield one
@@ -68,7 +68,7 @@ class Graph:
 
 @contextmanager
 def graph_at(at: Router, domain: int) -> Iterator[Graph]:
-    with node(at, Identity("skin", "/icub", domain)) as skin, peer(at.endpoint, domain) as other:
+    with node(at, NodeIdentity("skin", "/icub", domain)) as skin, peer(at.endpoint, domain) as other:
         yield Graph(at, domain, skin, other)
 
 
@@ -275,7 +275,7 @@ def test_ending_a_service_waits_for_its_answer(graph: Graph) -> None:
 def test_graphs_of_other_domains_and_releases_do_not_meet(graph: Graph) -> None:
     graph.skin.publisher("/skin/arm/greeting", STRING, Qos())
     graph.other.wait_for("MP", "/skin/arm/greeting")
-    humble = Identity("old", domain=next(_domains), distro=Distro.HUMBLE)
+    humble = NodeIdentity("old", domain=next(_domains), distro=Distro.HUMBLE)
     with node(graph.at, humble) as old, peer(graph.at.endpoint, humble.domain) as other:
         publisher = old.publisher("/skin/arm/greeting", STRING, Qos())
         topic = other.wait_for("MP", "/skin/arm/greeting")
@@ -303,7 +303,7 @@ def test_what_ends_is_not_found_and_says_no_more(graph: Graph) -> None:
 
 def test_what_cannot_be_is_refused(graph: Graph) -> None:
     with pytest.raises(ConfigurationError, match="no endpoint"):
-        ZenohNode(Identity("skin"), connect=["localhost:7447"])
+        ZenohNode(NodeIdentity("skin"), connect=["localhost:7447"])
     with pytest.raises(BridgeError, match="no absolute name"):
         graph.skin.publisher("skin", STRING, Qos())
     with pytest.raises(BridgeError, match="no absolute name"):
@@ -316,7 +316,7 @@ def test_a_router_that_comes_late_goes_and_comes_back(sessions_end: None) -> Non
     told: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
     at = Router()
     try:
-        with node(at, Identity("skin"), lambda *told_now: told.put(told_now)) as skin:
+        with node(at, NodeIdentity("skin"), lambda *told_now: told.put(told_now)) as skin:
             publisher = skin.publisher("/skin/arm/greeting", STRING, Qos())
             assert next_of(told) == (False, f"no zenoh router at {at.endpoint}: ")
             assert publisher.publish(HELLO)

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from typing import Any, Self
 from unittest import mock
 
-import msgspec
-
 from skinware import status
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
@@ -21,7 +19,7 @@ from skinware_drivers.running.building import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import CommandReceived
+from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -30,7 +28,7 @@ SILENCE_NS = 600_000_000
 """How long boards may be silent in tests: a busy machine lets the threads of a test wait for longer than 0.2 s."""
 
 
-def emulated(log: list[msgspec.Struct] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
+def emulated(log: list[Event] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
     hardware = EmulatedRoboskin(EmulatorOptions(**options), log=log)
     return VirtualCanBus.with_hardware(hardware, listen_only=listen_only)
 
@@ -40,9 +38,9 @@ def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
     return bus.hardware
 
 
-def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
+def commands(log: list[Event]) -> list[tuple[int, int, str]]:
     """(time_ns, identifier, payload in hex) of what boards were told."""
-    return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+    return [(e.time_ns, e.identifier, e.payload or "") for e in log if e.event == "command_received"]
 
 
 def restarted_on_demand(emulator: Any) -> Any:
@@ -219,7 +217,7 @@ class TroubledBus(VirtualCanBus):
         self.fail_next_receive(BusNotAvailable("the bus went down", is_down=True))
 
 
-def troubled(log: list[msgspec.Struct] | None = None, **options: Any) -> TroubledBus:
+def troubled(log: list[Event] | None = None, **options: Any) -> TroubledBus:
     return TroubledBus.with_hardware(EmulatedRoboskin(EmulatorOptions(**options), log=log))
 
 

@@ -99,7 +99,7 @@ def test_only_the_buses_that_can_are_asked() -> None:
         }
         with pytest.raises(RequestRefused, match=r"no bus 'bus1' with patches; there are: bus0, bus2"):
             reader.call("press", at_m=at, bus="bus1")
-        with pytest.raises(RequestFailed, match="bus0: nothing is there"):
+        with pytest.raises(RequestFailed, match="bus0: no taxel is there"):
             reader.call("press", at_m=[0.07, -0.0225, 0.0])
         with pytest.raises(RequestRefused, match="it takes: bus, patch, at_m"):
             reader.call("press")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("hurry")
 SET_UP = [(0x207, "4d0032f0"), (0x207, "50000f02010022"), (0x207, "0700")]
 
 
-def sent(log: list[msgspec.Struct]) -> list[tuple[int, str]]:
+def sent(log: list[Event]) -> list[tuple[int, str]]:
     return [(identifier, payload) for _, identifier, payload in commands(log)]
 
 
@@ -48,7 +48,7 @@ def refuse() -> None:
 
 
 def test_a_bus_that_is_down_is_opened_again_with_growing_pauses(caplog: pytest.LogCaptureFixture) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     first, second = emulated(boards=(7,)), troubled(log, boards=(7,))
     with caplog.at_level(logging.WARNING), driving(first, second) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
@@ -69,7 +69,7 @@ def test_a_bus_that_is_down_is_opened_again_with_growing_pauses(caplog: pytest.L
 
 
 def test_boards_that_lost_power_while_their_bus_was_away_are_set_up() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = troubled(log, boards=(7,), boot_s=0.05)
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
@@ -84,7 +84,7 @@ def test_boards_that_lost_power_while_their_bus_was_away_are_set_up() -> None:
 
 
 def test_a_bus_that_goes_down_while_boards_are_looked_for() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = troubled(log, boards=(7,))
     bus.before_send = once(bus.go_down, b"\xff")
     with driving(bus, wait=False) as running:
@@ -97,7 +97,7 @@ def test_a_bus_that_goes_down_while_boards_are_looked_for() -> None:
 
 
 def test_a_bus_that_goes_down_while_boards_are_set_up(caplog: pytest.LogCaptureFixture) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = troubled(log, boards=(7,))
     bus.before_send = once(bus.go_down, b"\x50")
     with caplog.at_level(logging.WARNING), driving(bus, wait=False) as running:
@@ -115,7 +115,7 @@ def test_a_bus_that_goes_down_while_boards_are_set_up(caplog: pytest.LogCaptureF
 
 
 def test_a_full_queue_is_waited_for() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = troubled(log, boards=(7,))
     tries: list[bytes] = []
 
@@ -158,7 +158,7 @@ def test_a_restarted_board_that_cannot_be_set_up_is_tried_again() -> None:
 def test_boards_that_cannot_be_stopped_are_told_of_and_the_others_are_stopped(
     caplog: pytest.LogCaptureFixture, namespace: Namespace
 ) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     first, second = troubled(boards=(7,)), emulated(log, boards=(8,))
     with caplog.at_level(logging.WARNING), driving(first, second):
         first.before_send = lambda _identifier, _payload: refuse()

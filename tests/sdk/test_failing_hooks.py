@@ -7,7 +7,6 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
-import msgspec
 import pytest
 
 from skinware import BusReason, BusState, DriverReader
@@ -23,6 +22,7 @@ from skinware_drivers.polling import Poll, Watch
 from skinware_drivers.running import serving
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of, troubled
@@ -201,7 +201,7 @@ def test_what_is_no_patch_is_named() -> None:
 
 
 def test_a_stop_that_fails_skips_no_other_bus() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     lines = [
         (faulty("stop")(RoboskinOptions(boards=(7,))), emulated(boards=(7,))),
         (RoboskinDriver(RoboskinOptions(boards=(8,))), emulated(log, boards=(8,))),

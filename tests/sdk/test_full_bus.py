@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 
-import msgspec
 import pytest
 
 from skinware import DriverReader
@@ -16,6 +15,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import wire
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated
 
 
@@ -31,7 +31,7 @@ def test_boards_that_find_no_room_are_not_taken_for_restarted(
 ) -> None:
     monkeypatch.setattr(wire, "_BIT_NS", 20_000)  # a slow wire, so that the machine need not be fast
     monkeypatch.setattr(wire, "_USUAL_NS", 2_600_000)
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     boards = (1, 2, 3)
     bus = emulated(log, boards=boards, pattern="idle")
     with (

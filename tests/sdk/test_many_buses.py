@@ -9,7 +9,6 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,6 +19,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import Event
 from tests.commands import running as running_command
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, read_until, troubled
 
@@ -66,7 +66,7 @@ def change_to(running: Driving, adapters: dict[str, RoboskinDriver], *new: Virtu
 
 
 def test_a_bus_joins_and_leaves_and_joins_again() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(boards=(7,))) as running, DriverReader("roboskin") as reader:
         first = read_until(reader, lambda f: not f.status.any())
         uids = first.structure.sensor_uid
@@ -126,7 +126,7 @@ def test_a_driver_stops_while_a_bus_joins() -> None:
 
 
 def test_a_bus_with_other_options_is_opened_anew_in_its_place_and_the_others_go_on() -> None:
-    logs: list[list[msgspec.Struct]] = [[], []]
+    logs: list[list[Event]] = [[], []]
     first, second = emulated(logs[0], boards=(7, 8)), emulated(logs[1], boards=(9,))
     with driving(first, second) as running, DriverReader("roboskin") as reader:
         before = read_until(reader, lambda f: not f.status.any())

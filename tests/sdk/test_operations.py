@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import pytest
 
 from skinware import DriverReader, Namespace, PatchState, Status
@@ -18,12 +17,13 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 
 pytestmark = pytest.mark.usefixtures("hurry")
 
 
-def told(log: list[msgspec.Struct], since: int = 0) -> list[tuple[int, str]]:
+def told(log: list[Event], since: int = 0) -> list[tuple[int, str]]:
     """(identifier, payload) of what boards were told, from a position of the log on."""
     return [(identifier, payload.replace(" ", "").upper()) for _, identifier, payload in commands(log)[since:]]
 
@@ -34,12 +34,12 @@ def test_a_driver_tells_what_it_can_do() -> None:
             "enable": "Make",
             "rate": "Change",
             "rebaseline": "Make",
-            "versions": "Type,",
+            "versions": "Return",
         }
 
 
 def test_rebaseline_sets_up_the_patches_that_are_meant_and_no_other() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7, 8))), DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         before = len(commands(log))
@@ -62,7 +62,7 @@ def test_rebaseline_ends_a_suspicion() -> None:
 
 
 def test_disabled_boards_stay_silent_until_they_are_enabled() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7, 8))), DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         before = len(commands(log))
@@ -80,7 +80,7 @@ def test_disabled_boards_stay_silent_until_they_are_enabled() -> None:
 
 
 def test_another_rate() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7,))), DriverReader("roboskin") as reader:
         first = read_until(reader, lambda f: not f.status.any())
         before = len(commands(log))
@@ -107,7 +107,7 @@ def test_another_rate() -> None:
     ],
 )
 def test_bad_requests(operation: str, arguments: dict[str, Any], error: type[Exception], words: str) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7, 8))), DriverReader("roboskin") as reader:
         before = len(commands(log))
         with pytest.raises(error, match=words):

@@ -13,8 +13,7 @@ from skinware_drivers.can import CanAdapter
 from skinware_drivers.cli import driver, emulate
 from skinware_drivers.cli.hardware_options import reserved_names
 from skinware_drivers.options import HasOptions, NoOptions
-from skinware_drivers.virtual.emulator import Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual import Emulator, EmulatorOptions
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)

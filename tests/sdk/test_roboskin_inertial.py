@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin_options import RoboskinOptions, SpecialBoards
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves
 
@@ -118,7 +118,7 @@ def gravity(frame: DriverSnapshot) -> float:
 def test_emulated_boards_and_driver_agree(
     emulator: dict[str, Any], options: dict[str, Any], told: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), pattern="idle", **emulator)
     with driving(bus, inertial_period_ms=20, **options), DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())
@@ -135,7 +135,7 @@ def test_emulated_boards_and_driver_agree(
 
 @pytest.mark.usefixtures("hurry")
 def test_only_some_boards_send_and_the_wrong_scale_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(8,))
     special = (SpecialBoards((8,), inertial=("accelerometer",)),)
     with (
@@ -162,7 +162,7 @@ def test_a_restarted_board_sends_its_inertial_data_again(hurry: None) -> None:
 
 
 def test_skin_and_inertial_sensors_are_switched_each_for_itself(hurry: None) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(7,)), inertial=BOTH), DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         before = len(commands(log))

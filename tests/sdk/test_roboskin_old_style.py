@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
 import pytest
 
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError, RequestFailed
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves
 
@@ -39,7 +39,7 @@ def test_an_idle_triangle_as_on_the_wire() -> None:
 
 @pytest.mark.usefixtures("hurry")
 def test_old_boards_are_told_4c_and_4e_and_stream() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(7, 8), pattern="idle", boot_s=0.1)
     modules = (Kind(8, tuple(range(4, 16)), enabled=False),)
     options: dict[str, Any] = {
@@ -84,7 +84,7 @@ def test_an_mtb4_set_up_the_old_way_sends_everything_every_40_ms_in_class_4() ->
 
 @pytest.mark.usefixtures("hurry")
 def test_old_boards_are_silenced_and_woken() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(7, 8), pattern="idle")
     with driving(bus, old_style=True), DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
@@ -131,7 +131,7 @@ def test_what_the_old_way_cannot_do_is_refused(options: dict[str, Any], words: s
 @pytest.mark.parametrize("last", ["4c", "4e"])
 def test_boards_are_silenced_when_the_driver_ends_in_the_middle_of_the_set_up(last: str) -> None:
     """Set up the old way, a board sends from the first command on."""
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), mtb3=(7, 8))
     with driving(bus, wait=False, boards=(7, 8), old_style=True, period_ms=209) as running:
         wait_until(lambda: any(payload.startswith(last) for _, _, payload in commands(log)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +14,8 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.can.roboskin_setup import BoardSetUp
+from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.roboskin.boards import Board
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.virtual.rig import Rig
 
@@ -40,7 +41,7 @@ def sent(set_up: BoardSetUp) -> list[bytes]:
 
 @pytest.mark.usefixtures("hurry")
 def test_an_arm_is_set_up_in_the_real_order_and_all_that_was_enabled_is_live() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     with driving(emulated(log, boards=(13, 14)), **ARM), DriverReader("roboskin") as reader:
         structure = reader.structure
         assert structure.n_modules == 16 + 11
@@ -71,7 +72,7 @@ def test_an_arm_is_set_up_in_the_real_order_and_all_that_was_enabled_is_live() -
 
 
 def test_a_restarted_special_board_gets_its_own_set_up_again(hurry: None) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(13, 14), boot_s=0.1, pattern="idle")
     with driving(bus, **ARM) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
@@ -126,7 +127,7 @@ def test_boards_of_different_periods_all_stay_fresh(hurry: None) -> None:
 
 
 def test_a_rate_for_all_holds_for_special_boards_too(hurry: None) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     special = (SpecialBoards((8,), period_ms=100, skin_type=2),)
     modules = (Kind(8, tuple(range(16)), enabled=True),)
     bus = emulated(log, boards=(7, 8), pattern="idle")
@@ -199,7 +200,8 @@ def test_what_the_driver_believes_to_be_on_is_on_in_the_firmware(
     rig = Rig(boards=(7,), mtb3=(7,) if is_mtb3 else ())
     for payload in sent(set_up):
         rig.send(0x207, payload.hex())
-    (board,) = rig.hardware._boards
+    (board,) = rig.hardware.devices.values()
+    assert isinstance(board, Board)
     assert set_up.enabled == {t for t in range(16) if board._active[t]}
     assert board._period_ns == set_up.period_ms * MS
     assert not set_up.wiped & set_up.enabled

@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -17,7 +16,7 @@ from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import LostHalf, damaged_cycles
+from skinware_drivers.virtual.events import Event, damaged_cycles
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import EveryFrame, LateBoards, Together, commands, driving, emulated, hardware_of, read_until
@@ -89,7 +88,7 @@ def test_a_flood_on_one_bus_holds_up_no_other(
 
 
 def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8))
     with driving(bus):
         pass
@@ -128,7 +127,7 @@ def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
 
 @pytest.mark.usefixtures("hurry")
 def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), pattern="cycle", lose=0.01)
     shown: dict[int, set[int]] = {module: set() for module in range(32)}
     with driving(bus, period_ms=20) as running, EveryFrame(running) as every:
@@ -148,7 +147,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
         told = running.status()["patches"]
         assert all(few <= patch["orphans"] for few, patch in zip(orphans, told, strict=True))
         assert len(damaged_cycles(log)) > 20
-    halves = Counter((e.board, e.triangle, e.cycle) for e in log if isinstance(e, LostHalf))
+    halves = Counter((e.board, e.triangle, e.cycle) for e in log if e.event == "lost_half")
     both = [place for place, count in halves.items() if count == 2]
     # after a cycle that was lost whole, the next is not trusted
     damaged = {*damaged_cycles(log), *((board, triangle, cycle + 1) for board, triangle, cycle in both)}
@@ -158,7 +157,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
         missing = {cycle for cycle in between if cycle not in cycles}
         assert missing == {c for b, t, c in damaged if (b, t) == (board, triangle) and c in between}
     total = sum(patch["orphans"] for patch in running.status()["patches"])
-    lost = sum(isinstance(event, LostHalf) for event in log)
+    lost = sum(event.event == "lost_half" for event in log)
     assert lost - 2 * len(both) - 4 <= total <= lost  # at most one head per board still waited at the end
 
 
@@ -199,7 +198,7 @@ def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> N
 
 
 def test_a_restarted_board_is_set_up_alone() -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     bus = emulated(log, boards=(7, 8), boot_s=0.1)
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
@@ -295,7 +294,7 @@ def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
 
 @pytest.mark.usefixtures("hurry")
 def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:
-    log: list[msgspec.Struct] = []
+    log: list[Event] = []
     first, second = emulated(boards=(7,)), emulated(log, boards=(7,))
     with caplog.at_level(logging.WARNING), driving(first, second) as running, DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())

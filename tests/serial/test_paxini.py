@@ -23,8 +23,8 @@ from skinware_drivers.serial.paxini_high_speed import STRANGE, UNKNOWN_SLOTS, fr
 from skinware_drivers.serial.paxini_modules import POINTS_OF_PART, Slot, model_of
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini, EmulatedPaxiniOptions, message
-from skinware_drivers.virtual.emulator import Device
 from tests.drivers.fuzzed import paxini
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken

@@ -21,9 +21,7 @@ from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import NoOptions
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 NODES = (1, 2)
 NODE = Bits(shift=0, width=4)
@@ -135,12 +133,12 @@ class Counting(Fingertips):
 
     @property
     def layout(self) -> Layout:  # type: ignore[override]
-        """Halves are told apart by the lower half of the first byte."""
+        """The lower half of the first byte distinguishes the halves."""
         frames = [replace(f, when=[f.when[0], Byte(0, n, 0xF)]) for n, f in enumerate(layout().frames)]
         return Layout(frames, Cycle(["proximal", "distal"], maximum_age_s=0.01, counter=self.counter))
 
 
-# Wrong in what frames mean
+# Errors in the layout
 
 
 class CountsPressures(Counting):
@@ -240,7 +238,7 @@ class AnyLength(Fingertips):
     )
 
 
-# Wrong in what there is
+# Errors in the description
 
 
 class MissingModule(Fingertips):

@@ -1,4 +1,4 @@
-"""The suite on many modules: ranges of each channel, shifted keys, samples of what was not taken."""
+"""The suite on many modules: ranges of each channel, shifted keys, samples of unused frames."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_range_for_another_number_of_values_is_refused() -> None:
 
     cells = Wrong(EmulatorOptions(pattern="idle"))
     cells.skip(0)
-    with pytest.raises(ConfigurationError, match="rest has 3 numbers, `places` tells of 200 values"):
+    with pytest.raises(ConfigurationError, match="rest has 3 numbers, `places` has 200 values"):
         cells.emit(1_000_000_000)
 
 

@@ -25,10 +25,8 @@ from skinware_drivers.testing import lab
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.driving import EmulatedSkin
 from skinware_drivers.testing.waiting import read_until
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 

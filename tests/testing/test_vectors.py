@@ -13,7 +13,7 @@ from skinware_drivers import Frame, Layout, Link, Match, Module, NoOptions, Patc
 from skinware_drivers.modbus import ModbusAdapter, Registers
 from skinware_drivers.serial import SUM8, Packet, SerialAdapter
 from skinware_drivers.testing.vectors import Shown, decode_frames, decode_stream
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual import EmulatorOptions
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 PROXIMAL, DISTAL = (0x101, "00 0001 0002 0003"), (0x101, "01 0004 0005 0006")
@@ -25,7 +25,7 @@ class Declared(Fingertips):
 
 
 class AsksFirst(Fingertips):
-    """Its patches are what its devices say."""
+    """It learns its patches from its devices."""
 
     patches = ()
 

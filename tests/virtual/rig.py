@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
-import msgspec
-
+from skinware_drivers.virtual.events import Event, EventName
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -15,8 +14,6 @@ MS = 1_000_000
 START_NS = 5_000_000_000_000
 ENABLE_ALL = "50 00 0F 02 01 00 22"
 
-EventT = TypeVar("EventT", bound=msgspec.Struct)
-
 
 def constant_source(value: int) -> WireSource:
     return lambda board, triangle, cycle, time_ns: [value] * 12
@@ -24,7 +21,7 @@ def constant_source(value: int) -> WireSource:
 
 class Rig:
     def __init__(self, *, source: WireSource | None = None, **options: Any) -> None:
-        self.log: list[msgspec.Struct] = []
+        self.log: list[Event] = []
         options.setdefault("boards", (7,))
         self.hardware = EmulatedRoboskin(RoboskinOptions(**options), log=self.log, source=source)
         self.now_ns = START_NS
@@ -44,8 +41,8 @@ class Rig:
         if start:
             self.send(0x200 | board, "07 00")
 
-    def events(self, kind: type[EventT]) -> list[EventT]:
-        return [event for event in self.log if isinstance(event, kind)]
+    def events(self, kind: EventName) -> list[Event]:
+        return [event for event in self.log if event.event == kind]
 
     def streams(self, board: int = 7, period_ms: int = 50) -> bool:
         """Whether skin data of the board comes within four periods."""

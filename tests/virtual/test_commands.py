@@ -10,8 +10,6 @@ import itertools
 
 import pytest
 
-from skinware_drivers.virtual import events
-
 from .rig import ENABLE_ALL, START_NS, Rig, constant_source, cycles
 
 CONFIGURE = "4D 00 32 F0"
@@ -102,10 +100,10 @@ def test_the_board_type_is_four_bits(board_type: str) -> None:
 def test_set_triang_cfg_with_a_bad_range_is_ignored(triangles: str) -> None:
     rig = Rig()
     rig.configure()
-    before = len(rig.events(events.Recalibrated))
+    before = len(rig.events("recalibrated"))
     rig.send(0x207, f"50 {triangles} 02 00 00 22")
     assert rig.streams()
-    assert len(rig.events(events.Recalibrated)) == before
+    assert len(rig.events("recalibrated")) == before
 
 
 def test_set_triang_cfg_stops_an_mtb4_and_recalibrates_it() -> None:
@@ -115,7 +113,7 @@ def test_set_triang_cfg_stops_an_mtb4_and_recalibrates_it() -> None:
     rig.send(0x207, "50 04 04 02 01 00 22")
     rig.run_ms(10)
     assert rig.run_ms(1000) == []
-    assert rig.events(events.Recalibrated)[-1].reason == "command"
+    assert rig.events("recalibrated")[-1].reason == "command"
 
 
 def test_the_new_baseline_of_a_pressed_triangle_is_its_idle_value() -> None:
@@ -374,7 +372,7 @@ def test_commands_are_logged_and_counted() -> None:
     rig.send(0x20F, "1C 02 00")
     rig.send(0x208, "07 00")
     rig.send(0x209, "07 00")
-    commands = rig.events(events.CommandReceived)
+    commands = rig.events("command_received")
     assert [(event.identifier, event.payload, event.boards) for event in commands] == [
         (0x20F, "1c0200", [7, 8]),
         (0x208, "0700", [8]),

@@ -15,13 +15,18 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual import emulated_line, line
+from skinware_drivers.virtual import (
+    CanFrame,
+    Device,
+    SerialEmulator,
+    SerialEmulatorOptions,
+    cut_packets,
+    line,
+    on_a_grid,
+)
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.emulated_line import VirtualSerialBus
-from skinware_drivers.virtual.emulator import CanFrame, Device
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual.line import VirtualSerialBus
 
 
 class Strip(SerialEmulator[SerialEmulatorOptions]):
@@ -64,8 +69,7 @@ def received(bus: VirtualSerialBus | VirtualCanBus, payload_size: int) -> list[t
 
 
 def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (line, emulated_line):
-        monkeypatch.setattr(module, "load_emulator", lambda _name: Strip)
+    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
     bus = line.virtual_bus("strip", {"seed": "1"}, payload_size=8)
     assert isinstance(bus, VirtualSerialBus)
     bus.use(Packet(sync=(0xAA,), length=3), Packet(length=1, sync=(ord("?"),)))
@@ -81,8 +85,7 @@ def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.M
 
 
 def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (line, emulated_line):
-        monkeypatch.setattr(module, "load_emulator", lambda _name: Strip)
+    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
     with pytest.raises(ConfigurationError, match="unknown option 'sed'; did you mean 'seed'"):
         line.virtual_bus("strip", {"sed": "1"})
 

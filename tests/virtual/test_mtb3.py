@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import pytest
 
-from skinware_drivers.virtual import events
-
 from .rig import ENABLE_ALL, Rig, constant_source, cycles
 
 
@@ -21,7 +19,7 @@ def test_discovery_silences_streaming_mtb3s_but_not_mtb4s() -> None:
     rig.run_ms(10)
     assert not rig.streams(8)
     assert rig.streams(7)
-    assert [event.board for event in rig.events(events.BoardSilenced)] == [8]
+    assert [event.board for event in rig.events("board_silenced")] == [8]
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,8 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.loading import registered
-from skinware_drivers.virtual.emulator import Emulator
+from skinware_drivers.virtual import Emulator, ModbusEmulator
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 _SECOND_NS = 1_000_000_000

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from skinware_drivers.virtual import events
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.wire import Transmission, Wire, frame_time_ns
 
@@ -154,7 +153,7 @@ def test_a_period_shorter_than_the_burst_overflows_the_boards_queue_and_says_so(
     rig.configure(period_ms=2)
     frames = rig.run_ms(1000)
     assert 1000 / 0.13 * 0.98 < len(frames) <= 1000 / 0.13
-    lost = rig.events(events.LostHalf)
+    lost = rig.events("lost_half")
     assert {event.reason for event in lost} == {"overflow"}
     totals = rig.hardware.totals()
     assert totals["lost_halves"] == len(lost)

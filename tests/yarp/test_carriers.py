@@ -7,10 +7,10 @@ import struct
 import numpy as np
 import pytest
 
-from skinware.yarp.carriers import READ, Carrier, Message, framed, unframed
+from skinware.yarp.carriers import READ, Carrier, VectorMessage, framed, unframed
 from tests.yarp.peers import READING
 
-MESSAGE = Message(np.array([1.0, 2.5, 0.123456]), 7, 1215723086.25)
+MESSAGE = VectorMessage(np.array([1.0, 2.5, 0.123456]), 7, 1215723086.25)
 
 
 def test_text() -> None:
@@ -20,7 +20,7 @@ def test_text() -> None:
 
 @pytest.mark.parametrize(("yarp", "tag"), [(3, "0A010000"), (4, "14010000")])
 def test_binary(yarp: int, tag: str) -> None:
-    message = Message(np.array([1.0, 2.5, 0.123456]), 7, 1215723086.25, yarp)
+    message = VectorMessage(np.array([1.0, 2.5, 0.123456]), 7, 1215723086.25, yarp)
     command = b"do 7 1215723086.250000\0"
     block = (
         bytes.fromhex("17000000 7E 00 00 01")

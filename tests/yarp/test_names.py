@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from skinware.yarp.names import Contact, NameServer, configured_server, is_port_name
+from skinware.yarp.names import NameServer, PortAddress, configured_server, is_port_name
 from tests.yarp.peers import END, LOCAL, PORT, Answering, robot, until_gone
 
 
 def test_a_port_is_looked_up_as_the_manual_says() -> None:
     with robot(until_gone) as there:
         server = NameServer(LOCAL, there.server.port)
-        assert server.query(PORT) == Contact(PORT, LOCAL, there.port.port, "tcp")
+        assert server.query(PORT) == PortAddress(PORT, LOCAL, there.port.port, "tcp")
         assert server.query("/nobody") is None
         assert there.asked == [b"query " + PORT.encode(), b"query /nobody"]
 
@@ -34,7 +34,7 @@ def answers(*pieces: bytes) -> Callable[[socket.socket], None]:
     return handle
 
 
-def asked(handle: Callable[[socket.socket], None], name: str = "/write") -> Contact | None:
+def asked(handle: Callable[[socket.socket], None], name: str = "/write") -> PortAddress | None:
     there = Answering(handle)
     try:
         return NameServer(LOCAL, there.port).query(name)
@@ -48,7 +48,7 @@ MANUAL = (  # "The name server protocol"
 
 
 def test_the_answer_of_the_manual() -> None:
-    assert asked(answers(MANUAL)) == Contact("/write", "5.255.112.227", 10001, "tcp")
+    assert asked(answers(MANUAL)) == PortAddress("/write", "5.255.112.227", 10001, "tcp")
     assert asked(answers(*(MANUAL[at : at + 1] for at in range(len(MANUAL))))) is not None
     assert asked(answers(MANUAL), "/other") is None
 
@@ -148,9 +148,9 @@ def test_a_real_name_server_is_asked_and_understood_byte_by_byte() -> None:
 
     with contextlib.closing(Answering(replay)) as there:
         server = NameServer(LOCAL, there.port)
-        assert server.register("/sk/in", LOCAL, 12346) == Contact("/sk/in", LOCAL, 12346, "tcp")
-        assert server.register("/sk/in2", "...", 12347) == Contact("/sk/in2", LOCAL, 12347, "tcp")
-        assert server.query("/sk/in") == Contact("/sk/in", LOCAL, 12346, "tcp")
+        assert server.register("/sk/in", LOCAL, 12346) == PortAddress("/sk/in", LOCAL, 12346, "tcp")
+        assert server.register("/sk/in2", "...", 12347) == PortAddress("/sk/in2", LOCAL, 12347, "tcp")
+        assert server.query("/sk/in") == PortAddress("/sk/in", LOCAL, 12346, "tcp")
         assert server.query("/not/there") is None
         assert asked == [question for question, _ in exchanges[:4]]
         exchanges[4:5] = []  # the list of all ports, which is never asked for

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skinware.yarp.carriers import Carrier, Message, Word, framed, packed, unpacked
+from skinware.yarp.carriers import Carrier, VectorMessage, Word, framed, packed, unpacked
 from skinware.yarp.names import NameServer
 from skinware.yarp.port import _ADMINISTRATION, _WHICH_YARP, OutputPort
 from skinware_drivers.testing.waiting import wait_until
@@ -37,7 +37,7 @@ class There:
 
     def send(self, *values: float) -> None:
         self.count += 1
-        message = Message(np.array(values), self.count, time.time(), yarp=3)
+        message = VectorMessage(np.array(values), self.count, time.time(), yarp=3)
         done = threading.Event()
         self.loop.call_soon_threadsafe(self.port.send, message)
         self.loop.call_soon_threadsafe(done.set)

@@ -27,7 +27,7 @@ from skinware import DriverReader
 from skinware.conversion.showing import Showing
 from skinware.realtime import now_ns
 from skinware.ros2 import types
-from skinware.ros2.transport import Identity, MessageType, Qos
+from skinware.ros2.transport import MessageType, NodeIdentity, Qos
 
 PATIENCE_S = 30.0
 PAUSE_S = 0.05
@@ -148,7 +148,7 @@ def ways(sensors: int, writes: int = 20) -> None:
         (cloud,) = showing.pictures(frame, 0, wanted=POINTS.__eq__)
         processes = stack.enter_context(Processes())
         pipe = processes.start(subscribe, domain, [(POINTS, types.POINTS)])
-        node = dds.DdsNode(Identity("bench", domain=domain))
+        node = dds.DdsNode(NodeIdentity("bench", domain=domain))
         publisher = node.publisher(POINTS, types.POINTS, Qos())
         while not pipe.poll(0.05):
             publisher.publish(cloud.data)

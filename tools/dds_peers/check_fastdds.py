@@ -23,7 +23,7 @@ from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.geometry import Geometry
 from skinware.ros2 import messages, types
-from skinware.ros2.transport import Distro, Identity, MessageType, Qos
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 from skinware.sensor_types import PRESSURE
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def main() -> int:
     from skinware.ros2.dds import DdsNode
 
     topics = [each for modules in (2, 64, 2572) for each in made(modules, options.messages)]
-    peer, node = Peer(options.program, domain), DdsNode(Identity("check", domain=domain))
+    peer, node = Peer(options.program, domain), DdsNode(NodeIdentity("check", domain=domain))
     try:
         publishers = [node.publisher(topic, message_type, qos) for topic, message_type, qos, _ in topics]
         for topic, message_type, qos, _ in topics:

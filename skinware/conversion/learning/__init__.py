@@ -1,7 +1,7 @@
-"""Learning sets of recordings: episodes at a fixed rate, skins with their status and age beside joints and cameras.
+"""Make learning sets of recordings: episodes at a fixed rate, with skin values, status, age, joints and cameras.
 
 :func:`skinware.conversion.learning.export.convert_to_learning_set` reads recordings twice: once for the times of their
-frames, of which all rows are planned (:mod:`timing`), and once for what is in them, a little at a time.
+samples, from which it plans all rows (:mod:`timing`), and once for their contents, a few rows at a time.
 """
 
 from __future__ import annotations

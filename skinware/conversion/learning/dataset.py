@@ -1,4 +1,4 @@
-"""LeRobot's dataset format v3.0, written by pyarrow alone."""
+"""Write LeRobot's dataset format v3.0 with pyarrow alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from skinware.conversion._packages import pyarrow
 from skinware.conversion.learning.features import (
     IMAGE,
-    TOLD,
+    STATISTICS,
     Batch,
     Feature,
     Moments,
@@ -34,17 +34,17 @@ _OF_ALL = {
 }
 _SET_SAMPLE_BYTES, _EPISODE_SAMPLE_BYTES = 64 << 20, 16 << 20
 _IMAGES = 100
-"""How many images of an episode its statistics are of, at most."""
+"""Most images of an episode in its statistics."""
 
 
 class DatasetWriter:
-    """A dataset that is written episode by episode.
+    """Writes a dataset episode by episode.
 
     Args:
-        folder: in which it is made; there is none yet.
+        folder: of the dataset; it must not exist.
         fps: rows a second.
         features: of a row, by name, besides those that all datasets have.
-        lengths: rows of each episode that there will be.
+        lengths: number of rows of each episode to come.
 
     Raises:
         MissingExtra: pyarrow is not installed.
@@ -67,9 +67,9 @@ class DatasetWriter:
         """Write an episode.
 
         Args:
-            task: what is done in it.
-            length: its rows.
-            batches: these, some at a time.
+            task: description of the episode.
+            length: number of its rows.
+            batches: its rows, some at a time.
 
         Raises:
             OSError: it cannot be written.
@@ -95,7 +95,7 @@ class DatasetWriter:
                 statistics.add(name, numbers, moments)
                 self._whole.add(name, numbers, moments)
             done += count
-        self._write_episode(task, done, place, statistics.told())
+        self._write_episode(task, done, place, statistics.result())
         self._rows, self._count = self._rows + done, self._count + 1
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class DatasetWriter:
         self._episodes.close()
 
     def finish(self) -> None:
-        """Write what is told of the whole.
+        """Write the description and statistics of the whole dataset.
 
         Raises:
             OSError: it cannot be written.
@@ -112,8 +112,10 @@ class DatasetWriter:
         meta = self._folder / "meta"
         _write_tasks(self._arrow, self._tasks, meta / "tasks.parquet")
         with (meta / "stats.json").open("w", encoding="utf-8") as stream:
-            told = self._whole.told()
-            json.dump({name: {what: each.tolist() for what, each in of.items()} for name, of in told.items()}, stream)
+            statistics = self._whole.result()
+            json.dump(
+                {name: {what: each.tolist() for what, each in of.items()} for name, of in statistics.items()}, stream
+            )
         info = {
             "codebase_version": VERSION,
             "robot_type": None,
@@ -137,7 +139,7 @@ class DatasetWriter:
     def _numbers(
         self, rows: Batch, number: npt.NDArray[np.int64], length: int
     ) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-        """Of what statistics are told, by feature: the numbers of all rows, and pixels of some images."""
+        """Yield (feature, data for its statistics): the numbers of all rows, and pixels of some images."""
         for name, each in self._features.items():
             if each.dtype != IMAGE:
                 yield name, rows[name]
@@ -153,7 +155,7 @@ class DatasetWriter:
         fields += [(name, arrow.int64()) for name in integers]
         for name, each in self._features.items():
             depth = 3 if each.dtype == IMAGE else len(each.shape)
-            for what in TOLD:
+            for what in STATISTICS:
                 item, nested = (arrow.int64(), 1) if what == "count" else (arrow.float64(), depth)
                 for _ in range(nested):
                     item = arrow.list_(item)
@@ -187,7 +189,7 @@ class _Files:
         self._number, self._writer, self._path = -1, None, folder
 
     def next_place(self) -> dict[str, int]:
-        """Where the next rows go that belong together: number of the folder, and of the file in it."""
+        """Return the numbers of the folder and file for the next rows that belong together."""
         if self._writer is None or self._path.stat().st_size > _FILE_MB << 20:
             self.close()
             self._number += 1
@@ -213,12 +215,12 @@ class _Files:
 
 
 class _FeatureStatistics:
-    """Of all features of some rows.
+    """Statistics of all features.
 
     Args:
         features: by name.
-        lengths: of the episodes that will be shown.
-        most_bytes: of the rows that quantiles of a feature are taken of.
+        lengths: of the episodes to come.
+        most_bytes: bytes of rows kept for the quantiles of a feature.
     """
 
     def __init__(self, features: Mapping[str, Feature], lengths: Sequence[int], most_bytes: int) -> None:
@@ -232,20 +234,20 @@ class _FeatureStatistics:
                 self._of[name] = Statistics(each.shape, each.dtype, sum(lengths), most_bytes)
 
     def add(self, name: str, rows: npt.NDArray[Any], moments: Moments) -> None:
-        """Rows of a feature; of images pixels."""
+        """Add rows of a feature; for images, pixels."""
         self._of[name].add(rows, moments)
 
-    def told(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        return {name: each.told() for name, each in self._of.items()}
+    def result(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        return {name: each.result() for name, each in self._of.items()}
 
 
 def _image_step(length: int) -> int:
-    """Of how many images of an episode one is looked at."""
+    """Return n, where statistics use every n-th image of an episode."""
     return max(1, -(-length // _IMAGES))
 
 
 def _type(arrow: Any, feature: Feature) -> Any:
-    """Of a column, as LeRobot's reader expects it."""
+    """Return the type of a column that LeRobot's reader expects."""
     if feature.dtype == IMAGE:
         return arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
     item = arrow.from_numpy_dtype(np.dtype(feature.dtype))

@@ -1,4 +1,4 @@
-"""Recordings as a learning set: planned from times, then written a little at a time."""
+"""Write recordings as a learning set, planned from times and then written a few rows at a time."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LEARNING_FORMATS = {"lerobot": "-lerobot"}
 
 _BATCH_BYTES = 16 << 20
 _BYTES_PER_SENSOR = 4 + 1 + 4
-"""Of values, status, and what they are made of."""
+"""Bytes of a sensor's value, status and raw value."""
 
 
 def convert_to_learning_set(
@@ -55,13 +55,13 @@ def convert_to_learning_set(
     """Write a LeRobot dataset (format v3.0) of recordings.
 
     Args:
-        paths: recordings, or files that were made of some; they are only read.
-        target: the new folder, at which nothing may be; None: beside the first recording.
-        wanted: how it is made.
-        selection: which drivers, and which of their sensors; None: all.
-        start_s: where to begin in each recording, s since it began.
-        end_s: where to end, likewise; None: at its end.
-        is_stopped: asked now and then; True ends it with :class:`KeyboardInterrupt`, and nothing is written.
+        paths: recordings; they are only read.
+        target: the new folder, which must not exist; None: beside the first recording.
+        wanted: definition of the set.
+        selection: the drivers and sensors to convert; None: all.
+        start_s: begin at this time in each recording, s since it began.
+        end_s: end before this time; None: at the end of each recording.
+        is_stopped: called now and then; True ends it with :class:`KeyboardInterrupt` and leaves no folder.
 
     Raises:
         BadRecording: a file is not a recording, or of a newer version, or cannot be read.
@@ -164,7 +164,7 @@ def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval
     for interval in wanted.intervals:
         if not interval.file and len(paths) > 1:
             raise ConfigurationError(
-                f"the episode {interval} does not tell of which recording: give them in a CSV file with the column file"
+                f"the episode {interval} does not name its recording: list episodes in a CSV file with the column file"
             )
         found = [
             number for number, path in enumerate(paths) if not interval.file or interval.file in (str(path), path.name)
@@ -225,7 +225,7 @@ class _Set:
         self._write_beside(folder / "meta" / "skin")
 
     def _frames(self, episode: Episode, timed: TimedTable, window: int) -> Frames:
-        return Frames(self._recordings.table(episode.recording, timed.name), timed.told_ns, window)
+        return Frames(self._recordings.table(episode.recording, timed.name), timed.recorded_ns, window)
 
     def _window(self, name: str) -> int:
         windows = {episode.piece.tables[name].window(self._wanted) for episode in self._episodes}
@@ -254,13 +254,13 @@ class _Set:
         return {each.name: each.description for each in self._joined}
 
     def _write_beside(self, folder: Path) -> None:
-        """What LeRobot does not know: where sensors are, and when each episode was."""
+        """Write what LeRobot's format lacks: the places of sensors, and the time of each episode."""
         arrow = pyarrow()
         folder.mkdir()
         for name, sensors in self._sensors.items():
             arrow.parquet.write_table(arrow.table(sensors), folder / f"{name.replace('/', '_')}.sensors.parquet")
-        told = [
+        times = [
             {"episode": number, "file": self._recordings.paths[each.recording].name, "start_ns": int(each.times_ns[0])}
             for number, each in enumerate(self._episodes)
         ]
-        (folder / "episodes.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        (folder / "episodes.json").write_text(json.dumps(times, indent=1) + "\n", encoding="utf-8")

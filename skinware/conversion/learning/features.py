@@ -22,7 +22,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 
 MOST_NAMES = 4096
-"""Of sensors, in the description of a feature; the side file has them all."""
+"""Most names of sensors in the description of a feature; the side file has them all."""
 IMAGE = "image"
 _PNG, _RGB = b"\x89PNG\r\n\x1a\n", (8, 2)
 _OF_MODULES, _OF_GROUPS = COLUMNS + "module_time_ns", COLUMNS + "group_time_ns"
@@ -30,16 +30,16 @@ _NEEDED = (COLUMNS + "values", COLUMNS + "status", TIME)
 _MORE = ("frames/acquired_ns", "frames/published_ns")
 
 Batch = dict[str, npt.NDArray[Any]]
-"""Some rows of features, by name; of images PNG as bytes objects."""
+"""Rows of features, by name; images are PNG files as bytes objects."""
 
 
 class Feature(NamedTuple):
-    """What a row of a feature is.
+    """The format of a feature's rows.
 
     Attributes:
-        dtype: name of numpy's, or ``image``.
-        shape: of a row; (1,): one number.
-        names: of its numbers, or of its axes; None: not told.
+        dtype: a numpy name, or ``image``.
+        shape: of a row; (1,) for one number.
+        names: of its numbers or axes; None: no names.
     """
 
     dtype: str
@@ -48,13 +48,13 @@ class Feature(NamedTuple):
 
 
 class SkinFeatures:
-    """Features of a driver: of each type of its sensors values in its unit, and their status; the age of its frames.
+    """Features of a driver: values and status of each sensor type, and the age of its samples.
 
     Args:
         service: name of the driver.
-        structure: of it.
-        sensor_names: of its sensors, in the order of its values.
-        window: of how many frames a row has the values, the oldest first.
+        structure: of the driver.
+        sensor_names: in the order of its values.
+        window: number of samples in a row, the oldest first.
         period_ns: the driver's nominal period, 0 if it has none.
     """
 
@@ -84,11 +84,11 @@ class SkinFeatures:
         return described | {f"{self._prefix}.age": Feature("float32", (self._window,))}
 
     def rows(self, frames: Block, numbers: npt.NDArray[np.int64], rows_ns: npt.NDArray[np.int64]) -> Batch:
-        """Their values in t rows.
+        """Return the features of t rows.
 
         Args:
-            frames: some frames of the driver.
-            numbers: (t, window) which of these a row has, the newest last.
+            frames: samples of the driver.
+            numbers: (t, window) samples of each row, the newest last.
             rows_ns: (t,) time of each row, wall clock.
         """
         late_ns = rows_ns - frames[TIME][numbers[:, -1]]
@@ -106,9 +106,9 @@ class SkinFeatures:
     def _status(
         self, frames: Block, numbers: npt.NDArray[np.int64], late_ns: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.uint8]:
-        """(t, window, n) status, with what was too old by the time of the row.
+        """Return (t, window, n) status, with STALE for data that was too old at the time of the row.
 
-        Frames before the newest are judged as late as that one was: a driver that fell silent makes all of them stale.
+        Older samples of a window count as late as the newest one: a driver that fell silent makes all of them stale.
         """
         times_ns = frames[_OF_GROUPS if _OF_GROUPS in frames else _OF_MODULES]
         time_ns = times_ns[numbers]  # (t, window, groups)
@@ -124,12 +124,12 @@ class SkinFeatures:
 
 
 class Frames:
-    """Frames of a driver by their number, taken from one pass over its table.
+    """Samples of a driver by number, read in one pass over its table.
 
     Args:
         table: of the driver.
-        times_ns: (f,) of all of its frames, as they were before.
-        window: how many frames before the last one may be asked for again.
+        times_ns: (f,) times of all samples, from the pass before.
+        window: number of samples that stay available.
     """
 
     def __init__(self, table: Table, times_ns: npt.NDArray[np.int64], window: int) -> None:
@@ -140,13 +140,13 @@ class Frames:
         self._next = 0
 
     def take(self, numbers: npt.NDArray[np.int64]) -> Block:
-        """The frames with some numbers, in order.
+        """Return samples by number.
 
         Args:
-            numbers: ascending; at most a window before the last that was taken before.
+            numbers: ascending; at most a window before the last one that was taken.
 
         Raises:
-            BadRecording: they cannot be read, or are others than before.
+            BadRecording: they cannot be read, or differ from the pass before.
             OSError: they cannot be read.
         """
         needed = int(numbers[-1]) - self._window + 1
@@ -166,7 +166,7 @@ class Frames:
         return taken
 
     def _until(self, last: int) -> Iterator[tuple[int, Block]]:
-        """The blocks that are kept, and those that come, up to the one with a frame."""
+        """Yield the kept blocks and then new ones, up to the block with a sample."""
         yield from self._kept
         while self._next <= last:
             block = next(self._blocks, None)
@@ -180,13 +180,13 @@ class Frames:
 
 
 class JoinedFeature:
-    """A feature of what was joined.
+    """A feature of joined data.
 
     Args:
-        joined: numbers or paths of images.
+        joined: numbers, or paths of images.
 
     Raises:
-        ConfigurationError: the first image is not what is joined.
+        ConfigurationError: the first image is not a PNG file of the right kind.
         OSError: it cannot be read.
     """
 
@@ -199,10 +199,10 @@ class JoinedFeature:
             self.description = Feature("float32", (joined.rows.shape[1],), joined.names)
 
     def rows(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-        """(t, n) float32; (t,) PNG as bytes objects.
+        """Return (t, n) float32, or (t,) PNG files as bytes objects.
 
         Raises:
-            ConfigurationError: an image is not like the first.
+            ConfigurationError: an image differs in size from the first.
             OSError: it cannot be read.
         """
         chosen = self._joined.rows[numbers]
@@ -217,10 +217,10 @@ class JoinedFeature:
 
 
 def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
-    """(pixels, 3, 1, 1) of an image, 0 to 1; of large ones some pixels, evenly.
+    """Return (pixels, 3, 1, 1) float32 of an image, 0 to 1; evenly spaced pixels of a large one.
 
     Raises:
-        ConfigurationError: it is damaged.
+        ConfigurationError: the image is damaged.
         MissingExtra: pillow is not installed.
     """
     image_module = pillow()
@@ -235,7 +235,7 @@ def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
 
 
 def pixel_count(shape: tuple[int, ...]) -> int:
-    """How many pixels that gives of an image with a shape."""
+    """Return the number of pixels that :func:`pixels_of` returns."""
     step = _pixel_step(shape)
     return -(-shape[0] // step) * -(-shape[1] // step)
 
@@ -259,9 +259,9 @@ def _png_size(path: Path) -> tuple[bytes, int, int]:
 
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-TOLD = ("min", "max", "mean", "std", "count", *QUANTILES)
+STATISTICS = ("min", "max", "mean", "std", "count", *QUANTILES)
 _SAMPLE_ROWS, _LEAST_ROWS = 1000, 32
-"""How many rows quantiles are taken of at most; and at least, however large they are."""
+"""Most rows kept for quantiles; and least, however large they are."""
 _AT_ONCE = 4096
 
 Numbers = npt.NDArray[np.float64]
@@ -269,10 +269,10 @@ Numbers = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moments:
-    """Of some rows.
+    """Moments of rows.
 
     Attributes:
-        count: of rows.
+        count: number of rows.
         least, greatest, mean: (...) of each number of a row.
         squares: (...) sum of the squared differences from the mean.
     """
@@ -303,13 +303,13 @@ class Moments:
 
 
 class Sample:
-    """Some of the rows that are shown to it, evenly.
+    """Evenly chosen rows of those that are added.
 
     Args:
         shape: of a row.
         dtype: of its numbers.
-        rows: that will be shown.
-        most_bytes: of those that are kept.
+        rows: number of rows to come.
+        most_bytes: of the rows to keep.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int) -> None:
@@ -320,30 +320,30 @@ class Sample:
         self._rows = np.zeros((-(-rows // self._step), *shape), dtype)
 
     def add(self, rows: npt.NDArray[Any]) -> None:
-        """Show it (m, ...) rows."""
+        """Add (m, ...) rows."""
         chosen = rows[-self._seen % self._step :: self._step]
         self._rows[self._kept : self._kept + len(chosen)] = chosen
         self._kept += len(chosen)
         self._seen += len(rows)
 
     def quantiles(self) -> dict[str, Numbers]:
-        """Of each number of a row."""
+        """Return the quantiles of each number of a row."""
         rows = self._rows[: self._kept].reshape(self._kept, -1)
         found = np.zeros((len(QUANTILES), rows.shape[1]))
-        for first in range(0, rows.shape[1], _AT_ONCE):  # quantiles of all at once would be copies of the whole sample
+        for first in range(0, rows.shape[1], _AT_ONCE):  # all at once would copy the whole sample
             part = slice(first, first + _AT_ONCE)
             found[:, part] = np.quantile(rows[:, part], list(QUANTILES.values()), axis=0)
         return dict(zip(QUANTILES, found.reshape(-1, *self._rows.shape[1:]), strict=True))
 
 
 class Statistics:
-    """Of the rows of a feature that are shown to it.
+    """Statistics of the rows of a feature.
 
     Args:
         shape: of a row.
         dtype: of its numbers.
-        rows: that will be shown.
-        most_bytes: of the rows that quantiles are taken of.
+        rows: number of rows to come.
+        most_bytes: of the rows kept for quantiles.
         per_item: rows that count as one: pixels of an image.
     """
 
@@ -354,12 +354,12 @@ class Statistics:
         self._moments: Moments | None = None
 
     def add(self, rows: npt.NDArray[Any], moments: Moments) -> None:
-        """Show it (m, ...) rows, at least one, whose moments are known."""
+        """Add (m, ...) rows, at least one, with their moments."""
         self._sample.add(rows)
         self._moments = moments if self._moments is None else self._moments.with_(moments)
 
-    def told(self) -> dict[str, npt.NDArray[Any]]:
-        """:data:`TOLD`, each (...), but ``count``: (1,); at least one row was shown."""
+    def result(self) -> dict[str, npt.NDArray[Any]]:
+        """Return :data:`STATISTICS`, each (...), but ``count``: (1,); at least one row must have been added."""
         moments = self._moments
         assert moments is not None  # noqa: S101, there were rows
         return {

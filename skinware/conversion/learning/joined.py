@@ -1,4 +1,4 @@
-"""Files of joints, actions and cameras: columns with times, joined to the rows of a learning set."""
+"""Join files of joints, actions and cameras to the rows of a learning set by time."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 
 TIMES = ("time_ns", "unix_s", "monotonic_ns", "time_s")
-"""Names of a column of times: wall clock in ns or s since 1970, CLOCK_MONOTONIC of the machine that recorded, and s
-since the recording began."""
+"""Names of a column of times: wall clock in ns or s since 1970, CLOCK_MONOTONIC of the machine that recorded, s since
+the recording began."""
 _OF_ONE_RECORDING = ("monotonic_ns", "time_s")
 _VIDEOS = (".mp4", ".mkv", ".avi", ".webm", ".mov")
 
@@ -27,20 +27,20 @@ Columns = Mapping[str, npt.NDArray[Any]]
 
 
 class Joined:
-    """What becomes a feature: rows of numbers, or of paths of images, each with its time.
+    """Data for a feature: rows of numbers, or paths of images, each with its time.
 
     Args:
-        join: which columns of which file.
+        join: columns of a file.
 
     Attributes:
         name: of the feature.
         path: of the file.
         names: of the numbers in a row, or of the one column of paths.
-        rows: (m, n) float32; (m,) text of paths.
+        rows: (m, n) float32; (m,) text for paths.
 
     Raises:
-        ConfigurationError: the file has no times, or not these columns, or something else than numbers or paths.
-        MissingExtra: pyarrow is not installed, and it is Parquet.
+        ConfigurationError: the file has no times, lacks a column, or has something else than numbers or paths.
+        MissingExtra: the file is Parquet, and pyarrow is not installed.
         OSError: it cannot be read.
     """
 
@@ -69,14 +69,14 @@ class Joined:
         return bool(self.rows.ndim == 1)
 
     def times_ns(self, source: Source, *, is_only: bool) -> npt.NDArray[np.int64]:
-        """(m,) ns since 1970, on the axis of the recording.
+        """Return the time of each row, (m,) ns since 1970, on the axis of the recording.
 
         Args:
-            source: the recording to whose time they belong.
-            is_only: there is no other.
+            source: the recording that the times belong to.
+            is_only: it is the only recording.
 
         Raises:
-            ConfigurationError: they are of one recording, and there are several; or it does not tell the clocks.
+            ConfigurationError: the times refer to one recording, and there are several; or it lacks readings of clocks.
         """
         if self._time in _OF_ONE_RECORDING and not is_only:
             raise ConfigurationError(
@@ -93,18 +93,18 @@ class Joined:
         return since_ns
 
     def _ahead_ns(self, source: Source) -> int:
-        """How far the axis of the recording is ahead of CLOCK_MONOTONIC."""
+        """Return the axis of the recording minus CLOCK_MONOTONIC."""
         ahead = [each["log_time_ns"] - each["monotonic_ns"] for each in source.clock if "monotonic_ns" in each]
         if not ahead:
-            raise ConfigurationError(f"{source.path}: does not tell both clocks: {self.path} needs time_ns or unix_s")
+            raise ConfigurationError(f"{source.path}: has no readings of clocks: {self.path} needs time_ns or unix_s")
         return int(ahead[0])
 
     def _on_axis(self, wall_ns: npt.NDArray[np.int64], source: Source) -> npt.NDArray[np.int64]:
-        """(m,) times of the wall clock, as it was set then, on the axis of the recording."""
-        told = sorted((each["realtime_ns"], each["log_time_ns"]) for each in source.clock if "realtime_ns" in each)
-        if not told:
+        """Return times of the wall clock on the axis of the recording, (m,)."""
+        readings = sorted((each["realtime_ns"], each["log_time_ns"]) for each in source.clock if "realtime_ns" in each)
+        if not readings:
             return wall_ns
-        wall, axis = np.array(told, np.int64).T
+        wall, axis = np.array(readings, np.int64).T
         at = np.maximum(np.searchsorted(wall, wall_ns, side="right") - 1, 0)
         on_axis: npt.NDArray[np.int64] = wall_ns + (axis - wall)[at]
         return on_axis
@@ -147,13 +147,13 @@ def matched(
     match: Literal["previous", "nearest"],
     limit_ns: int,
 ) -> npt.NDArray[np.int64]:
-    """(t,) which of some times belongs to each moment; -1: none is near enough.
+    """Return the index of the time that belongs to each moment, (t,); -1: none is near enough.
 
     Args:
         times_ns: (m,) in order.
         at_ns: (t,) the moments.
-        match: the newest at or before a moment, or the nearest; of two equally near the earlier.
-        limit_ns: how far away it may be.
+        match: the newest time at or before a moment, or the nearest one (the earlier of two).
+        limit_ns: greatest distance.
     """
     found: npt.NDArray[np.int64] = np.searchsorted(times_ns, at_ns, "right") - 1
     if match == "nearest":
@@ -169,7 +169,7 @@ def _read(path: Path) -> Columns:
     readers: dict[str, Callable[[Path], Columns]] = {".csv": _csv, ".parquet": _parquet, ".npz": _npz}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise ConfigurationError(f"{path}: what is joined is a CSV, Parquet or NPZ file, by its name")
+        raise ConfigurationError(f"{path}: join a file that ends in .csv, .parquet or .npz")
     return reader(path)
 
 
@@ -186,7 +186,7 @@ def _csv(path: Path) -> Columns:
 
 
 def _numbers(texts: list[str]) -> npt.NDArray[Any]:
-    """Texts as int64, float64, or as what they are."""
+    """Return texts as int64, as float64, or else as texts."""
     for convert in (int, float):
         try:
             return np.array([convert(text) for text in texts], np.int64 if convert is int else np.float64)
@@ -211,7 +211,7 @@ def _parquet(path: Path) -> Columns:
                 raise ConfigurationError(f"{path}: {name} has rows of different lengths")
             columns[name] = np.array(rows)
         elif column.null_count:
-            raise ConfigurationError(f"{path}: {name} is not told in some rows")
+            raise ConfigurationError(f"{path}: {name} is missing in some rows")
         else:
             columns[name] = column.to_numpy(zero_copy_only=False)
     return columns

@@ -1,4 +1,4 @@
-"""Which frame belongs to which row of a learning set: episodes, planned from times alone."""
+"""Plan the episodes of a learning set from times alone: which sample belongs to which row."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from skinware.structure import Structure
 
 _FPS_TOLERANCE = 0.02
 _MISSING = 1.5
-"""How far a camera's rate may be from the set's; times between two of its images, in periods, that miss one."""
+"""Tolerance of a camera's rate; a distance of two images, in periods, above which one is missing."""
 _CLOCK_ERROR_NS = 100_000_000
-"""What a recorder that was held up between its looks at both clocks may tell wrongly; more is a clock that was set."""
+"""Error of the clocks' difference in a recorder that was held up; a larger step means that a clock was set."""
 
 Times = npt.NDArray[np.int64]
 
 
 class TimedTable:
-    """When the frames of a driver were, for as long as its structure stayed the same.
+    """The times of a driver's samples, as long as its structure stayed the same.
 
     Args:
         table: of a driver.
-        structure: of it.
+        structure: of the driver.
 
     Attributes:
         name: of the table.
         structure: as given.
         period_ns: the driver's nominal period, 0 if it has none.
-        told_ns: (f,) when each of its frames was published, wall clock, as recorded.
+        recorded_ns: (f,) time of publication of each sample, wall clock, as recorded.
         times_ns: (f,) the same, never going back.
 
     Raises:
@@ -47,25 +47,25 @@ class TimedTable:
     def __init__(self, table: Table, structure: Structure) -> None:
         self.name, self.structure, self.period_ns = table.name, structure, table.origin.period_ns
         blocks = [np.zeros(0, np.int64), *(block[TIME] for block in table.blocks([TIME]))]
-        self.told_ns: Times = np.concatenate(blocks)
-        self.times_ns: Times = np.maximum.accumulate(self.told_ns)
-        if (self.times_ns - self.told_ns > _CLOCK_ERROR_NS).any():
+        self.recorded_ns: Times = np.concatenate(blocks)
+        self.times_ns: Times = np.maximum.accumulate(self.recorded_ns)
+        if (self.times_ns - self.recorded_ns > _CLOCK_ERROR_NS).any():
             raise BadRecording(f"{table.name}: the clock was set back while it was recorded: choose a part by its time")
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second, as the driver says, or else as they came; 0: there are not two."""
+        """Nominal samples a second, or else as recorded; 0 for fewer than two samples."""
         if self.period_ns:
             return NS_PER_S / self.period_ns
         periods = np.diff(self.times_ns)
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
     def window(self, wanted: LearningSet) -> int:
-        """Of how many frames a row has the values."""
+        """Return the number of samples in a row."""
         return wanted.window or max(1, int(np.ceil(self.rate_hz / wanted.fps - 1e-3)))
 
     def runs(self, gap_s: float | None) -> Iterator[tuple[int, int]]:
-        """Numbers of the first frame of each run without a gap, and of the one after its last."""
+        """Yield the numbers of the first sample of each run without a gap, and of the sample after it."""
         limit_ns = (1 << 62) if gap_s is None else round(gap_s * NS_PER_S)
         cuts = np.flatnonzero(np.diff(self.times_ns) > limit_ns) + 1
         edges = [0, *cuts.tolist(), len(self.times_ns)]
@@ -74,7 +74,7 @@ class TimedTable:
 
 @dataclass(frozen=True)
 class Piece:
-    """A time in which all drivers were there, each with one structure.
+    """A time in which all drivers ran, each with one structure.
 
     Attributes:
         begin_ns, end_ns: wall clock, both in it.
@@ -96,11 +96,11 @@ class Episode:
 
     Attributes:
         recording: number of the recording.
-        task: what is done.
+        task: its description.
         times_ns: (t,) of each row, wall clock.
         piece: the drivers.
-        frames: of each driver (t,) number of the newest frame at each row.
-        joined: of each joined feature (t,) its row.
+        frames: by driver, (t,) number of the newest sample at each row.
+        joined: by joined feature, (t,) its row.
     """
 
     recording: int
@@ -119,16 +119,16 @@ class Planner:
 
     Args:
         number: of the recording.
-        source: it, with the drivers that are wanted.
-        wanted: how the set is made.
-        joined: with the times of each, wall clock.
-        structures: of recordings before; those of this one are added. Equal ones are kept once: they can be large.
+        source: the recording, reduced to the selected drivers.
+        wanted: definition of the set.
+        joined: joined data, each with its times, wall clock.
+        structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:
-        notes: what was left out; a line each.
+        notes: a line for each thing that was left out.
 
     Raises:
-        ConfigurationError: there is no driver in it.
+        ConfigurationError: the recording has no driver.
         BadRecording: it cannot be read.
     """
 
@@ -160,10 +160,10 @@ class Planner:
         return frozenset(self._drivers)
 
     def episodes(self, intervals: Sequence[Interval], task: str) -> list[Episode]:
-        """The episodes in some intervals, in order; in all that was recorded, if there are none.
+        """Return the episodes in some intervals, in order; without intervals those of the whole recording.
 
         Raises:
-            ConfigurationError: intervals overlap, or something is missing in one, or its structure changes.
+            ConfigurationError: intervals overlap, data is missing in one, or a structure changes in one.
         """
         pieces = list(self._pieces())
         if not intervals:
@@ -191,14 +191,14 @@ class Planner:
         yield from sorted(pieces, key=lambda piece: piece.begin_ns)
 
     def _spans(self, timed: TimedTable) -> Iterator[tuple[int, int]]:
-        """From when there is a whole window of frames, to the last one, of each run."""
+        """Yield the times of the first row with a whole window, and of the last one, of each run."""
         more = timed.window(self._wanted) - 1
         for first, end in timed.runs(self._wanted.gap_s):
             if first + more < end:
                 yield int(timed.times_ns[first + more]), int(timed.times_ns[end - 1])
 
     def _check_whole(self, pieces: Sequence[Piece], where: str) -> None:
-        """Refuse a change of structure where nobody asked for several sets."""
+        """Refuse a change of structure unless several sets are wanted."""
         changed = [piece for before, piece in pairwise(pieces) if piece.structures != before.structures]
         if changed and not self._wanted.each_structure:
             when = ", ".join(f"{self._seconds(piece.begin_ns):.3f} s" for piece in changed)
@@ -287,7 +287,7 @@ class Planner:
             f"{each.path} from {self._seconds(int(times_ns[0])):.3f} to {self._seconds(int(times_ns[-1])):.3f} s"
             for each, times_ns in self._joined
         ]
-        raise ConfigurationError(f"{self._path}: no time {where} has everything that is asked for: {', '.join(spans)}")
+        raise ConfigurationError(f"{self._path}: no time {where} has all the data asked for: {', '.join(spans)}")
 
     def _slow_drivers(self) -> Iterator[str]:
         for name, tables in self._drivers.items():

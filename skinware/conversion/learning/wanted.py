@@ -1,4 +1,4 @@
-"""What a learning set is to be made of, as people say it."""
+"""Define a learning set, from texts of a command line and CSV files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ RESERVED = ("timestamp", "frame_index", "episode_index", "index", "task_index", 
 
 
 class Interval(NamedTuple):
-    """An episode that is asked for.
+    """An episode to make.
 
     Attributes:
         start_s, end_s: s since the recording began; the end is not in it.
-        task: what was done; None: as of all episodes.
+        task: its description; None: that of all episodes.
         file: path or name of its recording; empty: the only one.
     """
 
@@ -50,20 +50,19 @@ class Join(NamedTuple):
 
 @dataclass(frozen=True)
 class LearningSet:
-    """How a learning set is made.
+    """The definition of a learning set.
 
     Attributes:
         fps: rows a second.
-        task: what is done in episodes that do not tell; None: the name of the recording.
-        window: of how many frames of a driver each row has the values, the newest last; 0: of as many as it publishes
-            between two rows.
+        task: description of episodes without one; None: the name of the recording.
+        window: number of samples of a driver in a row, the newest last; 0: as many as it publishes between two rows.
         intervals: the episodes; empty: each recording is one.
-        gap_s: an episode ends where a driver published nothing for longer, and the next one begins; None: it goes on.
+        gap_s: a silence of a driver that ends an episode and begins the next; None: no silence does.
         joins: files of joints, actions and cameras that become features.
-        match: what of them belongs to a row: the newest at or before its time, or the nearest.
-        within_s: how far from it that may be; None: the time between two rows.
-        at: name of a joined feature: a row at each of its times, not one each 1 / fps; empty: none.
-        each_structure: a set for each structure of the drivers, in folders; False: several are refused.
+        match: which joined row belongs to a row: the newest at or before its time, or the nearest.
+        within_s: greatest distance of a joined row; None: the time between two rows.
+        at: name of a joined feature whose times are those of the rows; empty: a row each 1 / fps.
+        each_structure: write a set for each structure of the drivers, in folders; False: refuse several structures.
     """
 
     fps: int = 30
@@ -89,25 +88,25 @@ class LearningSet:
 
     @property
     def limit_s(self) -> float:
-        """How far from the time of a row what is joined may be."""
+        """Greatest distance in time of a joined row."""
         return 1 / self.fps if self.within_s is None else self.within_s
 
 
 def interval_of(text: str) -> Interval:
-    """From ``START..END``, s since the recording began.
+    """Return the interval of ``START..END``, s since the recording began.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: the text has another form.
     """
     start, _, end = text.partition("..")
     return _interval(start, end, f"episode {text!r}")
 
 
 def read_intervals(path: Path) -> list[Interval]:
-    """From a CSV file with the columns ``start_s`` and ``end_s``, and perhaps ``task`` and ``file``.
+    """Read intervals from a CSV file with the columns ``start_s``, ``end_s``, and optionally ``task`` and ``file``.
 
     Raises:
-        ConfigurationError: there is something else in it.
+        ConfigurationError: it has other columns or contents.
         OSError: it cannot be read.
     """
     with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -125,10 +124,10 @@ def read_intervals(path: Path) -> list[Interval]:
 
 
 def join_of(text: str) -> Join:
-    """From ``FEATURE=FILE`` or ``FEATURE=FILE:COLUMN,COLUMN``.
+    """Return the join of ``FEATURE=FILE`` or ``FEATURE=FILE:COLUMN,COLUMN``.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: the text has another form.
     """
     feature, is_one, rest = text.partition("=")
     if not is_one or not rest:

@@ -1,1 +1,1 @@
-"""The devices that emulators ship for, one file each; each says only what is its own."""
+"""Emulators of devices, one module for each driver."""

@@ -1,4 +1,4 @@
-"""An emulated Ability Hand: it answers what the maker's programs ask, and would move if it were told to.
+"""An emulated Ability Hand: it answers the questions of the maker's programs, and counts their commands to move.
 
 Source: github.com/psyonicinc/ability-hand-api (``ah_api.py``, ``ah_parser.py``, ``ppp_stuffing.py``).
 """
@@ -12,12 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
-_ASKED = "asked"  # in the memory of a device: the command that is answered
-_MOVES = "moves"  # how often it was told to move
+_ASKED = "asked"  # in the memory of a device: the command to be answered
+_MOVES = "moves"  # commands to move so far
 _TARGETS = 12
 
 
@@ -29,13 +27,13 @@ def message(content: bytes) -> bytes:
 
 
 class EmulatedAbilityHandOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the hand is."""
+    """Options of the hand."""
 
-    address: Annotated[int, Meta(ge=0, le=255, description="of the hand")] = 0x50
+    address: Annotated[int, Meta(ge=0, le=255, description="address of the hand")] = 0x50
 
 
 class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
-    """One hand, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One hand, device 1.
 
     Values: the sensors of index, middle, ring, little finger and thumb, six each.
     """
@@ -43,12 +41,10 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
     full_scale = 4095
     rest = 300
     swing = 3000
+    streams = "never"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(30, 6)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        """It waits to be asked."""
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         *parts, rest = heard.split(b"~")
@@ -77,11 +73,11 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
         return b""
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """The answer: 12 bits of each sensor, the lowest first."""
+        """Return the answer: 12 bits of each sensor, the lowest first."""
         bits = sum(value << 12 * number for number, value in enumerate(values))
         positions = bytes(range(24))
         return [message(bytes([device.memory[_ASKED]]) + positions + bits.to_bytes(45, "little") + b"\0")]
 
     def moves(self) -> int:
-        """How often it was told to move, since it has power."""
+        """Return the number of commands to move since power-up."""
         return sum(device.memory.get(_MOVES, 0) for device in self.devices.values())

@@ -1,4 +1,4 @@
-"""An emulated device of the AGNI serial protocol: its bytes on the line.
+"""An emulated device of the AGNI serial protocol.
 
 Source: agni_serial_protocol, ``serial_protocol_defines.h`` (BSD); the vectors in tests/serial/test_agni.py.
 """
@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _DEVICE, _TYPE = 7, 0x0203
 _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
@@ -29,13 +27,13 @@ def message(number: int, body: bytes) -> bytes:
 
 
 class EmulatedAgniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the device is."""
+    """Options of the device."""
 
     sensors: Annotated[tuple[int, ...], Meta(description="number of values of each sensor")] = (16, 4)
 
 
 class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
-    """One device, number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One device, number 1.
 
     Values: uint16, those of sensor 1, of sensor 2 ... Its time is in microseconds.
     """
@@ -58,7 +56,7 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         return sent
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``sensor1`` and so on; other messages are answers."""
+        """Return ``sensor1`` and so on; other messages are answers."""
         return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
 
     def kinds(self) -> Sequence[str]:

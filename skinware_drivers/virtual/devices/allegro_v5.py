@@ -1,4 +1,4 @@
-"""Emulated Allegro hands V5, as far as their skin: they send by themselves, as if their own program had started them.
+"""The skin of emulated Allegro hands V5, which send by themselves, as if their own program had started them.
 
 Sources: allegro_hand_ros2_v5, allegro_hand_ros2_V5_Sense, allegro_hand_v5_plus_python.
 """
@@ -13,22 +13,27 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import (
+    CanFrame,
+    Device,
+    Emulator,
+    EmulatorOptions,
+    SerialEmulator,
+    SerialEmulatorOptions,
+    on_a_grid,
+)
 
 _JOINTS = 16
 
 
 class EmulatedAllegroV5Options(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How fast it is."""
+    """Options of the hand."""
 
     period_ms: Annotated[int, Meta(ge=1, description="time between two messages of a kind, ms")] = 10
 
 
 class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
-    """One V5 Sense on CAN, device 0; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+    """One V5 Sense on CAN, device 0.
 
     Values: the pads in the order of the frames, as bytes.
     """
@@ -36,12 +41,10 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     full_scale = 254
     swing = 200
     identifiers: Collection[int] = frozenset((0x150, 0x154, 0x3C0, 0x3C8, 0x140, 0x148))
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(16, 4)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
         return [self.kind_of(identifier, b"") for identifier in (0x054 << 2, 0x055 << 2)]
@@ -51,10 +54,10 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
 
 
 class EmulatedAllegroV5TipsOptions(EmulatedAllegroV5Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which firmware it has."""
+    """Options of the hand."""
 
-    as_in_manual: Annotated[bool, Meta(description="identifiers of the manual, and not those of real hands")] = False
-    air_pa: Annotated[int, Meta(ge=0, description="what an untouched fingertip sends, Pa")] = 0
+    as_in_manual: Annotated[bool, Meta(description="identifiers of the manual, not those of real hands")] = False
+    air_pa: Annotated[int, Meta(ge=0, description="pressure of an untouched fingertip, Pa")] = 0
 
 
 class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
@@ -64,20 +67,18 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     lowest = -1_000
     swing = 4_000
     identifiers: Collection[int] = EmulatedAllegroV5.identifiers
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(4, 4)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
         return [self.kind_of(identifier, b"") for identifier in (self._first << 2, self._first + 2 << 2)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
-        told = [value + self.options.air_pa for value in values]
+        pascals = [value + self.options.air_pa for value in values]
         first, second = self._first << 2, self._first + 2 << 2
-        return [(first, struct.pack("<2i", *told[:2])), (second, struct.pack("<2i", *told[2:]))]
+        return [(first, struct.pack("<2i", *pascals[:2])), (second, struct.pack("<2i", *pascals[2:]))]
 
     @property
     def _first(self) -> int:
@@ -85,7 +86,7 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How fast it is."""
+    """Options of the hand."""
 
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two datagrams, ms")] = 3
 
@@ -97,12 +98,10 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
     swing = 800
     speed_mbit_s = 100
     datagrams = True
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(16, 4)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         number = device.cycle & 0xFFFF_FFFF

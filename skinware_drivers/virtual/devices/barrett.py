@@ -1,55 +1,50 @@
-"""Emulated pucks of a Barrett hand BH280, as far as their tactile cells: they answer questions about TACT with data.
+"""The tactile cells of emulated pucks of a Barrett hand BH280: they answer questions about TACT with data.
 
-Source: owd ``openwam/CANbus.cc``. Not there and assumed: what a puck answers before a format was chosen (nothing), and
-that the answer about a property other than TACT goes to group 6.
+Source: owd ``openwam/CANbus.cc``. It is assumed that a puck does not answer before a format was chosen, and that the
+answer about a property other than TACT goes to group 6.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 _TACT = 106
 _TOP_10, _FULL = 1, 2
 
 
 class EmulatedBarrettOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which pucks there are."""
+    """Options of the pucks."""
 
     nodes: Annotated[tuple[int, ...], Meta(description="nodes of the pucks")] = (11, 12, 13, 14)
 
 
 class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
-    """Pucks on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`. Values are in 1/256 N/cm2."""
+    """Pucks on one bus. Values are in 1/256 N/cm2."""
 
     full_scale = 0xFFF
     swing = 3_000
     identifiers: Collection[int] = frozenset(range(0x800)) - {
         i for i in range(0x800) if i >> 5 & 31 not in range(11, 15) and i & 0x41F not in (0x405, 11, 12, 13, 14)
     }
-
-    def __init__(self, options: EmulatedBarrettOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.nodes
-        super().__init__(options, **more)
+    numbered_by = "nodes"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(24, 3)
 
     def boot(self, device: Device, now_ns: int) -> None:  # noqa: ARG002
-        """Nothing by itself; with ``streaming``, the format is chosen already."""
+        """Wait for questions; with ``streaming``, the format is chosen already."""
         if self.options.streaming:
             device.memory["format"] = _FULL
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        """Set TACT, ask for TACT, ask for anything else."""
+        """Obey a command about TACT, or answer a question about another property."""
         if identifier not in (device.number, 0x405) or not payload:
             return False
         number, is_set = payload[0] & 0x7F, payload[0] >= 0x80
@@ -66,12 +61,12 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
         return True
 
     def kind_of(self, identifier: int, payload: bytes) -> str:
-        """The frames of all cells by identifier and part: ``0x569-0``."""
+        """Name the frames of all cells by identifier and part: ``0x569-0``."""
         part = f"-{payload[0] >> 4}" if identifier & 0x41F == 0x409 else ""
         return f"{super().kind_of(identifier, payload)}{part}"
 
     def kinds(self) -> Sequence[str]:
-        """Five frames of all cells, or one of the ten strongest, from each puck."""
+        """Name five frames of all cells, and one of the ten strongest, from each puck."""
         senders = [number << 5 | 0x400 for number in self.numbers]
         whole = [self.kind_of(sender | 9, bytes([part << 4])) for sender in senders for part in range(5)]
         return [*whole, *(self.kind_of(sender | 8, b"") for sender in senders)]

@@ -1,7 +1,7 @@
-"""Emulated CANopen skin patches: devices made with the ``canopen`` package from an EDS.
+"""Emulated CANopen skin patches, made with the ``canopen`` package from an EDS.
 
 The package's ``LocalNode`` answers SDO requests and holds the object dictionary. Its threads are not used: NMT,
-heartbeat, event timers and SYNC (CiA 301) are done here, in the time of the emulation.
+heartbeat, event timers and SYNC (CiA 301) run here, in the time of the emulation.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import events
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions, Seconds
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator_options import Seconds
+from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.stage import Actor
 
 _HEARTBEAT = "heartbeat"
@@ -33,7 +32,7 @@ _REAL32 = 8
 
 
 class EmulatedCanopenOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which patches there are."""
+    """Options of the patches."""
 
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127")] = (5, 6)
     eds: Annotated[str, Meta(description="EDS file; default: the example's")] = ""
@@ -43,7 +42,7 @@ class EmulatedCanopenOptions(EmulatorOptions, frozen=True, forbid_unknown_fields
 
 
 class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
-    """Patches on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+    """Patches on one bus.
 
     Values: those of the TPDOs, in the order of their mapping, but for objects with a unit of their own (a temperature,
     say), which keep their default.
@@ -52,9 +51,9 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
     full_scale = 4095
     rest = 100
     swing = 3500
+    numbered_by = "nodes"
 
     def __init__(self, options: EmulatedCanopenOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.nodes
         super().__init__(options, **more)
         functions = range(0x080, 0x780, 0x80)  # of the predefined connection set
         own = {function + node for function in functions for node in (0, *options.nodes)}
@@ -74,7 +73,7 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         return actors
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """Say so, and be pre-operational; with ``streaming``, operational."""
+        """Send the boot-up message and be pre-operational, or with ``streaming`` operational."""
         device.memory["node"] = _make_node(self.options.eds, device.number, _Ports(self, device))
         self.reply(device, (0x700 + device.number, bytes([_BOOT_UP])), now_ns)
         device.memory["state"] = _PRE_OPERATIONAL
@@ -100,7 +99,7 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
             self.burst(device, time_ns)
 
     def kinds(self) -> Sequence[str]:
-        """The TPDOs, the answers of SDO and the heartbeats of each node."""
+        """Name the TPDOs, the answers of SDO and the heartbeats of each node."""
         found = []
         for number in self.numbers:
             node = _make_node(self.options.eds, number, None)
@@ -119,14 +118,14 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         return found
 
     def report_error(self, number: int, code: int, now_ns: int) -> None:
-        """Send an EMCY: an error, or with code 0 that there is none any more."""
+        """Send an EMCY: an error, or with code 0 its end."""
         self._report(self.devices[number], code, self.run_to(now_ns))
         self.find_next_event()
 
     def _report(self, device: Device, code: int, now_ns: int) -> None:
         if device.alive and now_ns >= device.ready_ns:
             self.reply(device, (0x080 + device.number, struct.pack("<HB5x", code, int(code != 0))), now_ns)
-            self.log.append(events.ErrorReported(time_ns=now_ns, board=device.number, code=code))
+            self.log.append(Event("error_reported", now_ns, board=device.number, code=code))
 
     def _command(self, device: Device, command: int, now_ns: int) -> bool:
         if command in _RESETS:
@@ -147,13 +146,13 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
 
 class _Ports:
-    """What a ``LocalNode`` knows of its network: where its answers go, and its heartbeat."""
+    """The network of a ``LocalNode``: it takes the node's answers and starts its heartbeat."""
 
     def __init__(self, emulator: EmulatedCanopen, device: Device) -> None:
         self._emulator, self._device = emulator, device
 
     def subscribe(self, can_id: int, callback: object) -> None:
-        """The emulator knows whom to tell."""
+        """Do nothing: the emulator calls the node itself."""
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
         self._emulator.reply(self._device, (can_id, bytes(data)), self._device.memory["now_ns"])
@@ -170,7 +169,7 @@ class _Ports:
 def _make_node(eds: str, number: int, ports: _Ports | None) -> Any:
     import canopen
 
-    logging.getLogger("canopen").setLevel(logging.WARNING)  # it tells of every transfer
+    logging.getLogger("canopen").setLevel(logging.WARNING)  # it logs every transfer
     source = eds or str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds")
     node = canopen.LocalNode(number, source)
     if ports is not None:

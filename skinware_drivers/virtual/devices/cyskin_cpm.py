@@ -13,34 +13,29 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 _SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
-"""Which of the sixteen values of a set is that of taxel 0, 1, 2 ..."""
+"""Position of taxel 0, 1, 2 ... in the sixteen values of a set."""
 
 
 class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How fast it is."""
+    """Options of the finger."""
 
     period_ms: Annotated[int, Meta(ge=1, description="time between two sets, ms")] = 20
 
 
 class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
-    """One finger, device 0; see :class:`skinware_drivers.virtual.emulator.Emulator`."""
+    """One finger, device 0."""
 
     full_scale = 0xFFFF
     rest = 800
     swing = 6_000
-    numbers: Sequence[int] = (0,)
     identifiers: Collection[int] = frozenset((0x405, 0x407, 0x409, 0x40B))
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(16, 4)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         wire = [0] * 16

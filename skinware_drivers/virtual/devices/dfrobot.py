@@ -1,4 +1,4 @@
-"""Emulated tactile arrays of DFRobot (SEN0704, SEN0705): their registers.
+"""Emulated tactile arrays of DFRobot (SEN0704, SEN0705).
 
 Source: DFRobot/DFRobot_TactileSensor; the vectors in tests/modbus/test_dfrobot.py.
 """
@@ -13,20 +13,17 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which arrays there are, and what is wrong with them."""
+    """Options of the arrays."""
 
     units: Annotated[tuple[int, ...], Meta(description="numbers of the arrays")] = (1,)
     shapes: Annotated[tuple[Literal["4x8", "6x6"], ...], Meta(description="rows and columns of each, or of all")] = (
         "6x6",
     )
-    unready: Annotated[tuple[int, ...], Meta(description="arrays that never become ready, and tell 0")] = ()
+    unready: Annotated[tuple[int, ...], Meta(description="arrays that never become ready, and send 0")] = ()
     swapped: Annotated[bool, Meta(description="send the low byte of a register first")] = False
 
     def __post_init__(self) -> None:
@@ -36,18 +33,18 @@ class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
 
 
 class EmulatedDfrobot(ModbusEmulator[EmulatedDfrobotOptions]):
-    """Arrays on one line. Values: the cells of a 6x6, if there is one, then those of a 4x8, each from the top row down.
+    """Arrays on one line. Values: the cells of a 6x6, if any, then those of a 4x8, each from the top row down.
 
-    An array has those of its own shape.
+    An array uses those of its own shape.
     """
 
     full_scale: int = 4095
     rest = 20
     swing = 3000
     function = 4
+    numbered_by = "units"
 
     def __init__(self, options: EmulatedDfrobotOptions, **more: object) -> None:
-        self.numbers = options.units
         shapes = options.shapes * len(options.units) if len(options.shapes) == 1 else options.shapes
         self._is_square = {unit: shape == "6x6" for unit, shape in zip(options.units, shapes, strict=True)}
         super().__init__(options, **more)

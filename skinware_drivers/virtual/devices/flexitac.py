@@ -1,8 +1,8 @@
-"""An emulated FlexiTac or 3D-ViTac pad: sends from power-up to the end, and hears nothing.
+"""An emulated FlexiTac or 3D-ViTac pad: it sends from power-up on, and hears nothing.
 
 Source: ``32_16_fast.ino`` of FlexiTac/FlexiTac_Hardware_Repo; for the text, ``MatrixArray.ino`` of
-binghao-huang/3D-ViTac_Tactile_Hardware. A board sends the next marker at once behind a frame; this one sends it a
-period later, so that its frames are known to be whole a period later.
+binghao-huang/3D-ViTac_Tactile_Hardware. A real board sends the next marker right after a frame; this one sends
+it a period later, so that a frame is known to be whole only then.
 """
 
 from __future__ import annotations
@@ -14,23 +14,21 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the pad is, and which of its lines are broken."""
+    """Options of the pad."""
 
     rows: Annotated[int, Meta(ge=1, le=64, description="rows of the pad")] = 12
     columns: Annotated[int, Meta(ge=1, le=64, description="columns of the pad")] = 32
-    firmware: Annotated[Literal["binary", "text"], Meta(description="which one it has")] = "binary"
+    firmware: Annotated[Literal["binary", "text"], Meta(description="firmware of the pad")] = "binary"
     broken_rows: Annotated[tuple[int, ...], Meta(description="rows whose cells all read 0")] = ()
     broken_columns: Annotated[tuple[int, ...], Meta(description="columns whose cells all read 0")] = ()
 
 
 class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
-    """One pad, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One pad, device 1.
 
     Values: one for each cell, row by row.
     """
@@ -39,6 +37,7 @@ class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
     rest = 20
     swing = 220
     speed_mbit_s: ClassVar[int] = 2
+    streams = "always"
 
     def __init__(self, options: EmulatedFlexiTacOptions, **more: Any) -> None:
         super().__init__(options, **more)
@@ -48,9 +47,6 @@ class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(self.options.rows * self.options.columns, self.options.columns)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         cells = np.reshape(values, self._sound.shape) * self._sound

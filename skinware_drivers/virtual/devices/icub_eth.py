@@ -1,4 +1,4 @@
-"""Emulated skin boards behind an Ethernet board of iCub: its datagrams.
+"""Emulated skin boards behind an Ethernet board of iCub.
 
 Source: robotology/icub-firmware-shared; the vectors in tests/streams/test_icub_eth.py. A device is a skin board.
 """
@@ -13,15 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _ROOM = 24
 
 
 def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_us: int) -> bytes:
-    """One signal of a skin, with all its room, in a frame; another variable comes before it, as in real ones."""
+    """Return a frame with one signal of a skin, with all its room, after another variable, as in real frames."""
     items = b"".join(struct.pack("<H8s", len(data) << 12 | can, data) for can, data in records)
     array = struct.pack("<BBBB", _ROOM, 10, len(records), 0) + items.ljust(10 * _ROOM, b"\0")
     joint = struct.pack("<BBHI", 0, 4, 5, 0x0100_0004) + b"joint".ljust(8, b"\0")
@@ -30,7 +28,7 @@ def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_
 
 
 class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which boards there are."""
+    """Options of the boards."""
 
     boards: Annotated[tuple[int, ...], Meta(description="addresses of the skin boards")] = (1,)
     triangles: Annotated[int, Meta(ge=1, le=12, description="triangles of each board")] = 12
@@ -39,22 +37,17 @@ class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
 
 
 class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
-    """One Ethernet board; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+    """One Ethernet board."""
 
     full_scale = 255
     rest = 240
     swing = -150
     speed_mbit_s = 100
-
-    def __init__(self, options: EmulatedIcubEthOptions, **more: object) -> None:
-        self.numbers = options.boards
-        super().__init__(options, **more)
+    streams = "always"
+    numbered_by = "boards"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(12 * self.options.triangles, 12)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
 
     def kinds(self) -> Sequence[str]:
         """Name the CAN frames that the board's datagrams carry."""

@@ -1,4 +1,4 @@
-"""An emulated RH56DFTP hand of Inspire Robots: its registers, whose addresses count bytes.
+"""An emulated RH56DFTP hand of Inspire Robots, whose addresses count bytes.
 
 Source: the maker's manual PRJ-02-TS-U-010 V1.0.0; the vectors in tests/modbus/test_inspire.py.
 """
@@ -12,9 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
-from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions
 
 _FINGER = ((3, 3), (12, 8), (10, 8))
 _THUMB = ((3, 3), (12, 8), (3, 3), (12, 8))
@@ -24,12 +22,10 @@ _SHAPES = (*_FINGER * 4, *_THUMB, _PALM)
 
 
 class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the hand is, and what is wrong with it."""
+    """Options of the hand."""
 
-    unit: Annotated[int, Meta(ge=0, le=255, description="its number")] = 1
-    zero: Annotated[
-        tuple[int, ...], Meta(description="matrices that tell nothing but 0: 1 to 17, the last is the palm")
-    ] = ()
+    unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand")] = 1
+    zero: Annotated[tuple[int, ...], Meta(description="matrices that send only 0: 1 to 17, the last is the palm")] = ()
     swapped: Annotated[bool, Meta(description="send the low byte of a register first")] = False
 
 
@@ -41,13 +37,10 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
     swing = 3000
     speed_mbit_s = 100
     step = 2
-
-    def __init__(self, options: EmulatedInspireOptions, **more: object) -> None:
-        self.numbers = (options.unit,)
-        super().__init__(options, **more)
+    numbered_by = "unit"
 
     def places(self) -> npt.NDArray[np.float64]:
-        """Fingers beside each other, the little one left, each from its tip down; the palm below."""
+        """Return places of fingers side by side, the little one left, each from its tip down; the palm is below."""
         found = []
         for finger in range(5):
             shapes = _THUMB if finger == 4 else _FINGER
@@ -60,23 +53,23 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
         return np.concatenate(found)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:  # noqa: ARG002
-        """From 3000 on, two addresses each."""
-        told: list[int] = []
+        """Return the registers from 3000 on, two addresses each."""
+        sent: list[int] = []
         for number, (rows, columns) in enumerate(_SHAPES, 1):
             n = rows * columns
-            matrix = [0] * n if number in self.options.zero else list(values[len(told) : len(told) + n])
+            matrix = [0] * n if number in self.options.zero else list(values[len(sent) : len(sent) + n])
             if (rows, columns) == _PALM:
                 matrix = [
                     matrix[row * columns + column] for column in range(columns) for row in range(rows - 1, -1, -1)
                 ]
-            told += matrix
+            sent += matrix
         if self.options.swapped:
-            told = [value >> 8 | (value & 0xFF) << 8 for value in told]
-        return {3000 + 2 * number: value for number, value in enumerate(told)}
+            sent = [value >> 8 | (value & 0xFF) << 8 for value in sent]
+        return {3000 + 2 * number: value for number, value in enumerate(sent)}
 
 
 def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[float, float]) -> npt.NDArray[np.float64]:
-    """(rows * columns, 2) places in a rectangle, row by row."""
+    """Return (rows * columns, 2) places in a rectangle, row by row."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     share = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)
     return np.array(corner) + share * size

@@ -1,7 +1,7 @@
-"""Emulated LinkerHands, as far as their touch: questions and answers have one identifier.
+"""The touch of emulated LinkerHands: questions and answers have one identifier.
 
-Sources: linkerhand-python-sdk, linkerhand-ros2-sdk. Assumed: all parts of a hand are felt when its first one is asked
-for; with ``program_ms`` a program on the same bus asks for all of them in turn, and moves the fingers.
+Sources: linkerhand-python-sdk, linkerhand-ros2-sdk. It is assumed that a hand samples all its parts when the first one
+is asked for. With ``program_ms``, a program on the same bus asks for all of them in turn, and moves the fingers.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 _SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
 _OF_HAND = {"hand_23x9": ((23, 9), (28, 20)), "hand_12x6": ((12, 6), (14, 16))}
@@ -26,14 +24,14 @@ _FELT, _WANTED = "felt", "wanted"  # in the memory of a device
 
 
 class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which hands there are, and who asks them."""
+    """Options of the hands, and of their own program."""
 
     hands: Annotated[tuple[int, ...], Meta(description="identifiers of the hands")] = (0x27,)
     touch: Annotated[
         Literal["12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],
         Meta(description="matrices, values of each finger, or matrices of the whole hand"),
     ] = "12x6"
-    palm: Annotated[bool, Meta(description="whether the palm has a matrix, too")] = False
+    palm: Annotated[bool, Meta(description="the palm has a matrix, too")] = False
     program_ms: Annotated[
         int, Meta(ge=0, description="time between two rounds of questions of the hands' own program, ms; 0: it is off")
     ] = 50
@@ -41,7 +39,7 @@ class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fie
 
 
 class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
-    """Hands on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+    """Hands on one bus.
 
     Values: row by row, from the thumb to the little finger and the palm; or normal force of all fingers, tangential
     force of all, direction, proximity.
@@ -51,9 +49,9 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
     swing = 200
     longest_queue = 1024
     period_s = 0.05
+    numbered_by = "hands"
 
     def __init__(self, options: EmulatedLinkerHandOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.hands
         self.identifiers: Collection[int] = frozenset(options.hands)
         super().__init__(options, **more)
         if options.program_ms:
@@ -70,7 +68,7 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
             self.start(device, now_ns)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        """Answer a question; ignore what it does not know."""
+        """Answer a question; ignore unknown ones."""
         if identifier != device.number or not payload or payload[0] in self.options.mute:
             return False
         if payload == b"\xb0":
@@ -84,29 +82,29 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
                 device.memory[_WANTED] = payload[0]
                 self.burst(device, now_ns)
             else:
-                for frame in self._told(device, payload[0]):
+                for frame in self._answers(device, payload[0]):
                     self.reply(device, frame, now_ns)
         else:
             return False
         return True
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Answers by their command: ``0xb1``; what the program asks and moves has no such kind."""
+        """Name answers by their command: ``0xb1``; the program's own frames have another kind."""
         return "question" if payload == self._question(payload[0]) else f"0x{payload[0]:02x}"
 
     def kinds(self) -> Sequence[str]:
         return [f"0x{command:02x}" for command in self._commands]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        """What was asked for; or a round of the program's questions, with the answers and a movement between them."""
+        """Return the answer to a question; or a round of the program's questions, with answers and a movement."""
         device.memory[_FELT] = values
         if (wanted := device.memory.pop(_WANTED, None)) is not None:
-            return list(self._told(device, wanted))
-        told: list[CanFrame] = []
+            return list(self._answers(device, wanted))
+        sent: list[CanFrame] = []
         for command in self._commands:
-            told += [(device.number, self._question(command)), *self._told(device, command)]
+            sent += [(device.number, self._question(command)), *self._answers(device, command)]
         return [
-            *told,
+            *sent,
             (device.number, bytes.fromhex("01FF80FF10FF20")),
             (device.number, bytes.fromhex("01FE81FE11FE21")),
         ]
@@ -118,7 +116,7 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         return range(0xB1, 0xB7 if self.options.palm else 0xB6)
 
     def _question(self, command: int) -> bytes:
-        """What makes a hand tell what this command is about; nothing does if it has no such command."""
+        """Return the question for a command; empty if the hand has no such command."""
         if command not in self._commands:
             return b""
         if self.options.touch in _OF_HAND:
@@ -131,7 +129,7 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
             return _OF_HAND[self.options.touch][command == 0xB6]
         return _SIZES[self.options.touch]
 
-    def _told(self, device: Device, command: int) -> Iterator[CanFrame]:
+    def _answers(self, device: Device, command: int) -> Iterator[CanFrame]:
         nth, values = command - self._commands[0], device.memory[_FELT]
         if self.options.touch in _FIRST:
             yield device.number, bytes([command, *values[5 * nth : 5 * nth + 5]])

@@ -1,4 +1,4 @@
-"""An emulated open patch: what a microcontroller with ``openpatch.h`` does, for those who have none yet.
+"""An emulated open patch: it behaves as a microcontroller with ``openpatch.h``.
 
 Source: docs/protocols/patch-serial.md.
 """
@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _TAXELS = 12
 _SHORTEST_US, _LONGEST_US = 1000, 1_000_000
@@ -36,7 +34,7 @@ def message(number: int, payload: bytes) -> bytes:
 
 
 def stuff(data: bytes) -> bytes:
-    """Without zeros: before each run of other bytes its length and one; a run of 254 is not followed by a zero."""
+    """Return data without zeros: each run of other bytes after its length plus 1; no zero follows a run of 254."""
     stuffed = b""
     runs = data.split(b"\0")
     for at, run in enumerate(runs):
@@ -50,7 +48,7 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(stuffed: bytes) -> bytes:
-    """What it was before; nothing if it was never stuffed."""
+    """Return the data before stuffing; empty if these bytes are not stuffed."""
     data, at = b"", 0
     while at < len(stuffed):
         code = stuffed[at]
@@ -65,7 +63,7 @@ def unstuff(stuffed: bytes) -> bytes:
 
 
 class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the patch is."""
+    """Options of the patch."""
 
     modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
     period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
@@ -73,7 +71,7 @@ class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknow
 
 
 class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
-    """One patch, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One patch, device number 1.
 
     Values: those of the pressure sensors of module 0, of module 1 ...
     """
@@ -107,7 +105,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
             off=set(),
             tared=set(),
             first_cycle=device.cycle,
-            us=0,  # device time of cycle us_cycle, which began when the period was last set
+            us=0,  # device time of cycle us_cycle, the first with this period
             us_cycle=0,
             stamp_us=0,
             sent=0,
@@ -128,7 +126,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         return whole, rest[-_LONGEST:]
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Answer a request; nothing else means anything to a patch."""
+        """Answer a request; a patch ignores all else."""
         heard = unstuff(command)
         body = heard[:-4]
         if len(body) < 2 or zlib.crc32(body) != int.from_bytes(heard[-4:], "little") or not 0x01 <= body[0] <= 0x1F:
@@ -141,15 +139,15 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
             error, answer = _BAD_LENGTH, b""
         else:
             error, answer = self._answer(device, request, arguments, now_ns)
-        said = message(0x40 + request, number + bytes([error]) + answer)
+        reply = message(0x40 + request, number + bytes([error]) + answer)
         if error == _OK and request == _START:
-            said += self._what_is_off(device, device.memory["off"])
+            reply += self._masked(device, device.memory["off"])
         elif error == _OK and request == _ENABLE and not arguments[1]:
-            said += self._what_is_off(device, self._meant(arguments[0]))
-        return said
+            reply += self._masked(device, self._meant(arguments[0]))
+        return reply
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``module0`` and so on, ``boot``, ``report``; other messages are answers."""
+        """Return ``module0`` and so on, ``boot`` or ``report``; other messages are answers."""
         body = unstuff(payload.split(b"\0")[0])
         return f"module{body[1]}" if body[0] == _DATA else {_BOOT: "boot", _REPORT: "report"}.get(body[0], "answer")
 
@@ -213,7 +211,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         self.change_period(device, now_ns, period_us / 1e6)
         return _OK, struct.pack("<I", period_us)
 
-    def _what_is_off(self, device: Device, modules: Collection[int]) -> bytes:
+    def _masked(self, device: Device, modules: Collection[int]) -> bytes:
         if device.streams_from_ns is None:
             return b""
         cycles = device.cycle - device.memory["first_cycle"]

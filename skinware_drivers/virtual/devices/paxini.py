@@ -1,4 +1,4 @@
-"""Emulated boards of Paxini's PX-6AX GEN3: their bytes on the line.
+"""Emulated boards of Paxini's PX-6AX GEN3.
 
 Source: the captured requests and the programs named in docs/drivers/paxini.md; the vectors in
 tests/serial/test_paxini.py.
@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _LONGEST_COMMAND = 64
 _NO_COMMAND = 2
@@ -26,13 +24,13 @@ Forces = npt.NDArray[np.int64]
 
 
 def message(*parts: bytes) -> bytes:
-    """A message as it goes over the line: these bytes, and their LRC."""
+    """Return a message on the line: these bytes, and their LRC."""
     sent = b"".join(parts)
     return sent + bytes([-sum(sent) & 0xFF])
 
 
 class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which board it is, and what is attached to it."""
+    """Options of the board, and of the modules at it."""
 
     board: Annotated[
         Literal["converter", "high_speed"], Meta(description="sensors that are asked, or a hand that streams")
@@ -47,17 +45,18 @@ class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_f
         *range(20, 23),
     )
     acknowledge: Annotated[
-        Literal["reply", "frame", "nothing"], Meta(description="high-speed: how it says that it streams")
+        Literal["reply", "frame", "nothing"],
+        Meta(description="high-speed: acknowledgement of the start"),
     ] = "reply"
-    error: Annotated[int, Meta(ge=0, le=255, description="high-speed: error that all its frames have")] = 0
-    calibrates_s: Annotated[float, Meta(ge=0, le=60, description="high-speed: how long it calibrates, s")] = 1.0
+    error: Annotated[int, Meta(ge=0, le=255, description="high-speed: error code in all its frames")] = 0
+    calibrates_s: Annotated[float, Meta(ge=0, le=60, description="high-speed: duration of a calibration, s")] = 1.0
     period_ms: Annotated[float, Meta(ge=1, le=1000, description="high-speed: time between two frames, ms")] = 11
 
 
 class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     """Sensors behind a converter board, by their ids; or one high-speed board, number 1.
 
-    Values: Fx, Fy, Fz of each taxel, -128 to 127. Fz is sent as the same byte, which means 0 to 255.
+    Values: Fx, Fy, Fz of each taxel, -128 to 127. The byte of Fz means 0 to 255.
     """
 
     full_scale = 127
@@ -80,11 +79,11 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return self.options.slots
 
     def points_of(self, slot: int) -> int:
-        """Taxels of the module in a slot: of those on the palm, nine are told of."""
+        """Return the taxels of the module in a slot; those on the palm send at most nine."""
         return self.options.points if slot < 20 else min(9, self.options.points)
 
     def boot(self, device: Device, now_ns: int) -> None:
-        """A high-speed board streams, if the options want that; sensors only answer."""
+        """Let a high-speed board stream, if the options say so; sensors only answer."""
         if self.options.board == "high_speed":
             super().boot(device, now_ns)
 
@@ -95,11 +94,11 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return felt
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Commands say how long they are, on each board in another place; one of the other board is none."""
+        """Cut by the length of a command, which each board has in another place; ignore those of the other board."""
         return cut_packets(heard, b"\x55\xaa", self._length)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Only commands whose LRC is right have an answer."""
+        """Answer commands with a right LRC."""
         if len(command) <= _NO_COMMAND or sum(command) & 0xFF:
             return None
         of_board: Callable[[Device, bytes, int], bytes | None] = self._answer_of_sensor
@@ -108,7 +107,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return of_board(device, command, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``data``; other messages are answers."""
+        """Return ``data`` or ``answer``."""
         if self.options.board == "high_speed":
             return "data" if payload[:2] == b"\xaa\x56" else "answer"
         return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
@@ -205,15 +204,15 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         felt[:, 2] &= 0xFF
         if device.memory.pop("tare", False):
             device.memory["zero"] = felt
-        return _told(felt - device.memory.get("zero", 0))
+        return _clipped(felt - device.memory.get("zero", 0))
 
 
-def _told(forces: Forces) -> Forces:
+def _clipped(forces: Forces) -> Forces:
     return np.clip(forces, (-128, -128, 0), (127, 127, 255))
 
 
 def _resultant(forces: Forces) -> Forces:
-    return _told(forces.sum(axis=0))
+    return _clipped(forces.sum(axis=0))
 
 
 def _bytes(forces: Forces) -> bytes:

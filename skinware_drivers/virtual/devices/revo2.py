@@ -1,6 +1,7 @@
-"""An emulated Revo2 hand of BrainCo with touch, in one of its four editions: its registers.
+"""An emulated Revo2 hand of BrainCo with touch, in one of its four editions.
 
-Source: what the maker's program bc_stark_sdk 2.0.8 reads and writes; the vectors in tests/modbus/test_revo2.py.
+Source: the registers that the maker's program bc_stark_sdk 2.0.8 reads and writes; the vectors in
+tests/modbus/test_revo2.py.
 """
 
 from __future__ import annotations
@@ -12,10 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
 _SWITCHES = {
@@ -34,17 +32,17 @@ _N_VALUES = {"touch": 20, "pressure": 97, "array_pressure": 25, "force3d": 4 * 9
 
 
 class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the hand is."""
+    """Options of the hand."""
 
-    unit: Annotated[int, Meta(ge=1, le=254, description="its number")] = 127
-    side: Annotated[Literal["right", "left"], Meta(description="which hand it says it is")] = "right"
+    unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 127
+    side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     edition: Annotated[
         Literal["touch", "pressure", "force3d", "array_pressure"], Meta(description="which sensors it has")
     ] = "touch"
-    says_edition: Annotated[bool, Meta(description="it tells which they are, in register 970")] = True
+    says_edition: Annotated[bool, Meta(description="it reports its edition, in register 970")] = True
     kind: Annotated[Literal[0, 1, 2], Meta(description="values of the pressure edition: raw, calibrated, force")] = 0
     enabled: Annotated[bool, Meta(description="touch is on as soon as the hand has power")] = True
-    touch: Annotated[bool, Meta(description="it is a hand with touch; others take commands and have no data")] = True
+    touch: Annotated[bool, Meta(description="it has touch; hands without take commands and have no data")] = True
     abnormal: Annotated[tuple[int, ...], Meta(description="fingers (0 to 4) whose status is 1, abnormal")] = ()
     missing: Annotated[tuple[int, ...], Meta(description="fingers (0 to 4) whose status is 2, no sensor")] = ()
     cold: Annotated[bool, Meta(description="array_pressure: its sensors never become warm")] = False
@@ -53,16 +51,16 @@ class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fi
 class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
     """One hand. Values of the edition touch: force, tangential force and direction of each finger; then proximities.
 
-    Of the others: their registers in order, where force3d has x, y and z of each point.
+    Values of the other editions: their registers in order; force3d has x, y and z of each point.
     """
 
     full_scale: int | Sequence[int] = [0xFFFE] * 15 + [0xFFFF_FFFE] * 5
     rest: int | Sequence[int] = [30, 5, 90] * 5 + [70_000] * 5
     swing: int | Sequence[int] = [2500, 300, 0] * 5 + [90_000] * 5
     function = 4
+    numbered_by = "unit"
 
     def __init__(self, options: EmulatedRevo2Options, **more: object) -> None:
-        self.numbers = (options.unit,)
         if options.edition != "touch":
             self.full_scale, self.rest, self.swing = (127, 3, 90) if options.edition == "force3d" else (0xFFFF, 30, 900)
         super().__init__(options, **more)
@@ -102,15 +100,15 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
     def of_other_function(self, device: Device) -> Mapping[int, int]:
         options = self.options
         on = int(options.touch and device.memory.get("on", options.enabled))
-        said = {901: 2 if options.side == "left" else 1, **dict.fromkeys(_SWITCHES[options.edition], on)}
+        found = {901: 2 if options.side == "left" else 1, **dict.fromkeys(_SWITCHES[options.edition], on)}
         if options.says_edition:
-            said[970] = _EDITIONS[options.edition] if options.touch else 0
+            found[970] = _EDITIONS[options.edition] if options.touch else 0
         if options.edition == "pressure":
-            said[6000] = device.memory.get("kind", options.kind)
-        return said
+            found[6000] = device.memory.get("kind", options.kind)
+        return found
 
     def written(self, device: Device, address: int, value: int) -> bool:
-        """Switches of touch; and calibrations, which change nothing here."""
+        """Switch touch; accept calibrations, which change nothing here."""
         if address in _SWITCHES[self.options.edition]:
             device.memory["on"] = bool(value)
             return True
@@ -120,7 +118,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         return address in _OTHER_COMMANDS[self.options.edition]
 
     def _touch(self, values: Sequence[int]) -> Mapping[int, int]:
-        """The high word of a proximity comes first."""
+        """Return the registers of the edition touch; the high word of a proximity comes first."""
         words = list(values[:15])
         for proximity in values[15:]:
             words += [proximity >> 16, proximity & 0xFFFF]

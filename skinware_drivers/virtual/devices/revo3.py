@@ -1,7 +1,7 @@
-"""An emulated Revo3 hand of BrainCo: its registers, in the three forms that its maker's programs read.
+"""An emulated Revo3 hand of BrainCo, with registers in the three mappings that its maker's programs read.
 
-Source: BrainCoTech/brainco-revo3-sdk 7ba96eb (2026-08-03), and what bc-revo3-sdk 1.5.1 and 2.3.2 ask; the vectors in
-tests/modbus/test_revo3.py.
+Source: BrainCoTech/brainco-revo3-sdk 7ba96eb (2026-08-03), and the questions of bc-revo3-sdk 1.5.1 and 2.3.2; the
+vectors in tests/modbus/test_revo3.py.
 """
 
 from __future__ import annotations
@@ -13,10 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
 
 _PRESSURE = {
     4200: 36,
@@ -36,21 +33,21 @@ _MATRIX = (53, 56, 22, 22, 27, 22, 27, 22, 27, 22, 27)
 _PACKED_AT = (5240, 5340, 5380, 5440, 5480, 5540, 5580, 5640, 5680, 5740, 5780)
 _VALUES = {"adc": 0, "raw": 1, "force": 2}
 _SERIAL_NUMBER = "BCUTR40000000001"
-_KIND = "4023"  # what was written there, in the memory of a device
+_KIND = "4023"  # in the memory of a device: content of that register
 
 
 class EmulatedRevo3Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the hand is."""
+    """Options of the hand."""
 
-    unit: Annotated[int, Meta(ge=1, le=254, description="its number")] = 1
-    side: Annotated[Literal["right", "left"], Meta(description="which hand it says it is")] = "right"
+    unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 1
+    side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     mapping: Annotated[Literal["pressure", "matrix", "packed"], Meta(description="which registers it has")] = "pressure"
-    says_mapping: Annotated[bool, Meta(description="it tells which of them it has, in register 135")] = True
-    points: Annotated[tuple[int, ...], Meta(description="taxels of its pads, if they are others than usual")] = ()
+    says_mapping: Annotated[bool, Meta(description="it reports its mapping, in register 135")] = True
+    points: Annotated[tuple[int, ...], Meta(description="taxels of its pads, if not the usual ones")] = ()
     sums: Annotated[bool, Meta(description="mapping pressure: it sends sums of zones")] = False
-    values: Annotated[Literal["adc", "raw", "force"], Meta(description="what its values are")] = "adc"
+    values: Annotated[Literal["adc", "raw", "force"], Meta(description="kind of its values")] = "adc"
     adc_pads: Annotated[tuple[int, ...], Meta(description="matrix, packed: pads of values=force that send adc")] = ()
-    enabled: Annotated[bool, Meta(description="its pads are on as soon as it has power; else they tell 0")] = True
+    enabled: Annotated[bool, Meta(description="its pads are on as soon as it has power; else they send 0")] = True
 
 
 class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
@@ -60,9 +57,9 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
     rest = 40
     swing = 3000
     speed_mbit_s = 5
+    numbered_by = "unit"
 
     def __init__(self, options: EmulatedRevo3Options, **more: object) -> None:
-        self.numbers = (options.unit,)
         self.function = 4 if options.mapping == "pressure" else 3
         if options.mapping == "packed":
             self.full_scale, self.swing = 0xFF, 150
@@ -73,7 +70,7 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         return on_a_grid(42 if self.options.sums else sum(self._points), 16)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
-        """What is in no pad is 0."""
+        """Return the registers of the data; those of no pad are 0."""
         options = self.options
         if options.mapping != "pressure":
             found = dict.fromkeys(range(5240, 5900), 0)
@@ -98,18 +95,18 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         return found
 
     def beside(self, device: Device) -> Mapping[int, int]:
-        """What a matrix hand says of itself; its names and the part that it does not fill now, of a pressure hand."""
+        """Return the settings of a matrix hand, or the names and the unused part of a pressure hand."""
         if self.options.mapping != "pressure":
-            return self._said(device)
+            return self._settings(device)
         not_filled = range(4200, 4752) if self._sends_sums(device) else range(4100, 4142)
         return dict.fromkeys(not_filled, 0) | _TEXTS
 
     def of_other_function(self, device: Device) -> Mapping[int, int]:
-        """What a pressure hand says of itself; of a matrix hand, its names."""
-        return self._said(device) if self.options.mapping == "pressure" else _TEXTS
+        """Return the settings of a pressure hand, or the names of a matrix hand."""
+        return self._settings(device) if self.options.mapping == "pressure" else _TEXTS
 
     def written(self, device: Device, address: int, value: int) -> bool:
-        """Switches of the pads, what they send, and what sets them to zero, which changes nothing here."""
+        """Write the switches and modes of the pads; accept the zero command, which changes nothing here."""
         is_matrix = self.options.mapping != "pressure"
         if address in (range(5900, 5911) if is_matrix else range(4000, 4011)):
             device.memory["on"] = bool(value)
@@ -123,12 +120,11 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
     def _sends_sums(self, device: Device) -> bool:
         return bool(device.memory.get(_KIND, self.options.sums))
 
-    def _said(self, device: Device) -> dict[int, int]:
+    def _settings(self, device: Device) -> dict[int, int]:
         options = self.options
         is_matrix, on = options.mapping != "pressure", int(device.memory.get("on", options.enabled))
-        said = dict.fromkeys(
-            [*range(240, 261), *range(270, 291)], 0
-        )  # limits of joints, which the maker's program asks
+        # the maker's program asks for the limits of joints
+        said = dict.fromkeys([*range(240, 261), *range(270, 291)], 0)
         said |= {101: 1 if options.side == "right" else 2, 108: options.unit}
         if options.says_mapping:
             said[135] = 2 if is_matrix else 1

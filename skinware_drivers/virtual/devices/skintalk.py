@@ -1,4 +1,4 @@
-"""Emulated patches that are read with skintalk: silent until '1', then a record for every cell, until '0'.
+"""Emulated patches for skintalk: silent until '1', then a record for every cell, until '0'.
 
 Source: ``skintalk.c`` of github.com/t173/skinvis.
 """
@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which patches there are."""
+    """Options of the patches."""
 
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches")] = (1, 2, 3, 4, 5, 6, 7, 8)
     cells: Annotated[int, Meta(ge=1, le=16, description="cells of each patch")] = 16
@@ -27,7 +25,7 @@ class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown
 
 
 class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
-    """Patches on one line; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """Patches on one line.
 
     Values: one for each cell.
     """
@@ -36,16 +34,13 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
     lowest = -0x80_0000
     rest = 50_000
     swing = 2_000_000
-
-    def __init__(self, options: EmulatedSkintalkOptions, **more: Any) -> None:
-        self.numbers = options.patches
-        super().__init__(options, **more)
+    numbered_by = "patches"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(self.options.cells, 4)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
-        """Commands are single bytes, and mean nothing but start and stop."""
+        """Cut commands of one byte, start and stop; other bytes mean nothing."""
         return [bytes([byte]) for byte in heard if byte in b"01"], b""
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
@@ -56,7 +51,7 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
         return b""
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Cells by the byte that names patch and cell: ``0x13``."""
+        """Name cells by the byte for patch and cell: ``0x13``."""
         return f"0x{payload[1]:02x}"
 
     def kinds(self) -> Sequence[str]:

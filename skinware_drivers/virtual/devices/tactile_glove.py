@@ -1,6 +1,6 @@
-"""An emulated tactile glove: sends from power-up to the end, and hears nothing.
+"""An emulated tactile glove: it sends from power-up on, and hears nothing.
 
-Source: what tactile-filters ``linux/libio/SerialInput.cpp`` reads.
+Source: the bytes that tactile-filters ``linux/libio/SerialInput.cpp`` reads.
 """
 
 from __future__ import annotations
@@ -12,36 +12,32 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the glove is."""
+    """Options of the glove."""
 
     taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
 
 
 class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
-    """One glove, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One glove, device 1.
 
-    Values: one for each taxel, as it is sent: pressure lowers it.
+    Values: one for each taxel; pressure lowers it.
     """
 
     full_scale = 0xFFF
     rest = 4000
     swing = -3000
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(self.options.taxels, 8)
 
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
-
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Taxels by their first byte: ``0x3c``."""
+        """Name taxels by their first byte: ``0x3c``."""
         return f"0x{payload[0]:02x}"
 
     def kinds(self) -> Sequence[str]:

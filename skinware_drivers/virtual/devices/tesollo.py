@@ -1,4 +1,4 @@
-"""An emulated hand of Tesollo: its bytes on a TCP connection.
+"""An emulated hand of Tesollo, on a TCP connection.
 
 Source: the maker's program dg_tcp_comm; the vectors in tests/streams/test_tesollo.py.
 """
@@ -13,16 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _MOTORS_AND_FINGERS = {"1f": (3, 1), "2f": (6, 2), "3f": (12, 3), "4f": (18, 4), "5f": (20, 5), "5f15": (15, 5)}
 _MODEL = {"1f": 0x1F02, "2f": 0x2F03, "3f": 0x3F02, "4f": 0x4F02, "5f": 0x5F22, "5f15": 0x5F44}
 
 
 class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the hand is."""
+    """Options of the hand."""
 
     hand: Annotated[Literal["1f", "2f", "3f", "4f", "5f", "5f15"], Meta(description="model")] = "5f"
     tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes", "four_axes"], Meta(description="kind of sensors")] = (
@@ -30,21 +28,19 @@ class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
     )
     fitted: Annotated[int, Meta(ge=1, le=31, description="fingers that have one, as bits")] = 31
     pads: Annotated[bool, Meta(description="send zeros for fingers that have none")] = False
-    old: Annotated[bool, Meta(description="firmware that does not tell which sensors there are")] = False
+    old: Annotated[bool, Meta(description="firmware that does not report its sensors")] = False
 
 
 class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
-    """One hand, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+    """One hand, device number 1."""
 
     full_scale = 250
     swing = 220
     speed_mbit_s = 100
+    streams = "never"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(len(self._fitted) * self._each_has, self._each_has)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        """Wait to be asked."""
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\0", lambda part: max(3, part[1]) if len(part) > 1 else 0)
@@ -62,7 +58,7 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         return None
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``data``; other messages are answers."""
+        """Return ``data`` or ``answer``."""
         return "data" if payload[2] == 1 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
@@ -70,10 +66,10 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         body = b""
         if 1 in device.memory["asked"]:
             body += b"".join(struct.pack(">BhhhB", motor + 1, 10 * motor, -motor, 305, 0) for motor in range(motors))
-        told = iter(values)
+        sent = iter(values)
         for finger in range(_MOTORS_AND_FINGERS[self.options.hand][1]):
             if finger in self._fitted:
-                body += struct.pack(self._form, *[next(told) for _ in range(self._each_has)])
+                body += struct.pack(self._form, *[next(sent) for _ in range(self._each_has)])
             elif self.options.pads:
                 body += bytes(struct.calcsize(self._form))
         return [struct.pack(">HB", len(body) + 3, 1) + body]
@@ -92,10 +88,8 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         return {"tactile_m": ">15B", "tactile_s": ">18H", "six_axes": ">6h", "four_axes": ">3h4xh"}[self.options.tips]
 
     def _version(self) -> bytes:
-        model, kind = (
-            _MODEL[self.options.hand],
-            {"tactile_m": 3, "tactile_s": 5, "six_axes": 1, "four_axes": 4}[self.options.tips],
-        )
+        model = _MODEL[self.options.hand]
+        kind = {"tactile_m": 3, "tactile_s": 5, "six_axes": 1, "four_axes": 4}[self.options.tips]
         if self.options.old:
             return struct.pack(">HBHBB", 7, 8, model, 1, 5)
         return struct.pack(">HBHBBBB", 9, 8, model, 1, 5, kind, self.options.fitted)

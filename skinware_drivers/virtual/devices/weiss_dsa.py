@@ -1,4 +1,4 @@
-"""An emulated DSACON32m with the six matrices of a hand SDH: its bytes on the line.
+"""An emulated DSACON32m with the six matrices of a hand SDH.
 
 Source: the makers' SDHLibrary; the vectors in tests/serial/test_weiss_dsa.py.
 """
@@ -13,29 +13,27 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual.devices.weiss_wts import BEGIN, crc, cut_commands
 
 _OK, _WRONG = 0, 1
 
 
 def message(command: int, payload: bytes) -> bytes:
-    """A message as it goes over the line: without payload it has no checksum."""
-    said = struct.pack("<BH", command, len(payload)) + payload
-    return BEGIN + said + (struct.pack("<H", crc(said)) if payload else b"")
+    """Return a message on the line; without payload it has no checksum."""
+    body = struct.pack("<BH", command, len(payload)) + payload
+    return BEGIN + body + (struct.pack("<H", crc(body)) if payload else b"")
 
 
 class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the controller has."""
+    """Options of the controller."""
 
     fingers: Annotated[int, Meta(ge=1, le=3, description="fingers, of two matrices each")] = 3
     period_ms: Annotated[float, Meta(ge=10, le=1000, description="time between two frames, ms")] = 100
 
 
 class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
-    """One controller, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+    """One controller, device number 1."""
 
     full_scale = 4095
     swing = 3500
@@ -55,8 +53,8 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
         if number == 0x02:
             return message(number, struct.pack("<HHHBIB", _OK, len(self._rows), 0, 1, 42, 0))
         if number == 0x0B and len(arguments) == 1 and arguments[0] < len(self._rows):
-            told = struct.pack("<HffHH6s2sB", _OK, 3.4, 3.4, 6, self._rows[arguments[0]], b"ABCDEF", b"", 1)
-            return message(number, told + struct.pack("<7fB", 0, 0, 0, 0, 0, 0, 4095, 0))
+            matrix = struct.pack("<HffHH6s2sB", _OK, 3.4, 3.4, 6, self._rows[arguments[0]], b"ABCDEF", b"", 1)
+            return message(number, matrix + struct.pack("<7fB", 0, 0, 0, 0, 0, 0, 4095, 0))
         if number == 0x03 and len(arguments) == 3:
             self.stop(device)
             device.memory["runs"] = bool(arguments[0] & 1)
@@ -66,7 +64,7 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
         return None
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``data``; other messages are answers."""
+        """Return ``data`` or ``answer``."""
         return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
@@ -84,5 +82,5 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
 
     @property
     def _rows(self) -> list[int]:
-        """Of each matrix: those near the palm are longer."""
+        """Rows of each matrix: those near the palm are longer."""
         return [14, 13] * self.options.fingers

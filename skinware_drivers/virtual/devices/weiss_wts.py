@@ -1,4 +1,4 @@
-"""An emulated WTS tactile sensor of Weiss Robotics: its bytes on the line.
+"""An emulated WTS tactile sensor of Weiss Robotics, and the checksum and commands of that maker.
 
 Source: the programs wts_driver and wts_ft; the vectors in tests/serial/test_weiss_wts.py.
 """
@@ -13,13 +13,39 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
+BEGIN = b"\xaa\xaa\xaa"
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
 _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
+
+
+def crc(data: bytes) -> int:
+    """Return the checksum bit by bit: the polynomial of the CCITT, shifted the other way."""
+    state = 0xFFFF
+    for byte in data:
+        entry = ((state ^ byte) & 0xFF) << 8
+        for _ in range(8):
+            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
+        state = entry ^ state >> 8
+    return state
+
+
+def cut_commands(heard: bytes, *, bare_when_empty: bool = False) -> tuple[list[bytes], bytes]:
+    """Return the whole commands, by the length in each, and the rest.
+
+    Args:
+        heard: bytes of the line.
+        bare_when_empty: a command without payload has no checksum.
+    """
+
+    def size(part: bytes) -> int:
+        if len(part) < 6:
+            return 0
+        length = int.from_bytes(part[4:6], "little")
+        return 8 + length if length or not bare_when_empty else 6
+
+    return cut_packets(heard, BEGIN, size)
 
 
 def message(command: int, payload: bytes) -> bytes:
@@ -28,14 +54,14 @@ def message(command: int, payload: bytes) -> bytes:
 
 
 class EmulatedWeissWtsOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the sensor is."""
+    """Options of the sensor."""
 
     columns: Annotated[int, Meta(ge=1, le=32, description="cells in a row")] = 4
     rows: Annotated[int, Meta(ge=1, le=32, description="rows of cells")] = 8
 
 
 class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
-    """One sensor, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+    """One sensor, device number 1."""
 
     full_scale = 4095
     swing = 3500
@@ -51,11 +77,11 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
         return message(command[3], struct.pack("<H", status) + answer)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``data``; other messages are answers."""
+        """Return ``data`` or ``answer``."""
         return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One message with all cells, without run lengths."""
+        """Return one message with all cells, without run lengths."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000
         header = struct.pack("<IB", uptime_ms & 0xFFFF_FFFF, 0)
         return [message(0x00, header + struct.pack(f"<{len(values)}H", *self._tared(device, values)))]

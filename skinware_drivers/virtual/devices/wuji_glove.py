@@ -1,4 +1,4 @@
-"""An emulated tactile glove board of Wuji: its bytes on the line.
+"""An emulated tactile glove board of Wuji.
 
 Source: github.com/wuji-technology/wujihandpy (MIT); the vector in tests/serial/test_wuji_glove.py.
 """
@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _OK, _BAD_LENGTH, _BAD_CHECKSUM, _UNKNOWN, _BAD_PAYLOAD = 0x00, 0x10, 0x11, 0x12, 0x13
 _NEEDED = {0x0101: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # bytes of arguments
@@ -29,7 +27,7 @@ def message(sync: int, body: bytes) -> bytes:
 
 
 class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the board is."""
+    """Options of the board."""
 
     hand: Literal["left", "right"] = "left"
     period_ms: Annotated[
@@ -39,9 +37,9 @@ class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknow
 
 
 class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
-    """One board, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One board, device number 1.
 
-    Values: those of the cells, in 1/4096 of what they can measure.
+    Values: those of the cells, in 1/4096 of their range.
     """
 
     full_scale = 4096
@@ -57,12 +55,12 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
         )
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
-        """The command's number, a status, and what was asked for."""
+        """Answer with the command's number, a status and the data."""
         status, answer = self._do(device, command, now_ns)
         return message(0x57, command[4:8] + bytes([status]) + answer)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``data``; other messages are answers."""
+        """Return ``data`` or ``answer``."""
         return "data" if payload[1] == 0x55 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

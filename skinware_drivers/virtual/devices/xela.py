@@ -1,4 +1,4 @@
-"""Emulate XELA's uSkin boards, and XELA's server."""
+"""Emulated uSkin boards of XELA, and XELA's server."""
 
 from __future__ import annotations
 
@@ -11,14 +11,19 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import (
+    CanFrame,
+    Device,
+    Emulator,
+    EmulatorOptions,
+    SerialEmulator,
+    SerialEmulatorOptions,
+    on_a_grid,
+)
 
 
 class EmulatedXelaOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which boards there are."""
+    """Options of the boards."""
 
     boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards")] = (1,)
     model: Annotated[
@@ -29,7 +34,7 @@ class EmulatedXelaOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=Tr
 
 
 class EmulatedXela(Emulator[EmulatedXelaOptions]):
-    """Boards on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+    """Boards on one bus.
 
     Values: x, y, z of taxel 0, of taxel 1 ... Several boards have identifiers 0x20 apart (4x4) or 0x100 apart (4x6).
     """
@@ -37,9 +42,9 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
     full_scale = 0xFFFF
     rest = 33_000
     swing = 9_000
+    numbered_by = "boards"
 
     def __init__(self, options: EmulatedXelaOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.boards
         super().__init__(options, **more)
         taxels = {taxel for board in options.boards for taxel in self._taxels(board)}
         self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
@@ -74,15 +79,15 @@ _TAXELS = {"uSPa44": (16, 4), "uSPa46": (24, 6), "uSPa22": (4, 2), "uSCuAH": (30
 
 
 class EmulatedXelaServerOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which sensors there are."""
+    """Options of the server and its sensors."""
 
     sensors: Annotated[tuple[int, ...], Meta(description="numbers of the sensors")] = (1,)
     model: Annotated[Literal["uSPa44", "uSPa46", "uSPa22", "uSCuAH"], Meta(description="of all sensors")] = "uSPa44"
-    calibrated: Annotated[bool, Meta(description="tell forces, beside the counts")] = True
+    calibrated: Annotated[bool, Meta(description="send forces, besides the counts")] = True
 
 
 class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
-    """One server; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+    """One server.
 
     Values: x, y and z of each taxel in 1/256 N, or as counts.
     """
@@ -91,10 +96,7 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
     rest = 0
     swing = 2000
     speed_mbit_s = 100
-
-    def __init__(self, options: EmulatedXelaServerOptions, **more: object) -> None:
-        self.numbers = options.sensors
-        super().__init__(options, **more)
+    numbered_by = "sensors"
 
     def places(self) -> npt.NDArray[np.float64]:
         count, columns = _TAXELS[self.options.model]
@@ -106,9 +108,9 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         self.start(device, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """``sensor1`` and so on; the welcome is another."""
-        told = json.loads(payload)
-        return next((f"sensor{number}" for number in self.numbers if str(number) in told), "welcome")
+        """Return ``sensor1`` and so on, or ``welcome``."""
+        sent = json.loads(payload)
+        return next((f"sensor{number}" for number in self.numbers if str(number) in sent), "welcome")
 
     def kinds(self) -> Sequence[str]:
         return [f"sensor{number}" for number in self.numbers]
@@ -124,5 +126,5 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         }
         if self.options.calibrated:
             sensor["calibrated"] = [value / 256 for value in values]
-        told = {"message": device.cycle, "time": time_s, "sensors": 1, "type": "routine", str(device.number): sensor}
-        return [json.dumps(told).encode() + b"\n"]
+        routine = {"message": device.cycle, "time": time_s, "sensors": 1, "type": "routine", str(device.number): sensor}
+        return [json.dumps(routine).encode() + b"\n"]

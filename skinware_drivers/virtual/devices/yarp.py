@@ -1,7 +1,7 @@
-"""An emulated port of an iCub's skin: the vectors that it sends in a binary carrier.
+"""An emulated port of an iCub's skin, which sends vectors in a binary carrier.
 
-Source: exchanges with YARP 3.8.1 and 4.0.0; the vectors in tests/yarp/test_messages.py. A device is a port. The bus
-makes its name, and the name server that knows it: ``skin-emulate --driver yarp --bus yarp://HOST:PORT/NAME``.
+Source: exchanges with YARP 3.8.1 and 4.0.0; the vectors in tests/yarp/test_messages.py. A device is a port. The bus has
+its name and the name server that knows it: ``skin-emulate --driver yarp --bus yarp://HOST:PORT/NAME``.
 """
 
 from __future__ import annotations
@@ -14,41 +14,37 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.virtual.press import on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _BOOT_TIME_S = 1_700_000_000.0
 _TAGS = {3: 256 + 10, 4: 256 + 20}
 
 
 class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What it sends."""
+    """Options of the port."""
 
     length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
     yarp: Annotated[
         Literal[3, 4], Meta(description="major version of its YARP, which decides how a list of doubles is marked")
     ] = 4
-    envelope: Annotated[bool, Meta(description="tell number and time of each message")] = True
+    envelope: Annotated[bool, Meta(description="send number and time of each message")] = True
     period_ms: Annotated[float, Meta(ge=1, description="time between two messages, ms")] = 20
 
 
 class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
-    """One port; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+    """One port."""
 
     full_scale = 255
     rest = 0
     swing = 150
     speed_mbit_s = 100
+    streams = "always"
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(self.options.length, 12)
 
-    def boot(self, device: Device, now_ns: int) -> None:
-        self.start(device, now_ns)
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One vector, as YARP sends it in its binary carriers."""
+        """Return one vector, as in YARP's binary carriers."""
         text = f"D {device.cycle} {_BOOT_TIME_S + device.sampled_ns / 1e9:.6f}\0".encode()
         command = struct.pack("<i", len(text)) + b"~\0\0\1" + text if self.options.envelope else b"\0\0\0\0~D\0\1"
         head = struct.pack("<ii", _TAGS[self.options.yarp], len(values))

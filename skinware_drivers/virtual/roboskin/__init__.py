@@ -1,1 +1,1 @@
-"""The emulated ROBOSKIN: its options, what its boards do and compute, what they feel, and what goes wrong."""
+"""The emulated ROBOSKIN: boards with their firmware, touch and faults."""

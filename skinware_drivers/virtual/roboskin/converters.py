@@ -1,24 +1,26 @@
-"""The capacitance converters of a board and what its firmware makes of them: settings, baseline, acquisitions."""
+"""The capacitance converters of a board: their settings, baseline and faults, and the acquisitions of the firmware."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.roboskin.faults import BoardFaults
 from skinware_drivers.virtual.roboskin.firmware import (
     CHANNELS,
     FINGERTIP,
+    NO_ACK,
+    NOT_CONNECTED,
     TRIANGLES,
     Arithmetic,
     ArrayI,
     Sample,
     triangle_payloads,
 )
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD, DEFAULT_SHIFT = 0, 245, 2
@@ -26,11 +28,84 @@ DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD, DEFAULT_SHIFT = 0, 245, 2
 
 _LARGEST_SHIFT = 31
 _AHEAD = 16
-"""Acquisitions that are computed together: numpy needs hardly longer for them than for one."""
+"""Acquisitions that are computed together: numpy takes hardly longer for them than for one."""
+
+
+_BEYOND_COUNTS = 1024
+"""How far a broken taxel is beyond twice the range: more than warmth and noise can compensate."""
+
+TriangleState = Literal["unplugged", "plugged_in", "no_ack", "ack"]
+"""A triangle was unplugged or plugged in; its converter stopped or began again to acknowledge."""
+
+
+class TriangleFaults:
+    """The faults of one board's triangles and taxels.
+
+    Args:
+        options: of all boards.
+        address: of the board, as in the options.
+
+    Attributes:
+        disconnected: (16,) bool, triangles whose I2C lines read 0xFFFF.
+        not_acknowledging: (16,) bool, triangles whose registers stay 0.
+        broken: (16, 12) bool, taxels far out of range.
+        version: another number after each :meth:`set_triangle`.
+    """
+
+    def __init__(self, options: RoboskinOptions, address: int) -> None:
+        self.disconnected: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
+        self.not_acknowledging: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
+        self.version: int = 0
+        self.broken: npt.NDArray[np.bool_] = np.zeros((TRIANGLES, CHANNELS), np.bool_)
+        for board, triangle in options.places("not_connected", 2):
+            self.disconnected[triangle] |= board == address
+        for board, triangle, taxel in options.places("out_of_range", 3):
+            self.broken[triangle, taxel] |= board == address
+        fates: tuple[tuple[TriangleState, int], ...] = (
+            ("unplugged", options.unplugged_after_cycles),
+            ("no_ack", options.no_ack_after_cycles),
+        )
+        self._coming = [
+            (cycle, triangle, fault)
+            for fault, cycle in fates
+            for board, triangle in options.places(fault, 2)
+            if board == address
+        ]
+
+    def take_due(self, cycle: int) -> list[tuple[int, TriangleState]]:
+        """Apply the faults whose time has come by burst ``cycle``; return them as (triangle, fault)."""
+        due = [(triangle, fault) for at, triangle, fault in self._coming if at <= cycle]
+        if due:
+            self._coming = [coming for coming in self._coming if coming[0] > cycle]
+        for triangle, fault in due:
+            self.set_triangle(triangle, fault)
+        return due
+
+    def set_triangle(self, triangle: int, fault: TriangleState) -> None:
+        mask = self.disconnected if fault in ("unplugged", "plugged_in") else self.not_acknowledging
+        mask[triangle] = fault in ("unplugged", "no_ack")
+        self.version += 1
+
+    def distort(self, raw: ArrayI) -> None:
+        """Overwrite the readings of unplugged and silent triangles in ``raw``, (n, 16, 12)."""
+        raw[:, self.not_acknowledging] = NO_ACK
+        raw[:, self.disconnected] = NOT_CONNECTED
+
+    def break_taxels(self, raw: ArrayI, baseline: ArrayI, bottom: ArrayI) -> None:
+        """Put broken taxels in ``raw`` far out of range.
+
+        Args:
+            raw: (n, 16, 12) capacitances, changed in place.
+            baseline: (16, 12) of the last calibration.
+            bottom: (16, 1) difference at which a value reaches 0.
+        """
+        if self.broken.any():
+            far = np.minimum(baseline + 2 * bottom + _BEYOND_COUNTS, 0xFFFE)
+            raw[:, self.broken] = far[self.broken]
 
 
 class Acquisition(NamedTuple):
-    """What one acquisition gives."""
+    """The result of one acquisition."""
 
     time_ns: int
     payloads: list[bytes]
@@ -43,13 +118,13 @@ class Converters:
     """The 16 converters of a board, with default settings and no baseline.
 
     Args:
-        touch: what they feel.
-        faults: what is wrong with them.
+        touch: the capacitances of the board.
+        faults: of the board.
         mtb3: they belong to the older kind of board.
         short_tail: the second frame has no diagnostics.
     """
 
-    def __init__(self, touch: Touch, faults: BoardFaults, *, mtb3: bool, short_tail: bool) -> None:
+    def __init__(self, touch: Touch, faults: TriangleFaults, *, mtb3: bool, short_tail: bool) -> None:
         self._touch, self._faults = touch, faults
         self._mtb3, self._short_tail = mtb3, short_tail
         self._skin_type, self._no_load = DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD
@@ -62,7 +137,7 @@ class Converters:
 
     @property
     def _version(self) -> tuple[int, int]:
-        """Changes whenever acquisitions that were computed ahead no longer hold."""
+        """Changes when acquisitions that were computed ahead no longer hold."""
         return self._faults.version, self._touch.version
 
     def set_board(self, skin_type: int, no_load: int) -> None:
@@ -83,7 +158,7 @@ class Converters:
         self._settings_changed()
 
     def calibrate(self, time_ns: int, cycle: int) -> None:
-        """Take what is read at ``time_ns`` as the new baseline of all triangles.
+        """Take the readings at ``time_ns`` as the new baseline of all triangles.
 
         A triangle that is not connected then reads its no-load value and is flagged; one that does not
         acknowledge reads its no-load value and is **not** flagged any more (``fill`` in
@@ -94,7 +169,7 @@ class Converters:
         self._ahead.clear()
 
     def acquire(self, time_ns: int, cycle: int, period_ns: int) -> Acquisition:
-        """What the skin feels at ``time_ns``; the next call is likely to come one period later."""
+        """Return the acquisition at ``time_ns``; the next call is likely to come one period later."""
         ahead = self._ahead
         if ahead and ahead[0].time_ns == time_ns and self._ahead_version == self._version:
             return ahead.popleft()
@@ -105,7 +180,7 @@ class Converters:
         return ahead.popleft()
 
     def acquire_values(self, time_ns: int, cycle: int, values: Mapping[int, Sequence[int]]) -> Acquisition:
-        """An acquisition with true flags, but with ``values`` (by triangle, 12 of 0-255) as they are."""
+        """Return an acquisition with true flags and the given ``values`` (by triangle, 12 of 0-255)."""
         return self._acquisitions(np.array([time_ns]), np.array([cycle]), values)[0]
 
     def _acquisitions(self, times_ns: ArrayI, cycles: ArrayI, values: Mapping[int, Sequence[int]]) -> list[Acquisition]:
@@ -118,7 +193,7 @@ class Converters:
         return [Acquisition(*parts) for parts in zip(times_ns.tolist(), payloads, sample.no_ack, strict=True)]
 
     def _read(self, times_ns: ArrayI, cycles: ArrayI) -> ArrayI:
-        """(n, 16, 12) what the registers hold."""
+        """Return (n, 16, 12), the content of the registers."""
         raw = self._touch.capacitances(times_ns, cycles, self._cdc_offset, fingertip=self._skin_type == FINGERTIP)
         self._faults.distort(raw)
         return raw

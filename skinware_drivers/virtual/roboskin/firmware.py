@@ -1,6 +1,6 @@
-"""What a board's firmware computes: from sixteen-bit capacitances to the bytes of two CAN frames.
+"""The arithmetic of a board's firmware: from sixteen-bit capacitances to the bytes of two CAN frames.
 
-Sources of every rule here (facts, no code):
+Sources of the rules (facts, no code):
 
 * icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp, ``fill`` and
   ``computedrift`` (MTB4);
@@ -21,9 +21,9 @@ TRIANGLES = 16
 CHANNELS = 12
 """Channels of a triangle: one AD7147 capacitance-to-digital converter."""
 NOT_CONNECTED = 0xFFFF
-"""What the I2C lines read where no chip answers: the pull-ups."""
+"""Reading of I2C lines without a chip: the pull-ups."""
 NO_ACK = 0
-"""What is left in the registers where a chip did not acknowledge."""
+"""Content of the registers after a chip did not acknowledge."""
 
 RAW_TEST = 7
 """The board type that sends the low byte of every capacitance as it is."""
@@ -43,9 +43,9 @@ class Sample:
     """Acquisitions of a board as its firmware sees them.
 
     Attributes:
-        values: (n, 16, 12) uint8, what goes on the wire; lower is more pressure.
-        diagnostics: (n, 16) int64, the sixteen bits behind the values: 15-4 taxels 11-0 out of range, 1 triangle
-            not connected, 0 some channel did not acknowledge.
+        values: (n, 16, 12) uint8, as on the wire; lower is more pressure.
+        diagnostics: (n, 16) int64, the sixteen bits after the values: 15-4 taxels 11-0 out of range, 1 triangle not
+            connected, 0 some channel did not acknowledge.
         no_ack: (n, 16) bool, triangles with a channel that did not acknowledge and is connected.
     """
 
@@ -56,7 +56,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """The settings of a board that its arithmetic depends on, made ready for whole-board arrays.
+    """The arithmetic of a board with its settings, for arrays of the whole board.
 
     Attributes:
         skin_type: as commanded: 0 compensated, 1 palm and fingertips, 2 not compensated, 3 ergonomic hand,
@@ -72,7 +72,7 @@ class Arithmetic:
     mtb3: bool
 
     def sample(self, raw: ArrayI, baseline: ArrayI) -> Sample:
-        """Values and flags of all triangles.
+        """Return values and flags of all triangles.
 
         Args:
             raw: (n, 16, 12) capacitances of n acquisitions, 0-65535.
@@ -95,12 +95,12 @@ class Arithmetic:
 
     @cached_property
     def bottom(self) -> ArrayI:
-        """(16, 1) the difference at which a value reaches 0."""
+        """(16, 1), the difference at which a value reaches 0."""
         return self._int(self.no_load << self._shifts)
 
     @cached_property
     def _upper(self) -> ArrayI:
-        """(16, 1) minus the difference at which a value reaches 255."""
+        """(16, 1), minus the difference at which a value reaches 255."""
         return self._int((255 - self.no_load) << self._shifts)
 
     @cached_property
@@ -108,7 +108,7 @@ class Arithmetic:
         return np.array(self.shift, np.int64)[:, np.newaxis]
 
     def _drift(self, raw: ArrayI, baseline: ArrayI) -> ArrayI | int:
-        """(n, 16, 12) the part of each difference that the firmware takes for warmth."""
+        """Return (n, 16, 12), the part of each difference that the firmware takes for warmth."""
         gains = self._gains
         if gains is None:
             return 0
@@ -125,7 +125,7 @@ class Arithmetic:
 
     @cached_property
     def _gains(self) -> ArrayI | None:
-        """(16, 12) compensation of each channel in 1/128; None where nothing is compensated.
+        """(16, 12), the compensation of each channel in 1/128; None: there is no compensation.
 
         Types 1, and 3 in triangles 0-4, have another thermometer (channel 11), but no gains.
         """
@@ -139,17 +139,17 @@ class Arithmetic:
         return None
 
     def _int(self, number: ArrayI) -> ArrayI:
-        """What fits into the processor's ``int``."""
+        """Return the numbers as the processor's ``int`` holds them."""
         return (number + 0x8000 & 0xFFFF) - 0x8000 if self.mtb3 else number
 
 
 def triangle_payloads(sample: Sample, *, short_tail: bool) -> list[list[bytes]]:
-    """HEAD, TAIL, HEAD ... of all 16 triangles, for each acquisition.
+    """Return HEAD, TAIL, HEAD ... of all 16 triangles, for each acquisition.
 
     HEAD is 0x40 and taxels 0-6; TAIL is 0xC0, taxels 7-11 and the diagnostics, high byte first.
 
     Args:
-        sample: what the board measured.
+        sample: of the board.
         short_tail: leave the diagnostics out, as old firmware does.
     """
     block = np.empty((len(sample.values), TRIANGLES, 2, 8), np.uint8)

@@ -1,38 +1,29 @@
-"""The options of the emulated ROBOSKIN patches and what they mean (imports nothing slow: ``--help`` shows them)."""
+"""The options of the emulated ROBOSKIN boards."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated
 
-import msgspec
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options import check_options
-from skinware_drivers.virtual.emulator_options import Count, Probability, Seconds
+from skinware_drivers.virtual.emulator_options import Count, EmulatorOptions, Probability, Seconds
 
 _PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
 _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
 
 
-class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which boards there are, what they feel, and what is wrong with them.
+class RoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The boards, their touch and their faults.
 
     Raises:
-        ConfigurationError: an option is out of its limits, or names a board that is not there.
+        ConfigurationError: an option is out of its limits, or names a missing board.
     """
 
     boards: Annotated[tuple[int, ...], Meta(description="CAN addresses of the boards, 1-14")] = (7, 8, 9, 10)
     mtb3: Annotated[tuple[int, ...], Meta(description="boards of the older kind MTB3; the others are MTB4")] = ()
-    pattern: Annotated[
-        Literal["touch", "idle", "cycle"],
-        Meta(description="input: a wandering press, nothing, or each burst's number modulo 256"),
-    ] = "touch"
-    seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
     stage: Annotated[str, Meta(description="TOML file of what presses the boards, instead of the wandering press")] = ""
-    streaming: Annotated[
-        bool, Meta(description="stream from power-up, as if a host had configured the boards already")
-    ] = False
     short_tail: Annotated[
         bool, Meta(description="old firmware: the second frame of a triangle has 6 bytes and no diagnostics")
     ] = False
@@ -41,27 +32,11 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(ge=0, le=7, description="message class of the second frame; 6 in the firmware variant for TLR"),
     ] = 4
 
-    lose: Annotated[Probability, Meta(description="probability that a data frame is lost")] = 0.0
     wrong_length: Annotated[Probability, Meta(description="probability that a data frame has a wrong length")] = 0.0
-    jitter_us: Annotated[Count, Meta(description="longest random delay of a burst, in microseconds")] = 0
-    foreign_hz: Annotated[
-        float, Meta(ge=0, le=10_000, description="frames per second from other devices on the bus")
-    ] = 0.0
-    silence: Annotated[
-        tuple[str, ...],
-        Meta(description="kinds of frames that the boards stop sending, after silence_after_s, as 0x470-head"),
-    ] = ()
-    silence_after_s: Annotated[Seconds, Meta(description="seconds from power-up to that silence")] = 2.0
-    dead: Annotated[tuple[int, ...], Meta(description="boards that die, after dead_after_s or dead_after_cycles")] = ()
-    dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 0.0
+    dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the death of the boards of dead")] = 0.0
     dead_after_cycles: Annotated[
         Count | None, Meta(description="bursts before their death, instead of dead_after_s")
     ] = None
-    restart: Annotated[
-        tuple[int, ...], Meta(description="boards that lose power for a moment, after restart_after_s")
-    ] = ()
-    restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
-    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted board ignores commands")] = 0.5
     not_connected: Annotated[
         tuple[str, ...], Meta(description="triangles that were never plugged in, as BOARD/TRIANGLE")
     ] = ()
@@ -74,7 +49,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     ] = ()
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if not self.boards:
             raise ConfigurationError("option boards: at least one board is needed")
         for address in self.boards:
@@ -90,14 +65,14 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             self._check_boards(name, [place[0] for place in self.places(name, depth)])
 
     def places(self, name: str, depth: int) -> list[tuple[int, ...]]:
-        """The places that a list option names, as numbers.
+        """Return the places of a list option as numbers.
 
         Args:
             name: of the option.
             depth: 2 for (board, triangle), 3 for (board, triangle, taxel).
 
         Raises:
-            ConfigurationError: a text is not of that form, or a number is out of its limits.
+            ConfigurationError: a text has another form, or a number is out of its limits.
         """
         found: list[tuple[int, ...]] = []
         for text in getattr(self, name):
@@ -111,7 +86,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             found.append(numbers)
         return found
 
-    def _check_boards(self, name: str, addresses: list[int] | tuple[int, ...]) -> None:
+    def _check_boards(self, name: str, addresses: Iterable[int]) -> None:
         for address in addresses:
             if address not in self.boards:
                 raise ConfigurationError(

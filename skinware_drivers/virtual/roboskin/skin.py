@@ -1,160 +1,196 @@
-"""An emulated ROBOSKIN: MTB3 and MTB4 patch controllers on one CAN wire, obeying the real commands.
+"""An emulated ROBOSKIN: MTB3 and MTB4 patch controllers on one CAN wire, which obey the real commands.
 
-The boards are silent until a host starts them (or the option ``streaming`` says that one did). What each kind of
-board does is in :mod:`.mtb3` and :mod:`.mtb4`, what it computes in :mod:`.firmware`, what it feels in
-:mod:`.touch` and :mod:`.pressed`, what goes wrong in :mod:`.faults`, and what is written down about it in
-:mod:`skinware_drivers.virtual.events`.
+The boards are silent until a host starts them, or the option ``streaming`` does as if one had. Their commands are in
+:mod:`.mtb`, their arithmetic in :mod:`.firmware`, their touch in :mod:`.touch`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar, cast
 
-from skinware.errors import ConfigurationError
-from skinware_drivers.virtual import events
-from skinware_drivers.virtual.hardware import EventLog
+import numpy as np
+
+from skinware.geometry import Geometry
+from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.virtual.events import Event, FrameDamage, Half
+from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
+from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, Board
+from skinware_drivers.virtual.roboskin.converters import TriangleState
+from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
+from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
-from skinware_drivers.virtual.stage import Actor, Stage
-
-if TYPE_CHECKING:  # what needs numpy is imported when the boards are made: commands show these options fast
-    from skinware.geometry import Geometry
-    from skinware_drivers.virtual.hardware import Point, Pressing
-    from skinware_drivers.virtual.roboskin.boards import Board
-    from skinware_drivers.virtual.roboskin.faults import TriangleState
-    from skinware_drivers.virtual.roboskin.touch import WireSource
+from skinware_drivers.virtual.roboskin.touch import PressedSkin, WireSource, cycle_pattern
+from skinware_drivers.virtual.stage import DATA as BURSTS
+from skinware_drivers.virtual.stage import Actor, Device, Stage
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))
-"""What a host sends to a board: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""
-_COUNTED = ("lost_halves", "wrong_lengths", "foreign", "recalibrations")
+"""Set-up by a host: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""
+_WRONG_LENGTHS = (0, 1, 2, 3, 4, 5, 7)
+"""Neither 8 nor the 6 of old firmware."""
 
 
-class EmulatedRoboskin(Stage):
-    """Emulated boards on one bus; see :class:`skinware_drivers.virtual.hardware.EmulatedHardware`.
+class EmulatedRoboskin(Stage[RoboskinOptions]):
+    """Emulated boards on one bus.
 
     Args:
-        options: which boards, and what is wrong with them.
-        log: takes the :mod:`skinware_drivers.virtual.events`; a list will do.
-        source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; the 12
-            values 0-255 that it returns go on the wire instead of what the pattern feels. Flags stay true.
+        options: of the boards and their faults.
+        log: receives the :mod:`skinware_drivers.virtual.events`, for example a list.
+        source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
+            0-255 go on the wire instead of felt ones. Flags stay true.
     """
 
-    Options: ClassVar[type[RoboskinOptions]] = RoboskinOptions
+    numbered_by = "boards"
+    longest_queue: ClassVar[int] = 48
+    """icub-firmware:emBODY/eBcode/arch-arm/board/mtb4/application/src/main-appcan.cpp"""
+    counted: ClassVar[Sequence[str]] = (
+        *("lost_halves", "wrong_lengths", "foreign", "recalibrations"),
+        *("repeated", "truncated", "corrupted"),
+    )
+    frame_faults: ClassVar[Mapping[str, FrameDamage]] = {**Stage.frame_faults, "wrong_length": "wrong_length"}
 
     def __init__(
         self, options: RoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
     ) -> None:
-        from skinware_drivers.virtual.roboskin.pressed import PressedSkin
-
-        super().__init__(log, _COUNTED)
-        self._options = options
-        self._source = source
-        self._boards: list[Board] = []
-        self._skin = PressedSkin(options)
+        super().__init__(options, log=log)
+        self.source = cycle_pattern if source is None and options.pattern == "cycle" else source
+        self.skin = PressedSkin(options)
+        n_boards = len(options.boards)
+        self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
 
     def geometry(self) -> Geometry:
-        """Where the sensors are: the boards cover a forearm and a hand."""
-        return self._skin.geometry()
+        """Return the places of the sensors: the boards cover a forearm and a hand."""
+        return self.skin.geometry()
 
     def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
-        """What presses the boards: where, m, and with how many newtons."""
-        return self._skin.pressing(self.run_to(now_ns))
+        """Return place (m) and force (N) of each press."""
+        return self.skin.pressing(self.run_to(now_ns))
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
-        """Press somewhere from now on, beside the wandering fingers of the option ``pattern``.
+        """Press from now on, besides the wandering fingers of the option ``pattern``.
 
         Raises:
-            ValueError: nothing of the skin would feel it, or too many presses have not ended yet.
+            ValueError: no taxel would feel it, or too many presses have not ended yet.
         """
-        return self._skin.press(press, self.run_to(now_ns))
+        return self.skin.press(press, self.run_to(now_ns))
 
     def kind_of(self, identifier: int, payload: bytes) -> str:
         """Name the halves of a triangle by identifier and half: ``0x470-head``; other frames by identifier."""
-        from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL
-
         name = super().kind_of(identifier, payload)
-        if identifier >> 8 == INERTIAL:
-            return name
-        if identifier >> 8 in (DATA, self._options.tail_class) and payload:
+        if identifier >> 8 != INERTIAL and identifier >> 8 in (DATA, self.options.tail_class) and payload:
             return f"{name}-{'tail' if payload[0] & 0x80 else 'head'}"
         return name
 
     def kinds(self) -> Sequence[str]:
-        from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL
-        from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
-
         found = []
-        for board in self._options.boards:
+        for board in self.options.boards:
             for triangle in range(TRIANGLES):
                 low = board << 4 | triangle
                 found.append(self.kind_of(DATA << 8 | low, b"\x40"))
-                found.append(self.kind_of(self._options.tail_class << 8 | low, b"\xc0"))
+                found.append(self.kind_of(self.options.tail_class << 8 | low, b"\xc0"))
             found += [self.kind_of(INERTIAL << 8 | board << 4 | sensor, b"") for sensor in (0, 1, 3)]
         return found
 
-    def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
-        """Let all boards hear a command; those that obeyed or answered, by the address they had before."""
-        if not payload:
-            return []
-        addresses = [board.address for board in self._boards]
-        obeyed = [board.receive(identifier, payload, now_ns) for board in self._boards]
-        return [address for address, did in zip(addresses, obeyed, strict=True) if did]
-
     # Faults at a moment of the caller's choice
-
-    def kill(self, address: int, now_ns: int) -> None:
-        """Make a board fall silent for good; what it had waiting for the wire is lost."""
-        now_ns = self.run_to(now_ns)
-        self._board(address).die(now_ns)
-        self.find_next_event()
-
-    def restart(self, address: int, now_ns: int) -> None:
-        """Cut a board's power for a moment (a dead one lives again): silent, configuration lost, deaf for a while."""
-        now_ns = self.run_to(now_ns)
-        self._board(address).restart(now_ns, round(self._options.boot_s * 1e9))
-        self.find_next_event()
 
     def unplug(self, address: int, triangle: int, now_ns: int) -> None:
         """Pull a triangle's plug: from its next burst on it reads full pressure and is flagged."""
         self._set_triangle(address, triangle, "unplugged", now_ns)
 
     def plug_in(self, address: int, triangle: int, now_ns: int) -> None:
+        """Plug a triangle in."""
         self._set_triangle(address, triangle, "plugged_in", now_ns)
 
     def acknowledge(self, address: int, triangle: int, now_ns: int, *, on: bool) -> None:
         """Let a triangle's converter stop (``on=False``) or begin again to acknowledge on its I2C line."""
         self._set_triangle(address, triangle, "ack" if on else "no_ack", now_ns)
 
-    # Within
-
     def _set_triangle(self, address: int, triangle: int, fault: TriangleState, now_ns: int) -> None:
         now_ns = self.run_to(now_ns)
-        self._board(address).set_triangle(triangle, fault, now_ns)
+        _board(self.device(address)).set_triangle(triangle, fault, now_ns)
 
-    def _board(self, address: int) -> Board:
-        for board in self._boards:
-            if board.address == address:
-                return board
-        raise ConfigurationError(f"there is no emulated board {address}")
+    # The stage's hooks
+
+    def make_device(self, number: int, now_ns: int) -> Board:
+        kind = Mtb3 if number in self.options.mtb3 else Mtb4
+        return kind(number, self, self.wire.attach(), now_ns, self._phases[self.options.boards.index(number)])
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
-        """Make the boards and whatever else is on the bus."""
-        from skinware_drivers.virtual.roboskin.patch import make_boards, make_foreign_traffic
-
-        options = self._options
-        self._skin.begin(now_ns)
-        self._boards = make_boards(options, self.wire, self.log, self.counts, self._source, self._skin, now_ns)
+        options = self.options
+        self.skin.origin_ns = now_ns
+        actors = super().power_up(now_ns)
         for address, triangle, taxel in options.places("out_of_range", 3):
-            self.log.append(events.TaxelOutOfRange(time_ns=now_ns, board=address, triangle=triangle, taxel=taxel))
-        for board in self._boards:
-            if options.streaming:
+            self.log.append(Event("taxel_out_of_range", now_ns, board=address, triangle=triangle, taxel=taxel))
+        if options.streaming:
+            for device in self.devices.values():
                 for command in _CONFIGURED:
-                    board.receive(0x200 | board.address, command, now_ns)
-            if board.address in options.dead and options.dead_after_cycles is None:
-                self.schedule(now_ns + round(options.dead_after_s * 1e9), board.die)
-            if board.address in options.restart:
-                restart = partial(board.restart, boot_ns=round(options.boot_s * 1e9))
-                self.schedule(now_ns + round(options.restart_after_s * 1e9), restart)
-        self.plan_silence(options.silence, self.kinds(), options.silence_after_s, now_ns)
-        return [*self._boards, *make_foreign_traffic(options, self.wire, self.log, self.counts, now_ns)]
+                    self.obey(device, 0x200 | device.number, command, now_ns)
+        return actors
+
+    def dying(self) -> Sequence[int]:
+        return self.options.dead if self.options.dead_after_cycles is None else ()
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        _board(device).begin(now_ns)
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
+        return bool(payload) and _board(device).receive(identifier, payload, now_ns)
+
+    def on_timer(self, device: Device, name: str, time_ns: int) -> None:
+        _board(device).on_timer(name, time_ns)
+
+    def skipped(self, device: Device, name: str, times: int) -> int:
+        frames = _board(device).frames_of(name, times)
+        if name == BURSTS and frames:
+            super().skipped(device, name, times)
+        return frames
+
+    def spoil(self, fault: FrameDamage, payload: bytes, random: np.random.Generator) -> bytes:
+        if fault != "wrong_length":
+            return super().spoil(fault, payload, random)
+        length = int(random.choice(_WRONG_LENGTHS))
+        return payload[:length].ljust(length, b"\0")
+
+    def note_fault(
+        self,
+        device: Device,
+        time_ns: int,
+        where: tuple[int, int],
+        frame: tuple[int, bytes],
+        fault: FrameDamage,
+        reason: str,
+    ) -> None:
+        """Count and log the fault of a half of a triangle."""
+        (cycle, position), (identifier, payload) = where, frame
+        half: Half = "tail" if (payload[0] & 0x80 if payload else position % 2) else "head"
+        place = partial(Event, time_ns=time_ns, board=device.number, triangle=identifier & 0xF, cycle=cycle, half=half)
+        if fault in ("lost", "unsent"):
+            self.counts["lost_halves"] += 1
+            self.log.append(place("lost_half", reason=reason))
+        elif fault == "wrong_length":
+            self.counts["wrong_lengths"] += 1
+            self.log.append(place("wrong_length", length=len(payload)))
+        else:
+            self.counts[fault] += 1
+            data = payload.hex()
+            self.log.append(place("frame_fault", position=position, identifier=identifier, fault=fault, payload=data))
+
+    def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:  # noqa: ARG002
+        """Return identifiers of other devices on the bus, none of them from the address of an emulated board.
+
+        Motor boards (class 1), strain gauges (class 3, which is also the old class of skin data), a skin board that no
+        host configured (class 4), inertial sensors (class 5), and 29-bit frames that end in the bits of a skin frame
+        (classes: icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h).
+        """
+        boards = self.options.boards
+        return [
+            message_class << 8 | address << 4 | low
+            for message_class, low in ((1, 0), (1, 3), (3, 10), (3, 11), (4, 2), (5, 3))
+            for address in range(1, 15)
+            if address not in boards
+        ] + [EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in boards]
+
+
+def _board(device: Device) -> Board:
+    return cast("Board", device)

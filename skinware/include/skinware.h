@@ -1137,7 +1137,7 @@ static void skinware__fill(const skinware_reader *reader, skinware_frame *frame,
 
 static skinware_result skinware__overrun(int alive) {
     return skinware__fail(SKINWARE_OVERRUN, alive ? "give the service more slots, or publish less often"
-                                                  : "its writer is dead, and its newest frame is not whole; start it again");
+                                                  : "its writer is dead, and its newest sample is not whole; start it again");
 }
 
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {

@@ -122,7 +122,7 @@ class RingReader(Generic[SampleT]):
     def _overrun(self) -> Overrun:
         if not self.segment.writer_lives():
             return Overrun(
-                f"{self.segment.path}: its writer is dead, and its newest frame is not whole; start it again"
+                f"{self.segment.path}: its writer is dead, and its newest sample is not whole; start it again"
             )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "

@@ -118,7 +118,7 @@ class RingWriter:
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         if not self._state.begun_ns:
-            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old frame as a new one")
+            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old sample as a new one")
         acquired_ns, flags = operator.index(acquired_ns), operator.index(flags)
         if acquired_ns > _MOST_NS or not 0 <= flags <= _ALL_FLAGS:
             raise ValueError(f"{self.segment.path}: a frame has 63 bits for acquired_ns ({acquired_ns}), 64 for flags")

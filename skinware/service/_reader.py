@@ -139,7 +139,7 @@ class ServiceReader(Taking[SampleT]):
         if not valid:
             self._accounts.record.overruns += 1
             raise Overrun(
-                f"frame {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
+                f"sample {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
                 " with read(), or give the service more slots"
             )
 
@@ -335,7 +335,7 @@ class Tap(ServiceReader[SampleT]):
         sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
         frame = self._ring.copy(sequence)
         if frame is None:
-            raise Overrun(f"service {self.name!r}: frame {sequence} was overwritten before it was copied")
+            raise Overrun(f"service {self.name!r}: sample {sequence} was overwritten before it was copied")
         before = self._last
         taken = self._newest_now(lambda: frame, True)
         if before is not None and before > taken.position:  # it came before, and is not lost again
@@ -345,5 +345,5 @@ class Tap(ServiceReader[SampleT]):
     def _acquisitions(self) -> list[tuple[int, int]]:
         times = self._ring.times_ns(ACQUIRED)
         if not times:
-            raise Overrun(f"service {self.name!r}: no frame could be read")
+            raise Overrun(f"service {self.name!r}: no sample could be read")
         return times

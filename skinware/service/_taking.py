@@ -197,13 +197,13 @@ class Taking(Attachment[SampleT]):
         )
 
     def _why_nothing_came(self, max_age_s: float | None) -> str:
-        wanted = "newer frame" if max_age_s is None else f"frame younger than {max_age_s:g} s"
+        wanted = "newer sample" if max_age_s is None else f"sample younger than {max_age_s:g} s"
         if not self.alive:
             return f"no {wanted} of {self.name!r}: its writer is dead or was stopped; start it again"
         if self.paused:
             return f"no {wanted} of {self.name!r}: its writer is paused"
         if not self._ring.latest:
-            return f"no frame of {self.name!r} yet: its writer is running, but has published nothing so far"
+            return f"no sample of {self.name!r} yet: its writer is running, but has published nothing so far"
         return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
 
     def _next_in_order(self) -> SampleT | None:

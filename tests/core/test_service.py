@@ -53,7 +53,7 @@ def test_a_view_says_when_it_was_overwritten() -> None:
         assert frame.valid
         writer.begin()
         assert not frame.valid
-        with pytest.raises(Overrun, match="frame 1 of 'x' was overwritten while it was viewed"):
+        with pytest.raises(Overrun, match="sample 1 of 'x' was overwritten while it was viewed"):
             view.__exit__(None, None, None)
         assert reader.statistics.overruns == 1
 
@@ -323,7 +323,7 @@ def test_commit_without_begin_is_refused() -> None:
         with pytest.raises(ServiceError, match="commit without begin"):
             writer.commit(1)
         publish_one(writer)
-        with pytest.raises(ServiceError, match="would publish an old frame"):
+        with pytest.raises(ServiceError, match="would publish an old sample"):
             writer.commit(1)
         assert writer.sequence == 1
 

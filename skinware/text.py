@@ -113,8 +113,8 @@ def table(
     ]
 
 
-def wrapped(line: str, width: int | None) -> list[str]:
-    """Return a line, which may contain colours, broken at ``width``; continuations are indented further."""
+def wrapped(line: str, width: int | None, hang: int = 4) -> list[str]:
+    """Return a line, which may contain colours, broken at ``width``; continuations are indented by ``hang`` more."""
 
     def length(text: str) -> int:
         return len(_COLOUR.sub("", text))
@@ -128,7 +128,7 @@ def wrapped(line: str, width: int | None) -> list[str]:
         if length(lines[-1]) + 1 + length(word) <= width:
             lines[-1] += f" {word}"
         elif word:
-            lines.append(f"{indent}    {word}")
+            lines.append(f"{indent}{' ' * hang}{word}")
     return lines
 
 

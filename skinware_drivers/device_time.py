@@ -9,6 +9,7 @@ Measurements", 1999). Late frames do not move it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from itertools import pairwise
 from typing import Any
@@ -110,7 +111,9 @@ class DeviceClock:
         self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
         np.maximum.accumulate(np.maximum(times_ns, self._last_ns), out=times_ns)
         np.minimum(times_ns, received, out=times_ns)
-        if self._is_far_behind():
+        # the newest whole part shows that the clock stands still
+        _, x, y = self._points[-2] if len(self._points) > 1 else (0, 0.0, -math.inf)
+        if y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS:
             self.stops += 1
             self._stamp = -1  # the next one restarts the clock
             times_ns = received.copy()
@@ -172,29 +175,20 @@ class DeviceClock:
         recent = [point for point in list(self._points)[-_RECENT_PARTS:] if point[0] > oldest]
         self._offset_ns = min(y - self._slope * x for _, x, y in recent)
 
-    def _is_far_behind(self) -> bool:
-        """Return whether the newest whole part shows that the clock stands still."""
-        if len(self._points) < 2:
-            return False
-        _, x, y = self._points[-2]
-        return y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS
-
     def _fit_slope(self) -> None:
         whole = list(self._points)[:-1]  # the best point of the newest part may be yet to come
         if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_NS:
             return
         hull: list[tuple[float, float]] = []
         for _, x, y in whole:
-            while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
-                hull.pop()
+            while len(hull) > 1:
+                (x0, y0), (x1, y1) = hull[-2:]
+                if (y1 - y0) * (x - x0) < (x1 - x0) * (y - y0):
+                    break
+                hull.pop()  # it lies on or above the line from the one before to this one
             hull.append((x, y))
         middle = sum(x for _, x, _ in whole) / len(whole)
         right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
         self._slope = min(max(slope, -self._maximum_drift), self._maximum_drift)
-
-
-def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
-    """Return whether the second point lies on or above the line from the first to the third."""
-    return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])

@@ -155,7 +155,9 @@ class Link:
         loop = asyncio.get_running_loop()
         deadline_s, retry_s = loop.time() + timeout_s, _FIRST_RETRY_S
         while True:
-            await self._keep_pace()
+            self._free_at_s = max(self._free_at_s, loop.time() - AT_ONCE * self._gap_s) + self._gap_s
+            if (wait_s := self._free_at_s - loop.time()) > 0:  # keep the pace
+                await asyncio.sleep(wait_s)
             try:
                 self._bus.send(identifier, payload)
                 return
@@ -165,14 +167,6 @@ class Link:
                     raise
             await asyncio.sleep(min(retry_s, left_s))
             retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
-
-    async def _keep_pace(self) -> None:
-        """Wait until one more frame may be sent."""
-        loop = asyncio.get_running_loop()
-        self._free_at_s = max(self._free_at_s, loop.time() - AT_ONCE * self._gap_s) + self._gap_s
-        wait_s = self._free_at_s - loop.time()
-        if wait_s > 0:
-            await asyncio.sleep(wait_s)
 
     def narrow(self, layout: Layout) -> None:
         """From now on, receive only frames of this layout and awaited ones, if the bus can leave out the others."""

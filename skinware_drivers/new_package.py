@@ -86,22 +86,17 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
     made = []
     try:
         unfinished.mkdir()
-        for source, target in ((part, file) for part in ("common", transport) for file in _files(part).items()):
-            path = Path(Template(target[1]).substitute(words))
-            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
-            (unfinished / path).write_text(_template(source, target[0]).substitute(words))
-            made.append(path)
+        templates = files("skinware_drivers") / "templates"
+        for folder_of, named in (("common", _COMMON), (transport, _OF_TRANSPORT)):
+            for template, file in named.items():
+                path = Path(Template(file).substitute(words))
+                text = (templates / folder_of / f"{template}.template").read_text()
+                (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
+                (unfinished / path).write_text(Template(text).substitute(words))
+                made.append(path)
         unfinished.rename(folder)
     except OSError as error:
         raise SkinwareError(f"cannot make {folder}: {error.strerror}") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)  # there is none if all went well
     return made
-
-
-def _files(part: str) -> dict[str, str]:
-    return _COMMON if part == "common" else _OF_TRANSPORT
-
-
-def _template(part: str, name: str) -> Template:
-    return Template((files("skinware_drivers") / "templates" / part / f"{name}.template").read_text())

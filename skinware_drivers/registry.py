@@ -41,26 +41,19 @@ class NamedBus:
         self._channel = channel or driver if interface == "virtual" else channel
         self._transport = _transport(text, self.name)
 
-    @property
-    def bus_class(self) -> type[Bus]:
-        """The class of the bus. Where the channel determines it, that is looked at: an emulator, a recording.
+    def choose(self, driver: type[AnyAdapter]) -> type[AnyAdapter]:
+        """Return the class of a driver that fits the bus: some devices can be attached to several kinds of bus.
+
+        Where the channel determines the kind of bus, that is looked at: an emulator, a recording.
 
         Raises:
             ConfigurationError: there is no such channel.
         """
-        choose = getattr(self._transport, CHOOSE, None)
-        found: type[Bus] = choose(self._channel, self.name.options) if choose else self._transport
-        return found
-
-    def choose(self, driver: type[AnyAdapter]) -> type[AnyAdapter]:
-        """Return the class of a driver that fits the bus: some devices can be attached to several kinds of bus.
-
-        Raises:
-            ConfigurationError: as ``bus_class``.
-        """
         if not driver.elsewhere:
             return driver
-        return next((one for one in (driver, *driver.elsewhere) if self.bus_class.fits(one.medium)), driver)
+        choose_class = getattr(self._transport, CHOOSE, None)
+        bus: type[Bus] = choose_class(self._channel, self.name.options) if choose_class else self._transport
+        return next((one for one in (driver, *driver.elsewhere) if bus.fits(one.medium)), driver)
 
     def make(self, *, payload_size: int = 8, listen_only: bool = False, for_devices: bool = False) -> Bus:
         """Return the bus, not opened yet.

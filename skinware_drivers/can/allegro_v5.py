@@ -31,22 +31,20 @@ from typing import Annotated, ClassVar, Literal
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
 from skinware.status import Status
+from skinware_drivers import Link, Match, Module, Patch, check_options, taxels
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.description import Module, Patch, SkinTables, taxels
-from skinware_drivers.fields import SequenceNumber
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match, Reply
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Watch, ZeroWatch
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Framing, Unframed
+from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
+from skinware_drivers.link import Reply
+from skinware_drivers.polling import ZeroWatch
+from skinware_drivers.serial import SerialAdapter, Unframed
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -81,21 +79,21 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     model: Annotated[
         Literal["auto", "tips", "sense"],
-        msgspec.Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: by the frames"),
+        Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: by the frames"),
     ] = "auto"
     zero_pa: Annotated[
-        int, msgspec.Meta(description="what an untouched fingertip sends, Pa: 0, or 101325 for the pressure of the air")
+        int, Meta(description="what an untouched fingertip sends, Pa: 0, or 101325 for the pressure of the air")
     ] = 0
-    side: Annotated[Literal["right", "left"], msgspec.Meta(description="which hand it is, for the places")] = "right"
+    side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for the places")] = "right"
     palm: Annotated[
         Literal["alike", "tenfold"],
-        msgspec.Meta(description="on CAN, the unit of a Sense's palm: the unit of the other pads, or ten times that"),
+        Meta(description="on CAN, the unit of a Sense's palm: the unit of the other pads, or ten times that"),
     ] = "alike"
     period_ms: Annotated[
-        Annotated[int, msgspec.Meta(ge=1)] | None,
-        msgspec.Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
     ] = None
-    learn_s: Annotated[float, msgspec.Meta(description="time of listening for the model, s", gt=0)] = 0.5
+    learn_s: Annotated[float, Meta(description="time of listening for the model, s", gt=0)] = 0.5
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -104,11 +102,11 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
     """One V5 Sense over UDP; each datagram is a sample."""
 
-    types: Sequence[SensorType] = (PRESSURE.measured(scale=_PA_OVER_UDP, minimum=0),)
-    dtype: npt.DTypeLike = np.uint16
+    types = (PRESSURE.measured(scale=_PA_OVER_UDP, minimum=0),)
+    dtype = np.uint16
     period_s = 0.003
-    framing: Framing = Unframed(_LONGEST_DATAGRAM)
-    layout: Layout = Layout(
+    framing = Unframed(_LONGEST_DATAGRAM)
+    layout = Layout(
         [
             Frame(
                 "sample",
@@ -120,15 +118,12 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
             )
         ]
     )
-    patches: Sequence[Patch] = (Patch("hand", [Module(taxels(N_PADS), kind="pads")]),)
+    patches = (Patch("hand", [Module(taxels(N_PADS), kind="pads")]),)
+    watch = ZeroWatch
 
     def __init__(self, options: AllegroV5Options) -> None:
         super().__init__(options)
-        self.geometry: Geometry | None = _places_of_pads(options.side)
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
+        self.geometry = _places_of_pads(options.side)
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         return False
@@ -140,10 +135,8 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     elsewhere: ClassVar[Sequence[type[AnyAdapter]]] = (AllegroV5UdpDriver,)
     payload_size = 8
     period_s = 0.01
-    types: Sequence[SensorType]
-    dtype: npt.DTypeLike
-    layout: Layout = Layout([*_TIP_FRAMES, *_PAD_FRAMES])
-    patches: Sequence[Patch]
+    layout = Layout([*_TIP_FRAMES, *_PAD_FRAMES])
+    watch = ZeroWatch
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the hand of the option ``model``, or of the frames that are heard.
@@ -179,10 +172,6 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         return False
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     def _refuse_two(self, link: Link, counted: Counter[int]) -> None:
         """Refuse two hands of different identifiers on one bus, and warn of two alike: their frames have no number."""

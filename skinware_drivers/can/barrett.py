@@ -25,21 +25,19 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Link, Match, Module, Patch, Poll, check_options, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Packed, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll
 
 FIRST_NODE, LAST_NODE = 11, 14
 CELLS = 24
 HAND_GROUP = 0x405
 _VERSION, _SET = 0, 0x80
-_REPLY_S, _ANSWERS_S = 0.1, 0.2
+_REPLY_S = 0.1
 _NODE = Bits(shift=5, width=5)
 _PA_PER_N_CM2 = 1e4
 _FULL = tuple(
@@ -76,12 +74,12 @@ _TOP_10 = Frame(
 class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    nodes: Annotated[tuple[int, ...], msgspec.Meta(description="nodes with tactile cells, 11-14")] = (11, 12, 13, 14)
+    nodes: Annotated[tuple[int, ...], Meta(description="nodes with tactile cells, 11-14")] = (11, 12, 13, 14)
     format: Annotated[
-        Literal["full", "top10"], msgspec.Meta(description="all cells in 12 bits, or the ten strongest in four")
+        Literal["full", "top10"], Meta(description="all cells in 12 bits, or the ten strongest in four")
     ] = "full"
-    period_ms: Annotated[int, msgspec.Meta(description="time between two requests, ms", ge=5, le=1000)] = 20
-    tact: Annotated[int, msgspec.Meta(description="number of the property TACT, by firmware", ge=1, le=127)] = 106
+    period_ms: Annotated[int, Meta(description="time between two requests, ms", ge=5, le=1000)] = 20
+    tact: Annotated[int, Meta(description="number of the property TACT, by firmware", ge=1, le=127)] = 106
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -97,11 +95,11 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
     Values are raw: 1/256 N/cm2 in the format ``full``, N/cm2 in ``top10``; the scale of the type converts to pascals.
     """
 
-    dtype: npt.DTypeLike = np.uint16
+    dtype = np.uint16
 
     def __init__(self, options: BarrettOptions) -> None:
         super().__init__(options)
-        self.patches: Sequence[Patch] = tuple(
+        self.patches = tuple(
             Patch(
                 "palm" if node == LAST_NODE else f"finger {node - FIRST_NODE + 1}",
                 [Module(taxels(CELLS, first_uid=node << 8), kind="pad")],
@@ -116,7 +114,7 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         else:
             self.layout = Layout((_TOP_10,))
             greatest, scale = 15, _PA_PER_N_CM2
-        self.types: Sequence[SensorType] = (PRESSURE.measured(scale=scale, minimum=0, maximum=greatest * scale),)
+        self.types = (PRESSURE.measured(scale=scale, minimum=0, maximum=greatest * scale),)
 
     @property
     def polls(self) -> Sequence[Poll]:

@@ -17,10 +17,8 @@ from canopen.sdo.exceptions import SdoAbortedError
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
-from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers import EXTENDED_FLAG, Link, Match, Module, Patch, Sensor
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
-from skinware_drivers.link import Link, Match
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -216,7 +214,7 @@ class PdoMap:
             raise ConfigurationError("none of the objects that are mapped into TPDOs is a number that the EDS knows")
         self.dtype: np.dtype[Any] = _common_dtype(known)
         self.types: list[SensorType] = self._types(known)
-        self.layout: Layout = Layout(tuple(self._frames(nodes)))
+        self.layout = Layout(tuple(self._frames(nodes)))
         self.patches: tuple[Patch, ...] = tuple(
             Patch(f"node {node}", [self._module(node, tpdo) for tpdo in tpdos], key=node)
             for node, tpdos in nodes.items()

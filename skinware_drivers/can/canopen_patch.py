@@ -17,19 +17,17 @@ from typing import Annotated
 
 import canopen
 import msgspec
-import numpy.typing as npt
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary
+from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import CATALOGUE, SensorType
+from skinware.sensor_types import CATALOGUE
+from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
-from skinware_drivers.description import Patch
-from skinware_drivers.layout import Layout
-from skinware_drivers.link import Heard, Link, Match, Reply
-from skinware_drivers.options import check_options, nearest_name
-from skinware_drivers.polling import Notice, Poll
+from skinware_drivers.link import Heard, Reply
+from skinware_drivers.options import nearest_name
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -44,16 +42,14 @@ _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    eds: Annotated[str, msgspec.Meta(description="EDS or DCF file of the patches; default: the example's")] = ""
-    nodes: Annotated[
-        tuple[int, ...], msgspec.Meta(description="node ids of the patches, 1-127; default: all that answer")
-    ] = ()
-    period_ms: Annotated[int, msgspec.Meta(description="time between two updates, ms", ge=1, le=60_000)] = 20
+    eds: Annotated[str, Meta(description="EDS or DCF file of the patches; default: the example's")] = ""
+    nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127; default: all that answer")] = ()
+    period_ms: Annotated[int, Meta(description="time between two updates, ms", ge=1, le=60_000)] = 20
     heartbeat_ms: Annotated[
-        int, msgspec.Meta(description="time between two heartbeats of a patch, ms; 0: none", ge=0, le=60_000)
+        int, Meta(description="time between two heartbeats of a patch, ms; 0: none", ge=0, le=60_000)
     ] = 100
-    type: Annotated[str, msgspec.Meta(description="type of sensors whose name in the EDS contains none")] = "pressure"
-    learn_s: Annotated[float, msgspec.Meta(description="time in which a listener learns the nodes, s", gt=0)] = 1.0
+    type: Annotated[str, Meta(description="type of sensors whose name in the EDS contains none")] = "pressure"
+    learn_s: Annotated[float, Meta(description="time in which a listener learns the nodes, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -78,10 +74,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
     """
 
     payload_size = 8
-    types: Sequence[SensorType]
-    dtype: npt.DTypeLike
-    layout: Layout
-    patches: Sequence[Patch]
 
     def __init__(self, options: CanopenOptions) -> None:
         super().__init__(options)

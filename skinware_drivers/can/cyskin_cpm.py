@@ -10,18 +10,15 @@ The frames carry no number and no checksum, so one lost frame loses its set, and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Cycle, Frame, Identifier, Layout, Module, Patch, Values, check_options, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, Values
-from skinware_drivers.options import check_options
 
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
 IDENTIFIERS = (0x405, 0x407, 0x409, 0x40B)
@@ -34,7 +31,7 @@ QUARTERS = tuple(
 class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two sets, ms", ge=1)] = 20
+    period_ms: Annotated[int, Meta(description="nominal time between two sets, ms", ge=1)] = 20
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -43,11 +40,11 @@ class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
     """One finger on each bus; uid = taxel. Values are raw counts, without a baseline."""
 
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
-    dtype: npt.DTypeLike = np.uint16
-    patches: Sequence[Patch] = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
+    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
+    dtype = np.uint16
+    patches = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
 
     def __init__(self, options: CyskinCpmOptions) -> None:
         super().__init__(options)
         names = tuple(frame.name for frame in QUARTERS)
-        self.layout: Layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
+        self.layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))

@@ -28,22 +28,17 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware.sensor_types import SensorType
+from skinware_drivers import Identifier, Link, Match, Patch, Poll, check_options, operation
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
-from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.fields import Identifier
 from skinware_drivers.hand import FINGERS, Hand
-from skinware_drivers.layout import Layout
-from skinware_drivers.link import Heard, Link, Match
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll, Watch, ZeroWatch
+from skinware_drivers.link import Heard
+from skinware_drivers.polling import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -65,25 +60,23 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """Options of the driver."""
 
     hands: Annotated[
-        tuple[int, ...], msgspec.Meta(description="identifiers of the hands; default: 0x27 and 0x28, if present")
+        tuple[int, ...], Meta(description="identifiers of the hands; default: 0x27 and 0x28, if present")
     ] = ()
     touch: Annotated[
         Literal["auto", "12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],
-        msgspec.Meta(
+        Meta(
             description="matrices of this size, values of each finger (commands 20 or 90), or matrices of the whole"
             " hand with fingers of this size; auto: find out"
         ),
     ] = "auto"
-    ask: Annotated[
-        bool, msgspec.Meta(description="ask the hands for their touch; only where no other program does")
-    ] = False
+    ask: Annotated[bool, Meta(description="ask the hands for their touch; only where no other program does")] = False
     period_ms: Annotated[
-        Annotated[int, msgspec.Meta(ge=20, le=2000)] | None,
-        msgspec.Meta(
+        Annotated[int, Meta(ge=20, le=2000)] | None,
+        Meta(
             description="time between two updates, ms; default: learnt by a listener, else 50, for the whole hand 100"
         ),
     ] = None
-    learn_s: Annotated[float, msgspec.Meta(description="time in which a listener learns the hands, s", gt=0)] = 1.0
+    learn_s: Annotated[float, Meta(description="time in which a listener learns the hands, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -105,11 +98,9 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
     """
 
     payload_size = 8
-    dtype: npt.DTypeLike = np.uint8
-    types: Sequence[SensorType]
-    layout: Layout
-    patches: Sequence[Patch]
+    dtype = np.uint8
     _round_s: float | None = None  # from one round of another program's questions to the next
+    watch = ZeroWatch
 
     def __init__(self, options: LinkerHandOptions) -> None:
         super().__init__(options)
@@ -175,10 +166,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
                         link.bus_name,
                         _name(frame.identifier),
                     )
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     @operation(looks=True)
     async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware_drivers import Link, Match, Patch, operation
 from skinware_drivers.can.roboskin_layout import board_of
 from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD
-from skinware_drivers.description import Patch
-from skinware_drivers.link import Link, Match
-from skinware_drivers.operations import operation
 
 ADDRESSES = range(FIRST_BOARD, LAST_BOARD + 1)
 MTB3_TYPE = 5

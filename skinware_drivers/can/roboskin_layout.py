@@ -21,8 +21,8 @@ from collections.abc import Sequence
 
 from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
+from skinware_drivers import Module, Patch, Sensor
 from skinware_drivers.can.roboskin_options import CHANNELS, Inertial, InertialSensor, RoboskinOptions
-from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
 
 OLD_SKIN, SKIN, INERTIAL = 3, 4, 5

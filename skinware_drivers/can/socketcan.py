@@ -23,11 +23,10 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, identifier_text
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
 from skinware_drivers.can.controller import CONTROLLER_STATES, NO_CAN, ControllerHealth, read_controller, wire_bits
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
-from skinware_drivers.native.kernel_bus import KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 
@@ -231,7 +230,7 @@ class SocketCanBus(KernelBus):
         return not self._stamper.hardware
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)

@@ -16,36 +16,32 @@ messages, and the wire does not show which. It carries no checksum and no sequen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
+from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
+from skinware_drivers import Bits, Frame, Identifier, Layout, Link, Module, Patch, Values, check_options, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link
-from skinware_drivers.options import check_options
 
 
 class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver, for every board of a bus."""
 
-    boards: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the boards, 1-15")] = (1,)
+    boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards, 1-15")] = (1,)
     ids: Annotated[
         Literal["consecutive", "row_column"],
-        msgspec.Meta(description="how identifiers name taxels: first + taxel, or first | row << 4 | column"),
+        Meta(description="how identifiers name taxels: first + taxel, or first | row << 4 | column"),
     ] = "consecutive"
-    first_id: Annotated[
-        tuple[int, ...], msgspec.Meta(description="identifier of the first taxel of each board, as 0x710")
-    ] = (0x710,)
-    rows: Annotated[int, msgspec.Meta(description="rows of taxels", ge=1, le=16)] = 4
-    columns: Annotated[int, msgspec.Meta(description="columns of taxels", ge=1, le=16)] = 4
-    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two messages of a taxel, ms", ge=1)] = 10
+    first_id: Annotated[tuple[int, ...], Meta(description="identifier of the first taxel of each board, as 0x710")] = (
+        0x710,
+    )
+    rows: Annotated[int, Meta(description="rows of taxels", ge=1, le=16)] = 4
+    columns: Annotated[int, Meta(description="columns of taxels", ge=1, le=16)] = 4
+    period_ms: Annotated[int, Meta(description="nominal time between two messages of a taxel, ms", ge=1)] = 10
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -76,10 +72,8 @@ class XelaDriver(CanAdapter[XelaOptions]):
     Values are raw (idle about 32 to 37 thousand); only the maker's closed server computes forces.
     """
 
-    types: Sequence[SensorType] = tuple(
-        t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE)
-    )
-    dtype: npt.DTypeLike = np.uint16
+    types = tuple(t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE))
+    dtype = np.uint16
 
     def __init__(self, options: XelaOptions) -> None:
         super().__init__(options)
@@ -95,8 +89,8 @@ class XelaDriver(CanAdapter[XelaOptions]):
             patches.append(Patch(f"board {board}", modules, key=board))
             when = (Identifier.covering(own),)
             frames.append(Frame(f"board {board}", when, (8,), axes, patch=board, module=Bits(0, 11)))
-        self.patches: Sequence[Patch] = patches
-        self.layout: Layout = Layout(frames)
+        self.patches = patches
+        self.layout = Layout(frames)
 
     async def start(self, link: Link) -> None:
         for board in self.options.boards:

@@ -21,7 +21,7 @@ from skinware.cli._command import (
     version_option,
 )
 from skinware.cli._terminal import echo, overwrite, print_json, style
-from skinware.text import age_text, plural
+from skinware.text import age_text, plural, wrapped
 from skinware_drivers.doctor.finding import Finding, Severity
 
 if TYPE_CHECKING:
@@ -74,13 +74,13 @@ def _verdict(evidence: Evidence, found: Examination) -> Iterator[str]:
         if (count := sum(one.severity == severity for one in found.findings))
     ]
     verdict = ", ".join(counts) or style("nothing found", fg="green", bold=True)
-    yield from _wrapped(f"{verdict}  {style(f'({about})', dim=True)}", "", "")
+    yield from wrapped(f"{verdict}  {style(f'({about})', dim=True)}", _WIDTH, hang=0)
 
 
 def _finding(finding: Finding) -> Iterator[str]:
     sign, colour = _SIGNS[finding.severity]
     head = f"{style(f'{sign} {finding.area}', fg=colour, bold=True)}  {style(finding.what, bold=True)}"
-    yield from _wrapped(head, "", "    ")
+    yield from wrapped(head, _WIDTH)
     for label, text in (
         ("where", finding.where),
         ("evidence", finding.evidence),
@@ -94,19 +94,7 @@ def _finding(finding: Finding) -> Iterator[str]:
 
 def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
     head = "  " + style(f"{label:<{width}}", dim=True)
-    yield from _wrapped(head + text, "", " " * (width + 2))
-
-
-def _wrapped(text: str, first: str, following: str) -> list[str]:
-    """Return lines of the width, counted without colours; long words stay whole."""
-    words = text.split(" ")
-    lines = [first + words[0]]
-    for word in words[1:]:
-        if len(click.unstyle(lines[-1])) + 1 + len(click.unstyle(word)) <= _WIDTH:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(following + word)
-    return lines
+    yield from wrapped(head + text, _WIDTH, hang=width)
 
 
 @click.command(
@@ -137,10 +125,12 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
 
     Exit status: 0 nothing found, 1 something found, 2 wrong usage or not a recording.
     """
+    from skinware.memory.namespace import Namespace
     from skinware_drivers.doctor.examining import examine
+    from skinware_drivers.doctor.looking import look
 
     progress = _progress()
-    evidence = _live(namespace, watch_s, progress) if file is None else _recorded(file, progress)
+    evidence = look(Namespace(namespace), watch_s, progress) if file is None else _recorded(file, progress)
     progress(-1.0)
     found = examine(evidence)
     if report is not None:
@@ -185,13 +175,6 @@ def _write(report: Path, evidence: Evidence, found: Examination) -> None:
         report.write_text(as_markdown(evidence, found), encoding="utf-8")
     except OSError as error:
         raise ConfigurationError(f"{report}: {error.strerror or error}") from None
-
-
-def _live(namespace: str | None, watch_s: float, progress: Callable[[float], None]) -> Evidence:
-    from skinware.memory.namespace import Namespace
-    from skinware_drivers.doctor.looking import look
-
-    return look(Namespace(namespace), watch_s, progress)
 
 
 def _recorded(file: Path, progress: Callable[[float], None]) -> Evidence:

@@ -88,6 +88,7 @@ def command(
 
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration.
     """
+    from skinware.geometry import geometry_to_toml
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
@@ -119,7 +120,8 @@ def command(
         log = open_things.enter_context(contextlib.closing(JsonLinesLog(log_path))) if log_path else None
         hardware = emulator(options, log=log)
         if geometry_path is not None:
-            _write_geometry(geometry_path, _placed(hardware, "--geometry"), short_name(driver))
+            groups = _placed(hardware, "--geometry").geometry().to_groups()
+            geometry_path.write_text(geometry_to_toml(groups, f"the sensors of an emulated {short_name(driver)}"))
         companion = None
         if name is not None:
             service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
@@ -140,12 +142,6 @@ def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
     if not isinstance(hardware, PlacedHardware):
         raise ConfigurationError(f"{option}: these emulated devices have no places")
     return hardware
-
-
-def _write_geometry(path: Path, hardware: PlacedHardware, driver: str) -> None:
-    from skinware.geometry import geometry_to_toml
-
-    path.write_text(geometry_to_toml(hardware.geometry().to_groups(), f"the sensors of an emulated {driver}"))
 
 
 def main() -> None:

@@ -111,9 +111,12 @@ async def look(
         make_bus(name)  # refuses bad names, also without --probe
     buses_to_hear = [one.name for one in interfaces if one.up]
     buses_to_hear += [name for name in others if not BusName.of(name).is_only_asked]
-    searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
+
+    async def search() -> Any:
+        return Detection() if buses else await asyncio.to_thread(detect_adapters, _DETECTION_S)
+
     detection: Detection
-    detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
+    detection, *listened = await asyncio.gather(search(), *(listen(name, listen_s, drivers) for name in buses_to_hear))
     heard: dict[str, HeardOnBus] = {one.bus: one for one in listened}
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
@@ -190,12 +193,6 @@ async def _ask(
             of_ports = known_drivers("serial", driver_names) | known_drivers("modbus", driver_names)
             answers[port.path] = await ask_port(port.path, of_ports)
     return answers
-
-
-def _no_adapters(_timeout_s: float) -> Any:
-    from skinware_drivers.finding.interfaces import Detection
-
-    return Detection()
 
 
 def _can_data(

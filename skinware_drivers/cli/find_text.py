@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import Any
 
-import click
-
 from skinware.cli._terminal import style
-from skinware.text import count_text, plural
+from skinware.text import count_text, plural, words, wrapped
 from skinware_drivers.bus_names import BusName
 
 _WIDTH = 80
@@ -20,20 +17,20 @@ def as_text(found: dict[str, Any]) -> list[str]:
     can = found["can"]
     lines: list[str] = []
     if can["interfaces"] or can["advice"]:
-        lines += [_title("CAN interfaces of the kernel")]
+        lines += [style("CAN interfaces of the kernel", underline=True)]
         for interface in can["interfaces"]:
             lines += ["", *_interface_lines(interface)]
         lines += _advice(can["advice"])
     for bus in found["buses"]:
-        lines += ["", _title(bus["bus"]), *_bus_lines(bus)]
+        lines += ["", style(bus["bus"], underline=True), *_bus_lines(bus)]
     if found["adapters"] or found["adapters_problem"]:
-        lines += ["", _title("other CAN adapters, by python-can")]
+        lines += ["", style("other CAN adapters, by python-can", underline=True)]
         for adapter in found["adapters"]:
             details = ", ".join(f"{key} {value}" for key, value in adapter.details.items())
             lines += _wrapped(f"{style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
         lines += _advice([found["adapters_problem"]] if found["adapters_problem"] else [])
     if found["ports"]:
-        lines += ["", _title("serial ports")]
+        lines += ["", style("serial ports", underline=True)]
         for port in found["ports"]:
             lines += ["", *_port_lines(port)]
     elif not can["interfaces"] and not found["buses"] and not found["adapters"]:
@@ -45,7 +42,8 @@ def _interface_lines(one: dict[str, Any]) -> list[str]:
     state = style("up", fg="green") if one["up"] else style("down", fg="yellow")
     parts = [state, f"kernel driver {one['driver']}" if one["driver"] else one["kind"]]
     if one["bit_rate"]:
-        parts.append(_bit_rate(one))
+        parts.append(f"{one['bit_rate'] / 1000:g} kbit/s")
+        parts += [f"data {one['data_bit_rate'] / 1000:g} kbit/s"] if one["data_bit_rate"] else []
     elif one["kind"] == "can":
         parts.append("no bit rate known")
     if one["state"]:
@@ -53,19 +51,14 @@ def _interface_lines(one: dict[str, Any]) -> list[str]:
     parts += ["FD" if one["is_fd"] else "no FD", f"queue {one['queue_length']}"]
     counts = one["statistics"]
     went = [f"received {count_text(counts['rx_packets'])}", f"sent {count_text(counts['tx_packets'])}"]
-    went += [f"{name.replace('_', ' ')} {count_text(count)}" for name, count in _troubles(one).items()]
+    troubles = {**counts, **one["controller_errors"]}
+    went += [
+        f"{words(name)} {count_text(count)}"
+        for name, count in troubles.items()
+        if count and not name.endswith("_packets")
+    ]
     lines = [*_wrapped(f"{style(one['name'], bold=True)}  {', '.join(parts)}", first="")]
     return [*lines, *_wrapped(", ".join(went)), *_bus_lines(one), *_advice(one["advice"])]
-
-
-def _bit_rate(one: dict[str, Any]) -> str:
-    text = f"{one['bit_rate'] / 1000:g} kbit/s"
-    return text + (f", data {one['data_bit_rate'] / 1000:g} kbit/s" if one["data_bit_rate"] else "")
-
-
-def _troubles(one: dict[str, Any]) -> dict[str, int]:
-    counted = {**one["statistics"], **one["controller_errors"]}
-    return {name: count for name, count in counted.items() if count and not name.endswith("_packets")}
 
 
 def _bus_lines(bus: dict[str, Any]) -> list[str]:
@@ -148,16 +141,5 @@ def _advice(texts: list[str]) -> list[str]:
     return lines
 
 
-def _title(text: str) -> str:
-    return style(text, underline=True)
-
-
 def _wrapped(text: str, first: str = "  ") -> list[str]:
-    return textwrap.wrap(
-        text,
-        _WIDTH + len(text) - len(click.unstyle(text)),
-        initial_indent=first,
-        subsequent_indent=first + "    ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    return wrapped(first + text, _WIDTH)

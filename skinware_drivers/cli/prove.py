@@ -128,7 +128,7 @@ def command(
         _refuse_others(
             context, {"captured", "save", "driver_arguments", "as_json", *(["name"] if name is None else [])}
         )
-        from skinware_drivers.cli.captured import compare_capture
+        from skinware_drivers.cli.comparing import compare_capture
 
         if not compare_capture(captured, driver_arguments, save=save, as_json=as_json):
             context.exit(EXIT_FAILED)
@@ -263,7 +263,8 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
     try:
         thread.start()
         if not is_ready.wait(_STARTS_WITHIN_S) or not ready:
-            raise DriverError(_why_nothing(files.capture))
+            attach = f"; {files.capture} holds the frames on its buses: attach it" if files.capture.exists() else ""
+            raise DriverError(f"skin-driver publishes nothing{attach}" if attach else "skin-driver did not start")
         yield str(ready["name"])
     finally:
         process.send_signal(signal.SIGINT)
@@ -284,12 +285,6 @@ def _event_of(line: str) -> dict[str, Any]:
     except ValueError:
         return {}
     return event if isinstance(event, dict) else {}
-
-
-def _why_nothing(capture: Path) -> str:
-    if capture.exists():
-        return f"skin-driver publishes nothing; {capture} holds the frames on its buses: attach it"
-    return "skin-driver did not start"
 
 
 class _AtTerminal:

@@ -101,16 +101,13 @@ def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -
     driver = drivers[0] if len(drivers) == 1 else ""
     pairs: list[tuple[WireTrack, Bus]] = []
     for text in buses:
-        recorded, _, name = text.partition("=") if _names_recorded(recording, text) else ("", "", text)
+        names_one = any(text.startswith(f"{wire.bus}=") for wire in recording.wires)
+        recorded, _, name = text.partition("=") if names_one else ("", "", text)
         wire = wire_of(recording, recorded, driver)
         if any(wire is other for other, _ in pairs):
             raise ConfigurationError(f"--bus {text}: {wire.bus} is sent already")
         pairs.append((wire, make_bus(name, payload_size=MOST_BYTES if wire.is_serial else _PAYLOAD)))
     return pairs
-
-
-def _names_recorded(recording: Recording, text: str) -> bool:
-    return any(text.startswith(f"{wire.bus}=") for wire in recording.wires)
 
 
 class WireSender:

@@ -12,7 +12,7 @@ import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, run, version_option
 from skinware.cli._terminal import echo
-from skinware_drivers.options.texts import nearest_name
+from skinware_drivers.options.declared import nearest_name
 
 
 class Entry(NamedTuple):

@@ -33,25 +33,25 @@ def fewest(filters: Iterable[Filter]) -> list[Filter]:
     """Return filters that let the same frames through as these, without redundant ones."""
     left = {Filter(value & mask, mask) for value, mask in filters}
     while True:
-        joined = {_join(one, other) for one in left for other in left if _differ_in_one_bit(one, other)}
+        joined = set()
+        for one in left:
+            for other in left:
+                differ = one.value ^ other.value
+                if one.mask == other.mask and differ.bit_count() == 1:
+                    joined.add(Filter(one.value & ~differ, one.mask & ~differ))
         every = left | joined
-        fewer = {one for one in every if not any(_covers(other, one) for other in every if other != one)}
+        fewer = {
+            one
+            for one in every
+            # another one is wider, and lets it through
+            if not any(
+                other != one and other.mask & one.mask == other.mask and one.value & other.mask == other.value
+                for other in every
+            )
+        }
         if fewer == left:
             return sorted(left)
         left = fewer
-
-
-def _covers(wide: Filter, narrow: Filter) -> bool:
-    return wide.mask & narrow.mask == wide.mask and narrow.value & wide.mask == wide.value
-
-
-def _differ_in_one_bit(one: Filter, other: Filter) -> bool:
-    return one.mask == other.mask and (one.value ^ other.value).bit_count() == 1
-
-
-def _join(one: Filter, other: Filter) -> Filter:
-    mask = one.mask & ~(one.value ^ other.value)
-    return Filter(one.value & mask, mask)
 
 
 STANDARD_IDENTIFIERS = 1 << 11

@@ -123,7 +123,10 @@ class Decoder:
         for cycle in self.compiled.cycles:
             parts += self._pair(batch, cycle, entry, is_module, kind, severed)
         if not parts:
-            return self._no_updates(), foreign + first
+            empty, none = np.zeros((0, self.compiled.width), np.int64), np.zeros(0, np.int64)
+            groups = np.zeros((0, self.compiled.most_groups), np.int64)
+            nothing = Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
+            return nothing, foreign + first
         updates = Updates.join([part for part, _ in parts])
         newest_ns = updates.newest_ns
         if len(parts) > 1:
@@ -180,10 +183,7 @@ class Decoder:
     def _find_kinds(
         self, slots: Indices, entry: Indices, wire: npt.NDArray[np.void], bus: npt.NDArray[np.uint16]
     ) -> tuple[Bytes, Indices]:
-        """(n,) kind of each frame, 255 = none; and the rows that are ours and of no kind or of a wrong length.
-
-        Those are counted here.
-        """
+        """Return (n,) kind of each frame, 255: none; and rows of ours with no kind or a wrong length, after a count."""
         n_buses, payload = len(self.state.bus_counters), wire["payload"]
         length = np.minimum(wire["length"], self.compiled.length_ok.shape[1] - 1)
         ours = entry < self._n_modules + self._n_patches
@@ -221,7 +221,7 @@ class Decoder:
         return known
 
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
-        """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
+        """Return (n,) the last kind whose conditions hold, and whose length is right if it is checked; 255: none."""
         kind = np.full(len(slots), NO_KIND, np.uint8)
         candidates = self.compiled.addresses.candidates[slots]
         for number, frame in enumerate(self.compiled.frames):
@@ -238,7 +238,7 @@ class Decoder:
     def _pair(
         self, batch: FrameBatch, cycle: CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
     ) -> list[tuple[Updates, Indices]]:
-        """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
+        """Return the whole cycles and the orphans of a batch; keep rows that may become whole for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
         pairs = cycle.find(entry, kind, wire["payload"], time_ns, is_module, severed)
         if len(pairs.waiting):
@@ -255,10 +255,10 @@ class Decoder:
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
 
     def _count_haste(self, soon: Indices, whole: Indices) -> None:
-        """A patch whose frames always come too soon is not shown at all: say why, once.
+        """Count frames that come too soon: a patch that always sends such frames is not shown, and a warning says why.
 
         Args:
-            soon: modules whose frames did.
+            soon: modules whose frames came too soon.
             whole: modules of which whole cycles came.
         """
         haste = self.haste
@@ -307,7 +307,7 @@ class Decoder:
     def _count_unreadable(
         self, batch: FrameBatch, rows: Indices, module: Indices, unreadable: Indices, whole: Flags
     ) -> Flags:
-        """(n,) which updates are still whole, without those frames; their partners are orphans now."""
+        """Return (n,) which updates are still whole without those frames; their partners become orphans."""
         spoilt, n_frames = np.unique(unreadable, return_counts=True)
         bus = batch.bus[batch.start + rows[unreadable, 0]]
         self.state.bus_counters[:, 2] += np.bincount(bus, minlength=len(self.state.bus_counters))
@@ -324,8 +324,3 @@ class Decoder:
         if sequence is not None and len(module):
             for counter, found in enumerate(self.sequences.compare(sequence, payload, module), start=3):
                 self.state.patch_counters[:, counter] += found
-
-    def _no_updates(self) -> Updates:
-        empty, none = np.zeros((0, self.compiled.width), np.int64), np.zeros(0, np.int64)
-        groups = np.zeros((0, self.compiled.most_groups), np.int64)
-        return Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)

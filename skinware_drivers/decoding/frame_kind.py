@@ -140,8 +140,12 @@ class FrameKind:
         """
         words: dict[tuple[int, str, int], tuple[Indices, Words]] = {}  # several flags share one
         for flag in self.frame.flags:
-            if isinstance(flag, Sentinel | Above):
-                status[:, columns] |= np.where(_hit(flag, raw), np.uint8(flag.status), np.uint8(0))
+            if isinstance(flag, Above):
+                status[:, columns] |= np.where(raw > flag.limit, np.uint8(flag.status), np.uint8(0))
+                continue
+            if isinstance(flag, Sentinel):
+                is_none = np.isnan(raw) if flag.value != flag.value else raw == flag.value
+                status[:, columns] |= np.where(is_none, np.uint8(flag.status), np.uint8(0))
                 continue
             if isinstance(flag, StatusBytes):
                 end = flag.offset + raw.shape[1]
@@ -163,14 +167,6 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
         return _unpack(data, run.count, run.dtype)
     dtype = np.dtype(run.dtype)
     return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
-
-
-def _hit(flag: Sentinel | Above, raw: npt.NDArray[Any]) -> Flags:
-    if isinstance(flag, Above):
-        above: Flags = raw > flag.limit
-        return above
-    equal: Flags = np.isnan(raw) if flag.value != flag.value else raw == flag.value
-    return equal
 
 
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, Words]:

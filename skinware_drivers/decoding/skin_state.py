@@ -179,8 +179,3 @@ class SkinState:
         self.all_touched[updates.groups] = True
         self.all_patch_time_ns[self._prompt_patch[shown[:, 0]]] = updates.newest_ns
         self.newest_ns = max(self.newest_ns, int(updates.newest_ns[-1]))
-
-    def begin_frame(self) -> None:
-        """Forget what was shown since the last publication."""
-        self.updated[:] = False
-        self.touched[:] = False

@@ -18,7 +18,6 @@ from skinware_drivers.doctor.finding import (
     names_of_bus,
 )
 from skinware_drivers.doctor.machine import circumstances
-from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.finding.running import same_bus
 from skinware_drivers.running.news import FULL, HIGH_LOAD
 
@@ -301,7 +300,12 @@ def _state(bus: BusSeen, where: str, names: dict[str, str], evidence: Evidence) 
     rule = REASONS.get(bus.reason) or (STATES.get(bus.state) if is_away else None)
     if rule is not None:
         since = f" for {age_text(bus.since_s * 1e9)}" if bus.since_s else ""
-        port = next((f"; {_port_text(port)}" for port in evidence.ports if same_bus(port.path, bus.name)), "")
+        port = ""
+        for one in evidence.ports:
+            if same_bus(one.path, bus.name):
+                rights = [] if one.may_open else [f"this account may not open {one.path} (group {one.group or 'none'})"]
+                users = [f"{user.program} (pid {user.pid}) has it open" for user in one.users]
+                port = f"; {'; '.join([*rights, *users]) or f'{one.path} is plugged in'}"
         severity = _ERROR if is_away else _WARNING
         yield rule.found(where, f"{_state_text(bus.state, bus.reason)}{since}{port}", severity, **names)
     if len(bus.changes) > _FLAPS:
@@ -345,9 +349,3 @@ def _shared(evidence: Evidence) -> Iterator[Finding]:
                     f"{other} has it too; this one has sent {plural(bus.counted.total.get('sent', 0), 'frame')}",
                     **names_of_bus(bus.name),
                 )
-
-
-def _port_text(port: SerialPort) -> str:
-    parts = [] if port.may_open else [f"this account may not open {port.path} (group {port.group or 'none'})"]
-    parts += [f"{user.program} (pid {user.pid}) has it open" for user in port.users]
-    return "; ".join(parts) or f"{port.path} is plugged in"

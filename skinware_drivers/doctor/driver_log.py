@@ -132,19 +132,18 @@ class DriverLog:
         self.longest_gap_s = max(self.longest_gap_s, (frame.published_ns - before.published_ns) / 1e9)
 
     def _follow_states(self, frame: DriverSnapshot, time_s: float) -> None:
-        reasons = frame.bus_reason.tolist()
-        for row, state in enumerate(frame.bus_state.tolist()):
-            reason = (bus_reason_name(reasons[row]) or "").replace("_", "-")
-            self._note_state(("bus", row), Change(time_s, bus_state_name(state), reason))
+        states: dict[tuple[str, int], Change] = {}
+        for row, (state, reason) in enumerate(zip(frame.bus_state.tolist(), frame.bus_reason.tolist(), strict=True)):
+            why = (bus_reason_name(reason) or "").replace("_", "-")
+            states["bus", row] = Change(time_s, bus_state_name(state), why)
         for row, state in enumerate(frame.patch_state.tolist()):
-            self._note_state(("patch", row), Change(time_s, patch_state_name(state)))
-
-    def _note_state(self, part: tuple[str, int], now: Change) -> None:
-        states = self._states.setdefault(part, [])
-        if not states or (states[-1].state, states[-1].reason) != (now.state, now.reason):
-            if len(states) == _MOST_CHANGES:
-                del states[1]
-            states.append(now)
+            states["patch", row] = Change(time_s, patch_state_name(state))
+        for part, now in states.items():
+            changes = self._states.setdefault(part, [])
+            if not changes or (changes[-1].state, changes[-1].reason) != (now.state, now.reason):
+                if len(changes) == _MOST_CHANGES:
+                    del changes[1]
+                changes.append(now)
 
     # -- the sum ------------------------------------------------------------------------------------------------
 

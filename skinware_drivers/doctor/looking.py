@@ -33,6 +33,7 @@ from skinware_drivers.doctor.evidence import (
 from skinware_drivers.doctor.watching import watch
 from skinware_drivers.finding import interfaces, ports, running
 from skinware_drivers.finding.interfaces import CanInterface
+from skinware_drivers.finding.ports import text_of
 from skinware_drivers.running.news import softnet_dropped
 
 _EVERY_FRAME = "in order"
@@ -74,10 +75,7 @@ def publishes_again(pid: int, proc: Path = _PROC) -> bool:
 
 def program_of(pid: int, proc: Path = _PROC) -> str:
     """Return the name of a process' program; empty if there is no such process."""
-    try:
-        return (proc / str(pid) / "comm").read_text(errors="replace").strip()
-    except OSError:
-        return ""
+    return text_of(proc / str(pid) / "comm")
 
 
 _PACKAGES = (
@@ -118,7 +116,7 @@ class MachineWatch:
             kernel=f"{platform.system()} {platform.release()} {platform.machine()}",
             cpus=len(os.sched_getaffinity(0)),
             load=os.getloadavg()[0],
-            governors=tuple(sorted({text for path in _CPUS.glob(_GOVERNORS) if (text := _text(path))})),
+            governors=tuple(sorted({text for path in _CPUS.glob(_GOVERNORS) if (text := text_of(path))})),
             memory_bytes=memory.get("MemTotal", 0),
             memory_available_bytes=memory.get("MemAvailable", 0),
             shared_bytes=total,
@@ -127,7 +125,7 @@ class MachineWatch:
             locked_memory_bytes=resource.getrlimit(resource.RLIMIT_MEMLOCK)[0],
             realtime_priority=99 if os.geteuid() == 0 else resource.getrlimit(resource.RLIMIT_RTPRIO)[0],
             groups=_groups(),
-            limits={name: int(text) for name, path in _LIMITS.items() if (text := _text(path)).lstrip("-").isdigit()},
+            limits={name: int(text) for name, path in _LIMITS.items() if (text := text_of(path)).lstrip("-").isdigit()},
             softnet_dropped=None if softnet is None or self._softnet is None else softnet - self._softnet,
             clock_set_s=time.time() - time.monotonic() - self._clock_s,
         )
@@ -200,7 +198,7 @@ def _groups() -> tuple[str, ...]:
 def _memory() -> dict[str, int]:
     """Return the figures of /proc/meminfo, in bytes."""
     found = {}
-    for line in _text(_MEMORY).splitlines():
+    for line in text_of(_MEMORY).splitlines():
         name, _, rest = line.partition(":")
         with contextlib.suppress(ValueError, IndexError):
             found[name] = 1024 * int(rest.split()[0])
@@ -215,13 +213,6 @@ def _shared_memory() -> tuple[int, int, str]:
         return 0, 0, f"{ROOT}: {error.strerror}"
     problem = "" if os.access(ROOT, os.W_OK | os.X_OK) else f"{ROOT} may not be written by this account"
     return room.f_frsize * room.f_blocks, room.f_frsize * room.f_bavail, problem
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace").strip()
-    except OSError:
-        return ""
 
 
 def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:

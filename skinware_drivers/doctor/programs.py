@@ -8,7 +8,7 @@ from skinware.bridge_state import BridgeState
 from skinware.realtime import NS_PER_S
 from skinware.text import age_text, count_text, plural, rate_text
 from skinware.views.bridges import as_data, summary
-from skinware_drivers.doctor.evidence import DriverSeen, Evidence, ReaderSeen
+from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Rule, Severity
 from skinware_drivers.doctor.machine import circumstances
 
@@ -132,8 +132,13 @@ def check_timing(evidence: Evidence) -> Iterator[Note]:
         if driver.life != "dead":
             yield from _late(driver, evidence)
         yield from _clock(driver)
-    for reader in evidence.readers:
-        yield from _reader(reader, evidence)
+    for one in evidence.readers:
+        yield Looked(f"reader {one.program}", f"{one.frames} snapshots of {one.driver} taken, {one.lost} missed")
+        if one.lost:
+            yield SLOW_READER.found(
+                f"{one.program}, pid {one.pid}, reads {one.driver}",
+                f"{plural(one.lost, 'snapshot')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
+            )
     if evidence.is_live:
         if not evidence.drivers:
             yield _no_driver(evidence)
@@ -167,15 +172,6 @@ def _no_driver(evidence: Evidence) -> Finding:
         seen += f"; skin-driver runs (pid {pids}), and has found no device so far"
     elsewhere = {"elsewhere": evidence.running[0].namespace} if evidence.running else {}
     return NO_DRIVER.found(f"namespace {evidence.namespace}", seen, **elsewhere)
-
-
-def _reader(one: ReaderSeen, evidence: Evidence) -> Iterator[Note]:
-    yield Looked(f"reader {one.program}", f"{one.frames} snapshots of {one.driver} taken, {one.lost} missed")
-    if one.lost:
-        yield SLOW_READER.found(
-            f"{one.program}, pid {one.pid}, reads {one.driver}",
-            f"{plural(one.lost, 'snapshot')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
-        )
 
 
 def _life(driver: DriverSeen) -> Iterator[Finding]:

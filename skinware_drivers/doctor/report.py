@@ -102,10 +102,8 @@ class Disguise:
 
     def __call__(self, text: str) -> str:
         """Return a text in disguise; a host keeps its new name."""
-        return scrubbed(_HOST.sub(self._host, text), self._secrets)
-
-    def _host(self, found: re.Match[str]) -> str:
-        return self._hosts.setdefault(found[0], f"host{len(self._hosts) + 1}")
+        hidden = _HOST.sub(lambda found: self._hosts.setdefault(found[0], f"host{len(self._hosts) + 1}"), text)
+        return scrubbed(hidden, self._secrets)
 
 
 def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -157,7 +157,8 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
         is_new = match.rows & ~explained
         explained |= match.rows
         count = int(match.rows.sum())
-        patches = await _names(match, bus, traffic.heard())
+        names = {patch.key: patch.name for patch in await _describe(match.adapter, bus, traffic.heard())}
+        patches = tuple(names.get(key, f"patch {key}") for key in sorted(match.keys))
         guesses.append(Guess(match.name, count, count / len(wire), patches, bool(is_new.any())))
     return sorted(guesses, key=lambda one: not one.likely)
 
@@ -206,12 +207,17 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
     if layout is None or not len(wire):
         return None
     cycles = [set(cycle.members) for cycle in layout.cycles]
-    without_values = {frame.name for frame in layout.frames if _has_no_values(frame)}
+    without_values = {  # alone, such frames do not make a patch
+        frame.name
+        for frame in layout.frames
+        if not isinstance(frame.values, Expand) and not any(values.count for values in frame.runs)
+    }
     heard: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
     bits = 0.0
     for frame in layout.frames:
         rows = matching_rows(frame, wire)
-        bits += _constant_bits(frame) * int(rows.sum())
+        required = sum((condition.mask & 0x1FFF_FFFF).bit_count() for condition in frame.when)
+        bits += required * int(rows.sum())
         keys = _patch_keys(frame, wire["identifier"])
         for key in np.unique(keys[rows]).tolist():
             heard.setdefault(key, {})[frame.name] = rows & (keys == key)
@@ -227,21 +233,11 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
     return _Match(name, adapter, rows, frozenset(whole), bits / len(wire))
 
 
-def _has_no_values(frame: Frame) -> bool:
-    """Return whether a frame has no values of sensors: alone, it does not make a patch."""
-    return not isinstance(frame.values, Expand) and not any(values.count for values in frame.runs)
-
-
 def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
     patch: object = frame.patch
     if isinstance(patch, Bits):
         return identifier.astype(np.int64) >> patch.shift & ((1 << patch.width) - 1)
     return np.full(len(identifier), patch if isinstance(patch, int) else 0, np.int64)
-
-
-def _constant_bits(frame: Frame) -> int:
-    """Return the number of bits that a kind of frame requires."""
-    return sum((condition.mask & 0x1FFF_FFFF).bit_count() for condition in frame.when)
 
 
 class _Replay(Link):
@@ -267,19 +263,9 @@ class _Replay(Link):
         await asyncio.sleep(0)
 
 
-async def _names(match: _Match, bus: Bus, heard: dict[Heard, int]) -> tuple[str, ...]:
-    """Return the driver's names of the patches that were heard."""
-    names = {patch.key: patch.name for patch in await _describe(match.adapter, bus, heard)}
-    return tuple(names.get(key, f"patch {key}") for key in sorted(match.keys))
-
-
 async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
     """Return the patches that a listening driver would describe."""
     try:
         return await asyncio.wait_for(adapter.describe(_Replay(bus, heard)), _NAMING_S)
     except (BusError, TimeoutError):
         return ()
-
-
-def likely(guesses: Iterable[Guess]) -> list[Guess]:
-    return [one for one in guesses if one.likely]

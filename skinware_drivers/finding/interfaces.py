@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from skinware_drivers.can.controller import Controller, read_controller
+from skinware_drivers.finding.ports import text_of
 
 _STATES = ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF", "STOPPED", "SLEEPING")
 _ARPHRD_CAN = 280
@@ -113,7 +114,9 @@ def can_interfaces(
     """
     known = ask_iproute2() if links is None else links
     folders = sorted((root / "class/net").glob("*"))
-    found = [_interface(folder, known.get(folder.name, {})) for folder in folders if _is_can(folder)]
+    found = [
+        _interface(folder, known.get(folder.name, {})) for folder in folders if _number(folder / "type") == _ARPHRD_CAN
+    ]
     return [one if known else _with_controller(one, controller(one.name)) for one in found]
 
 
@@ -127,10 +130,6 @@ def ask_iproute2() -> dict[str, dict[str, Any]]:
         done = subprocess.run(arguments, capture_output=True, timeout=_IP_TIMEOUT_S, check=True)
         return {link["ifname"]: link for link in json.loads(done.stdout) if "ifname" in link}
     return {}
-
-
-def _is_can(folder: Path) -> bool:
-    return _number(folder / "type") == _ARPHRD_CAN
 
 
 def _with_controller(one: CanInterface, controller: Controller | None) -> CanInterface:
@@ -157,7 +156,7 @@ def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
         kind=info.get("info_kind", "can" if has_hardware else "virtual"),
         driver=driver,
         up=bool((_number(folder / "flags", 16) or 0) & _IFF_UP),
-        carrier=_text(folder / "operstate"),
+        carrier=text_of(folder / "operstate"),
         is_fd=(_number(folder / "mtu") or 0) >= _FD_MTU,
         queue_length=_number(folder / "tx_queue_len") or 0,
         bit_rate=timing.get("bitrate") or None,
@@ -170,16 +169,9 @@ def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
     )
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:  # gone meanwhile, or unknown
-        return ""
-
-
 def _number(path: Path, base: int = 10) -> int | None:
     try:
-        return int(_text(path), base)
+        return int(text_of(path), base)
     except ValueError:
         return None
 

@@ -12,7 +12,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_names import BusName
-from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, guess, likely, with_default_options
+from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, guess, with_default_options
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.registry import make_bus
 from skinware_drivers.running.news import reason_text, share_of_time
@@ -128,7 +128,7 @@ async def ask(
     if heard.problem:
         return Answer(heard.bus, refused=heard.problem)
     idle = force or not heard.frames
-    known = {one.driver for one in likely(heard.guesses)}
+    known = {one.driver for one in heard.guesses if one.likely}
     meant = {name: driver for name, driver in drivers.items() if idle or name in known}
     asking = {name: driver for name, driver in meant.items() if can_ask(driver)}
     if not force and owner:

@@ -122,14 +122,16 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
     devices = {
         folder.name: (folder / "device").resolve()
         for folder in (machine.sys / "class/tty").glob("*")
-        if (folder / "device").exists() and _text(folder / "type") != _UNKNOWN_UART
+        if (folder / "device").exists() and text_of(folder / "type") != _UNKNOWN_UART
     }
     present = {name: machine.dev / name for name in devices if (machine.dev / name).exists()}
     links = _links(machine, set(present.values()))
     users, all_seen = _users(machine, set(present.values()))
     return [
         _port(path, devices[name], links.get(path, ()), users.get(path, ()), all_seen)
-        for name, path in sorted(present.items(), key=lambda item: _natural(item[0]))
+        for name, path in sorted(
+            present.items(), key=lambda item: re.sub(r"\d+", lambda number: number[0].zfill(6), item[0])
+        )
     ]
 
 
@@ -147,7 +149,7 @@ def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | N
 def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, ...], all_seen: bool) -> SerialPort:
     info = path.stat()
     group = group_that_may(info)
-    latency = _text(device / "latency_timer")
+    latency = text_of(device / "latency_timer")
     return SerialPort(
         path=str(path),
         driver=_driver(device),
@@ -174,11 +176,11 @@ def _usb_identity(device: Path) -> UsbIdentity | None:
     for folder in (device, *device.parents):
         if (folder / "idVendor").exists():
             return UsbIdentity(
-                vendor_id=_text(folder / "idVendor"),
-                product_id=_text(folder / "idProduct"),
-                serial_number=_text(folder / "serial"),
-                manufacturer=_text(folder / "manufacturer"),
-                product=_text(folder / "product"),
+                vendor_id=text_of(folder / "idVendor"),
+                product_id=text_of(folder / "idProduct"),
+                serial_number=text_of(folder / "serial"),
+                manufacturer=text_of(folder / "manufacturer"),
+                product=text_of(folder / "product"),
                 place=folder.name,
                 interface=_interface_number(device, folder),
             )
@@ -190,7 +192,7 @@ def _interface_number(device: Path, usb_device: Path) -> str:
         if folder == usb_device:
             return ""
         if (folder / "bInterfaceNumber").exists():
-            return _text(folder / "bInterfaceNumber")
+            return text_of(folder / "bInterfaceNumber")
     return ""
 
 
@@ -225,7 +227,7 @@ def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, .
             continue
         for path in paths:
             if str(path) in targets and int(process.name) != os.getpid() and not _is_other_end(process, path):
-                found.setdefault(path, []).append(User(int(process.name), _text(process / "comm")))
+                found.setdefault(path, []).append(User(int(process.name), text_of(process / "comm")))
     return {path: tuple(users) for path, users in found.items()}, all_seen
 
 
@@ -233,15 +235,11 @@ def _is_other_end(process: Path, path: Path) -> bool:
     """Return whether a process made a pseudo terminal, which it keeps open for other programs."""
     if path.parent.name != "pts":
         return False
-    return any(f"tty-index:\t{path.name}" in _text(info).splitlines() for info in (process / "fdinfo").glob("*"))
+    return any(f"tty-index:\t{path.name}" in text_of(info).splitlines() for info in (process / "fdinfo").glob("*"))
 
 
-def _natural(name: str) -> tuple[str, int]:
-    letters = name.rstrip("0123456789")
-    return letters, int(name[len(letters) :] or 0)
-
-
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """Return the text of a file without spaces at its ends; empty if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:

@@ -66,7 +66,7 @@ def same_bus(one: str, other: str) -> bool:
     """Whether two names, of one program or of two, mean one bus now, by their :class:`BusPlace`.
 
     Serial lines that are named by their USB device are where that is plugged in now; while it is not plugged in, the
-    names alone are compared. A ``virtual`` bus is nobody else's: each process has its own.
+    names alone are compared. A ``virtual`` bus is never the same: each process has its own.
     """
     place = _place_now(one)
     return place == _place_now(other) and place.interface != _PRIVATE

@@ -14,14 +14,13 @@ from msgspec import Meta
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
-from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus import Bus, FrameBatch, KernelBus
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Gateway
 from skinware_drivers.modbus.guests import Guests
 from skinware_drivers.modbus.master import Listener, Master, Talk, Timing
 from skinware_drivers.modbus.native_master import NativeMaster
 from skinware_drivers.modbus.registers import Order, Wanted
-from skinware_drivers.native.kernel_bus import KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
@@ -294,7 +293,7 @@ class ModbusBus(KernelBus):
         return not self.listen_only and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
-        """Let C ask; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Let C ask; see :class:`skinware_drivers.bus.KernelBus`."""
         talk, port = self._talk, self._port
         if not isinstance(talk, NativeMaster) or not isinstance(port, DescriptorPort):
             return False

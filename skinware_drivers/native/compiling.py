@@ -88,7 +88,9 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
             kind = kinds[member]
             kind.assembly, kind.place, kind.column = number, place, columns.start
             kind.cycle = number - len(assemblies) if number >= len(assemblies) else -1
-            _place_runs(kind, columns.start)
+            # columns of runs count from the beginning of the update, not of their frame
+            for run in (structs.Run * kind.n_runs).from_address(kind.runs):
+                run.column += columns.start
     plan.n_kinds, plan.kinds = arrays.structs(structs.Kind, kinds)
     plan.n_cycles, plan.cycles = arrays.structs(
         structs.Cycle,
@@ -165,7 +167,10 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         (structs.ByteCondition(c.offset, c.mask, c.value) for c in frame.when if isinstance(c, Byte)),
     )
     kind.n_runs, kind.runs = arrays.structs(structs.Run, _runs(frame))
-    values = decoder.tables.structure.dtype if isinstance(frame.values, Expand) else _common(frame)
+    values = decoder.tables.structure.dtype
+    if not isinstance(frame.values, Expand):
+        dtypes = (np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs)
+        values = np.result_type(*dtypes)
     kind.n_flags, kind.flags = arrays.structs(structs.Flag, (_flag(flag, values, arrays) for flag in frame.flags))
     bits, table = frame.module_byte, compiled.module_by_byte
     if bits is not None and bits.byte is not None and table is not None:
@@ -173,10 +178,6 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         kind.key_mask, kind.n_keys, kind.module_by_key = (1 << bits.width) - 1, table.shape[1], arrays.at(table)
     kind.sequence = _number(frame.sequence)
     return kind
-
-
-def _common(frame: Frame) -> np.dtype[Any]:
-    return np.result_type(*(np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs))
 
 
 def _runs(frame: Frame) -> list[structs.Run]:
@@ -190,13 +191,6 @@ def _runs(frame: Frame) -> list[structs.Run]:
             runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
         column += run.count
     return runs
-
-
-def _place_runs(kind: structs.Kind, column: int) -> None:
-    # columns of runs count from the beginning of the update, not of their frame
-    runs = (structs.Run * kind.n_runs).from_address(kind.runs)
-    for run in runs:
-        run.column += column
 
 
 def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:

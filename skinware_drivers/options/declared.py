@@ -1,4 +1,4 @@
-"""Find the class of options that a driver or emulator declares, and describe its options for commands.
+"""Options of drivers and emulators: declared as structs, made from texts, described for commands.
 
 An options class is a ``msgspec.Struct`` whose fields carry a description::
 
@@ -8,14 +8,161 @@ An options class is a ``msgspec.Struct`` whose fields carry a description::
 
 from __future__ import annotations
 
-from collections.abc import Set
-from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+import difflib
+import re
+import types
+from collections.abc import Collection, Iterable, Mapping, Set
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options.texts import OptionsT, option_text, plain_type
+
+SOURCE_SUFFIX = ".py"
+
+
+def nearest_name(wrong: str, right: Iterable[str]) -> str:
+    """Return the end of an error message about an unknown name: the nearest known one, and all known ones."""
+    names = sorted(right)
+    nearest = difflib.get_close_matches(wrong, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
+    return f"{hint} Known: {', '.join(names) or 'none'}"
+
+
+def is_file(name: str) -> bool:
+    """Return whether a name is that of a file, not of something that is registered."""
+    return name.endswith(SOURCE_SUFFIX)
+
+
+OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+
+_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+_LONGEST_RANGE = 1 << 16
+_ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "str": "a text"}
+
+
+def options_from_strings(
+    options_class: type[OptionsT], strings: Mapping[str, str], beside: Collection[str] = ()
+) -> OptionsT:
+    """Return options made from texts.
+
+    Args:
+        options_class: the struct to make.
+        strings: texts by name of option. A yes/no option with an empty text is on.
+        beside: further names of options, for the message.
+
+    Raises:
+        ConfigurationError: an option is unknown (the message suggests the nearest name), missing, or has a wrong text.
+    """
+    fields = {field.encode_name: field for field in msgspec.structs.fields(options_class)}
+    hints = get_type_hints(options_class, include_extras=True)
+    values: dict[str, Any] = {}
+    for name, text in strings.items():
+        if name not in fields:
+            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, [*fields, *beside])}")
+        hint = hints[fields[name].name]
+        try:
+            values[fields[name].name] = msgspec.convert(_split(text, plain_type(hint)), hint, strict=False)
+        except (msgspec.ValidationError, ValueError) as error:
+            raise ConfigurationError(f"option {name}={text}: {_reason(error, hint)}") from None
+    for name, field in fields.items():
+        if field.required and field.name not in values:
+            raise ConfigurationError(f"option {name!r} must be given")
+    return options_class(**values)
+
+
+def check_options(options: msgspec.Struct) -> None:
+    """Check every field against its type and limits; call it in ``__post_init__``: msgspec checks no constructor.
+
+    Raises:
+        ConfigurationError: a field has a value that its annotation does not allow.
+    """
+    hints = get_type_hints(type(options), include_extras=True)
+    for field in msgspec.structs.fields(type(options)):
+        value = getattr(options, field.name)
+        try:
+            msgspec.convert(value, hints[field.name])
+        except msgspec.ValidationError as error:
+            message = f"option {field.encode_name}={option_text(value)}: {_reason(error, hints[field.name])}"
+            raise ConfigurationError(message) from None
+
+
+def option_text(value: Any) -> str:
+    """Return a value as a person would write it in the name of a bus: ``7,8``, ``yes``, ``0.01``."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return ""
+    if isinstance(value, list | tuple):
+        return ",".join(option_text(item) for item in value)
+    return str(value)
+
+
+def plain_type(hint: Any) -> Any:
+    if get_origin(hint) is Annotated:
+        return plain_type(get_args(hint)[0])
+    if get_origin(hint) in (Union, types.UnionType):
+        others = [other for other in get_args(hint) if other is not type(None)]
+        return plain_type(others[0]) if len(others) == 1 else hint
+    return hint
+
+
+def _split(text: str, plain: Any) -> Any:
+    """Return a text in a form that msgspec can convert: lists are split, ranges of numbers expanded, yes is True."""
+    if plain is bool:
+        word = text.strip().lower()
+        return {"": True, "yes": True, "on": True, "no": False, "off": False}.get(word, word)
+    if plain is int:
+        return _number(text.strip())
+    if get_origin(plain) not in (list, tuple):
+        return text.strip()
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    if plain_type(get_args(plain)[0]) is not int:
+        return items
+    numbers: list[str | int] = []
+    for item in items:
+        match = _RANGE.fullmatch(item)
+        if match is None:
+            numbers.append(_number(item))
+            continue
+        first, last = int(match[1]), int(match[2])
+        if not 0 <= last - first < _LONGEST_RANGE:
+            raise ValueError(f"the range {item} does not go upwards, or is too long")
+        numbers.extend(range(first, last + 1))
+    return numbers
+
+
+def _number(text: str) -> str | int:
+    """Return a whole number, which may be written as 0x710."""
+    return int(text, 16) if _HEXADECIMAL.fullmatch(text) else text
+
+
+def _reason(error: Exception, hint: Any) -> str:
+    """Return an error of msgspec in words for people, without the path to a value that the message names."""
+    text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
+    text = re.sub(r" \| null(?=`)", "", text)
+    plain = plain_type(hint)
+    one = plain_type(get_args(plain)[0]) if get_origin(plain) in (list, tuple) else plain
+    if get_origin(one) is Literal:
+        words = ", ".join(map(str, get_args(one)))
+        return re.sub(r"Invalid enum value [^ ]+|Expected `.*?`(?:, got `\w+`)?", f"give one of {words}", text)
+    asked = re.compile(r"Expected `(\w+)(.*?)`(?:, got `\w+`)?")
+    return asked.sub(lambda match: f"give {_ASKED.get(match[1], match[1])}{match[2]}", text).replace("`", "")
+
 
 _KINDS = {bool: "yes/no", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
@@ -123,17 +270,18 @@ def check_names(options_class: type[msgspec.Struct], reserved: Set[str], command
 def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
     """Return the options of a class that can be written as text, in the order of their declaration."""
     hints = get_type_hints(options_class, include_extras=True)
-    return [
-        Option(
-            field.encode_name,
-            _kind(plain_type(hints[field.name])),
-            field.required,
-            "" if field.required else option_text(_default(field)),
-            _description(hints[field.name]),
-        )
-        for field in msgspec.structs.fields(options_class)
-        if not _is_table(plain_type(hints[field.name]))
-    ]
+    found = []
+    for field in msgspec.structs.fields(options_class):
+        hint = hints[field.name]
+        plain = plain_type(hint)
+        if _is_table(plain):
+            continue
+        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        metas = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        description = next((m.description for m in metas if isinstance(m, msgspec.Meta) and m.description), "")
+        text = "" if field.required else option_text(default)
+        found.append(Option(field.encode_name, _kind(plain), field.required, text, description))
+    return found
 
 
 def _is_table(plain: Any) -> bool:
@@ -149,17 +297,3 @@ def _kind(plain: Any) -> str:
     if get_origin(plain) is Literal:
         return "|".join(str(word) for word in get_args(plain))
     return _KINDS.get(plain, "TEXT")
-
-
-def _description(hint: Any) -> str:
-    if get_origin(hint) is Annotated:
-        for meta in get_args(hint)[1:]:
-            if isinstance(meta, msgspec.Meta) and meta.description:
-                return meta.description
-    return ""
-
-
-def _default(field: msgspec.structs.FieldInfo) -> Any:
-    if field.default_factory is not msgspec.NODEFAULT:
-        return field.default_factory()
-    return field.default

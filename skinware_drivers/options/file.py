@@ -28,7 +28,7 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
 from skinware.toml_text import Keys, TomlText, wrong_value
-from skinware_drivers.options.texts import is_file, nearest_name, options_from_strings
+from skinware_drivers.options.declared import is_file, nearest_name, options_from_strings
 
 T = TypeVar("T", bound=msgspec.Struct)
 

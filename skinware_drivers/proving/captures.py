@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +211,20 @@ class _Replay:
         return np.where(time_ns == 0, 0, time_ns - later_ns)
 
 
+def snapshots_after(reader: DriverReader, last: tuple[int, int] | None) -> Iterator[DriverSnapshot]:
+    """Yield the snapshots after a position in order, also after a change of the structure."""
+    while reader.refresh() not in (None, last):
+        try:
+            snapshot = next(reader.in_order(timeout_s=0))
+        except ServiceTimeout:
+            return
+        except StructureChanged:
+            reader.reattach()
+            continue
+        last = snapshot.position
+        yield snapshot
+
+
 class _Published:
     """Every snapshot that a driver publishes."""
 
@@ -224,14 +238,7 @@ class _Published:
             if runner.builder.writer is None or runner.builder.writer.closed:
                 return
             self._reader = DriverReader(runner.identity.name, namespace=namespace, announce=False)
-        while self._reader.refresh() not in (None, self._last):
-            try:
-                frame = next(self._reader.in_order(timeout_s=0))
-            except ServiceTimeout:
-                return
-            except StructureChanged:
-                self._reader.reattach()
-                continue
+        for frame in snapshots_after(self._reader, self._last):
             self._last = frame.position
             if not self._frames or self._frames[-1][0] is not frame.structure:
                 self._frames.append((frame.structure, []))

@@ -113,7 +113,11 @@ class _Walk:
         chosen = manner.type_name or next((name for name in _FIRST_CHOICE if name in names), names[0])
         self._type = structure.type(chosen)
         module = structure.module_of(chosen)
-        self._modules = [int(number) for number in np.unique(module) if self._is_wanted(int(number))]
+        self._modules = [
+            int(number)
+            for number in np.unique(module)
+            if any(word.lower() in self._names[int(number)].lower() for word in manner.only or [""])
+        ]
         if not self._modules:
             raise StructureError(f"no module of {reader.name} has such a name; its modules: {', '.join(self._names)}")
         self._taxels = {int(number): np.flatnonzero(module == number) for number in np.unique(module)}
@@ -128,10 +132,6 @@ class _Walk:
     @property
     def _names(self) -> Sequence[str]:
         return self._structure.module_names
-
-    def _is_wanted(self, module: int) -> bool:
-        name = self._names[module].lower()
-        return not self._manner.only or any(word.lower() in name for word in self._manner.only)
 
     def go(self) -> None:
         self._proof.about["sensors"] = f"{self._structure.n_sensors}, judged by {self._type.name} ({self._type.unit})"
@@ -164,7 +164,7 @@ class _Walk:
         if not self._manner.with_tare:
             self._proof.add("tare", "", Verdict.UNKNOWN, "not wanted (--tare)")
             return
-        self._ask("rest", "", "leave the device alone")
+        self._person.ask(Step("rest", "", "leave the device alone"))
         try:
             self._reader.call(_TARE)
             values = [values for _, values in self._frames(after(self._manner.rest_s))]
@@ -180,7 +180,7 @@ class _Walk:
     # -- at rest --------------------------------------------------------------------------------------------------
 
     def _check_rest(self) -> None:
-        self._ask("rest", "", "leave the device alone")
+        self._person.ask(Step("rest", "", "leave the device alone"))
         frames, stamps = [], []
         for frame, values in self._frames(after(self._manner.rest_s), may_skip=False):
             frames.append(values)
@@ -194,17 +194,13 @@ class _Walk:
         noise = max(float(np.median(unrest[self._usable])) if self._usable.any() else 0.0, count)
         self._threshold = _TIMES_THE_NOISE * noise if noise else 1e-6
         unit = self._type.unit
-        self._proof.add("every taxel has data", "", bool(self._usable.all()), self._without_data())
+        missing = np.flatnonzero(~self._usable)
+        without_data = f"none from {self._named(missing)}" if len(missing) else plural(len(self._usable), "taxel")
+        self._proof.add("every taxel has data", "", not len(missing), without_data)
         self._proof.about["noise"] = (
             f"{figure_text(noise, 3)} {unit}; pressed is more than {figure_text(self._threshold, 3)}"
         )
         self._check_rate(np.array(stamps))
-
-    def _without_data(self) -> str:
-        missing = np.flatnonzero(~self._usable)
-        if not len(missing):
-            return plural(len(self._usable), "taxel")
-        return f"none from {self._named(missing)}"
 
     def _check_rate(self, stamps: npt.NDArray[np.int64]) -> None:
         """Check the rate of updates; snapshots that were missed count like those that were read."""
@@ -234,13 +230,14 @@ class _Walk:
 
     def _press(self, module: int) -> None:
         name, taxels = self._names[module], self._taxels[module]
-        self._ask("press", name, f"press {name}, and hold")
+        self._person.ask(Step("press", name, f"press {name}, and hold"))
         held: deque[int] = deque(maxlen=_HELD_FRAMES)
         most, signed, values, frame = 0, 0.0, self._rest, None
         for frame, values in self._patiently("right module", "nothing was felt"):  # noqa: B007 - the last one counts
             change = values - self._rest
             most = int(np.nanargmax(np.abs(change)))
-            held.append(self._module_of(most) if abs(change[most]) > self._threshold else -1)
+            module_of_most = int(self._structure.module_of(self._type.name)[most])
+            held.append(module_of_most if abs(change[most]) > self._threshold else -1)
             if len(held) == _HELD_FRAMES and len(set(held)) == 1 and held[0] >= 0:
                 signed = float(change[most])
                 break
@@ -249,7 +246,7 @@ class _Walk:
         self._proof.add("right module", name, answered == module, where)
         self._proof.add("sign", name, signed > 0, "grows" if signed > 0 else "goes down when it is pressed")
         self._check_range(name, values[taxels], frame)
-        self._ask("let go", name, f"let go of {name}")
+        self._person.ask(Step("let go", name, f"let go of {name}"))
         for _, values in self._patiently("comes to rest", "some taxels did not"):
             if np.nanmax(np.abs(values - self._rest)) <= self._threshold:
                 break
@@ -294,7 +291,7 @@ class _Walk:
 
     def _stroked(self, module: int, wanted: Wanted, text: str) -> Values:
         """Return (frames, n): distances of a module's taxels from their rest, from the first touch until the lift."""
-        self._ask(wanted, self._names[module], text)
+        self._person.ask(Step(wanted, self._names[module], text))
         taxels = self._taxels[module]
         found: list[Values] = []
         lifted_ns: int | None = None
@@ -340,12 +337,6 @@ class _Walk:
             self._first = self._first or frame
             self._last = frame
             yield frame, values
-
-    def _ask(self, wanted: Wanted, module: str, text: str) -> None:
-        self._person.ask(Step(wanted, module, text))
-
-    def _module_of(self, taxel: int) -> int:
-        return int(self._structure.module_of(self._type.name)[taxel])
 
     def _named(self, taxels: npt.NDArray[Any]) -> str:
         names = self._structure.sensor_names(self._type.name)

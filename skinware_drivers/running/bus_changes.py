@@ -70,7 +70,11 @@ class BusChanges:
                 BusLine(name, place, wanted[name], make_bus(name, wanted[name]), self._epoll)
                 for name, place in zip([*replaced, *coming], [*places, *self._places(coming)], strict=True)
             ]
-            self._check_types(new)
+            adapters = {line.ordinal: line.adapter for line in (*self._present, *new)}
+            try:
+                join_types([adapter.types for adapter in adapters.values()])
+            except StructureError as error:
+                raise ConfigurationError(str(error)) from None
             if not new:
                 self._check_rest(leaving)
             for line in replaced.values():
@@ -95,13 +99,6 @@ class BusChanges:
         if leaving and not any(line.patches for line in self._present if line not in leaving):
             names = ", ".join(line.name for line in leaving)
             raise ConfigurationError(f"bus {names}: the last one with sensors; stop the driver instead")
-
-    def _check_types(self, new: Sequence[BusLine]) -> None:
-        lines = {line.ordinal: line for line in (*self._present, *new)}
-        try:
-            join_types([line.adapter.types for line in lines.values()])
-        except StructureError as error:
-            raise ConfigurationError(str(error)) from None
 
     async def _put_in(self, line: BusLine) -> None:
         async with self._builder.built:

@@ -24,6 +24,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _STOP_TIMEOUT_S = 0.8
+_CHECK_PAUSE_NS = NS_PER_S // 2
 _NEVER_NS = 1 << 63
 
 
@@ -39,6 +40,7 @@ class BusCondition:
         reason: of the state, or of trouble although frames come.
         since_ns: when both became so, CLOCK_MONOTONIC ns.
         heard_ns: when the bus last delivered frames.
+        checked_ns: when the bus was last asked whether it is still there.
         speaks_from_ns: from when on its devices send of themselves; before, they only answer.
         limits: how close the bus is to its limits.
         news: logs changes.
@@ -51,6 +53,7 @@ class BusCondition:
         self.since_ns: int = now_ns()
         self.heard_ns: int = 0
         self.speaks_from_ns: int = 0 if bus.listen_only else _NEVER_NS
+        self.checked_ns: int = 0
         self._has_spoken = False
         self.limits: BusLimits = BusLimits(name, bus)
         self.news: BusNews = BusNews()
@@ -218,8 +221,10 @@ class BusLine:
 
     def _check(self) -> None:
         """Ask a bus that is not in order whether it is still there, now and then."""
-        if self.connection.lost.is_set() or not self.connection.is_check_due():
+        time_ns = now_ns()
+        if self.connection.lost.is_set() or time_ns - self.condition.checked_ns < _CHECK_PAUSE_NS:
             return
+        self.condition.checked_ns = time_ns
         try:
             self.bus.check()
         except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)

@@ -15,7 +15,6 @@ from skinware_drivers.running.guard import Backoff, SlowCall
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-_CHECK_PAUSE_NS = NS_PER_S // 2
 _OPENING_S = 10.0
 """Time in which an interface must open; after it, the log says that the interface hangs."""
 
@@ -39,7 +38,6 @@ class Connection:
         self.lost: asyncio.Event = asyncio.Event()
         self.opened_ns: int = 0
         self._noted = ""
-        self._checked_ns = 0
         self._opening: SlowCall | None = None
 
     @property
@@ -82,13 +80,6 @@ class Connection:
         if self._bus.note and self._bus.note != self._noted:
             log.warning("%s", self._bus.note)
             self._noted = self._bus.note
-
-    def is_check_due(self) -> bool:
-        """Return whether it is time to ask the bus again whether it is still there, and count it as asked."""
-        is_due = now_ns() - self._checked_ns >= _CHECK_PAUSE_NS
-        if is_due:
-            self._checked_ns = now_ns()
-        return is_due
 
     def drop(self) -> None:
         """Close the bus, without waiting for anything."""

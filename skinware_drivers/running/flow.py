@@ -15,8 +15,8 @@ from collections.abc import Callable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusState
+from skinware_drivers.bus import KernelBus, is_read_natively
 from skinware_drivers.native import structs
-from skinware_drivers.native.kernel_bus import KernelBus, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 

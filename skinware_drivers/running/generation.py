@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import DataPath, PatchState
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import FrameBatch, is_read_natively
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import hook

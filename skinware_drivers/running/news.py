@@ -315,7 +315,7 @@ class MachineLimits:
         self._source = source
         self._clock = clock
         self._looked_ns = clock()
-        self._before = self._read()
+        self._before = softnet_dropped(source) or 0
         self.softnet_dropped: int = 0
 
     def look(self) -> None:
@@ -325,7 +325,7 @@ class MachineLimits:
             return
         self._looked_ns = time_ns
         was_none = not self.softnet_dropped
-        self.softnet_dropped = max(self.softnet_dropped, self._read() - self._before)
+        self.softnet_dropped = max(self.softnet_dropped, (softnet_dropped(self._source) or 0) - self._before)
         if was_none and self.softnet_dropped:
             log.warning(
                 "this machine dropped %d network packets before any socket saw them, CAN frames perhaps among them;"
@@ -333,9 +333,6 @@ class MachineLimits:
                 self.softnet_dropped,
                 TROUBLESHOOTING,
             )
-
-    def _read(self) -> int:
-        return softnet_dropped(self._source) or 0
 
 
 def softnet_dropped(source: Path = SOFTNET) -> int | None:

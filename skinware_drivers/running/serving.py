@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import NS_PER_S, now_ns
@@ -95,7 +94,7 @@ class Serving:
     async def _serve_once(self, line: BusLine) -> None:
         """Serve one bus from its discovery on."""
         await line.describe(self._builder.build)
-        with _first_failure():
+        try:
             async with asyncio.TaskGroup() as beside:
                 care = PatchCare(
                     line, lambda: self._builder.generation, self._listen_only, self.join, beside.create_task
@@ -111,6 +110,9 @@ class Serving:
                 await care.check_data()
                 self._be_ready()
                 await self._look_after(line, care)
+        except BaseExceptionGroup as failures:
+            first = failures.exceptions[0]
+            raise first from first.__cause__
 
     async def _look_after(self, line: BusLine, care: PatchCare) -> None:
         begun_ns = now_ns()
@@ -162,12 +164,3 @@ class Serving:
     def _silence_s(self) -> float:
         generation = self._builder.generation
         return _SILENCE_S if generation is None else generation.publisher.pace.silence_ns / NS_PER_S
-
-
-@contextmanager
-def _first_failure() -> Iterator[None]:
-    try:
-        yield
-    except BaseExceptionGroup as failures:
-        first = failures.exceptions[0]
-        raise first from first.__cause__

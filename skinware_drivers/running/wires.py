@@ -85,19 +85,16 @@ class Wires:
                 await asyncio.sleep(_TURN_S)
             while True:
                 if is_wished(self._namespace, wire.WISH):
-                    await self._publish_for_a_while()
+                    self._open_taps()
+                    for _ in range(round(_LOOK_S / _TURN_S)):
+                        self._publish()
+                        await asyncio.sleep(_TURN_S)
                 else:
                     self._withdraw()
                     await asyncio.sleep(_LOOK_S)
         except (SkinwareError, OSError) as error:  # the driver goes on
             self._log_trouble(error)
             self._withdraw()
-
-    async def _publish_for_a_while(self) -> None:
-        self._open_taps()
-        for _ in range(round(_LOOK_S / _TURN_S)):
-            self._publish()
-            await asyncio.sleep(_TURN_S)
 
     def _publish(self) -> None:
         is_new = self._writer is None

@@ -25,18 +25,10 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.fields import Bits, Identifier
+from skinware_drivers import Link, Match, Module, Patch, Poll, check_options, taxels
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Expand, Frame, Layout, Packed, Sentinel, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Poll
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import LRC
-from skinware_drivers.serial.delimited import HDLC, Delimited
-from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.stream import Split
+from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout, Packed, Sentinel, Values
+from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -85,7 +77,7 @@ def _by_finger(header: int, body: bytes) -> Iterable[tuple[int, bytes]]:
 class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
     """One hand on a serial line; uid = 6 * finger + site, in the order of the wire. Each finger is a module."""
 
-    framing: Framing = Split(Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0)), _by_finger)
+    framing = Split(Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0)), _by_finger)
     baudrate = 460_800
 
     def __init__(self, options: AbilityHandOptions) -> None:
@@ -93,24 +85,22 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
         zero, most = Sentinel(Status.SUSPECT, 0), Sentinel(Status.OUT_OF_RANGE, _MOST)
         kind: SensorType = PRESSURE.measured(unit="counts", minimum=0, maximum=_MOST)
         values: Values | Expand = Values(0, Packed(12, order="little"), _N)
-        self.dtype: npt.DTypeLike = np.uint16
+        self.dtype = np.uint16
         if options.force != "no":
             newton = partial(_newton, sign=1 if options.force == "published" else -1)
             values, self.dtype = Expand(partial(_expand, newton=newton)), np.float32
             most = Sentinel(Status.OUT_OF_RANGE, float(newton(np.array([_MOST]))[0]))
             kind = FORCE_Z.measured(minimum=0)
         flags = [zero, most] if options.zero == "suspect" else [most]
-        self.types: Sequence[SensorType] = (kind,)
+        self.types = (kind,)
         finger = Identifier(_FINGER, 0x7F8)
-        self.layout: Layout = Layout(
-            [Frame("finger", [finger], [_FINGER_BYTES], values, module=Bits(0, 3), flags=flags)]
-        )
+        self.layout = Layout([Frame("finger", [finger], [_FINGER_BYTES], values, module=Bits(0, 3), flags=flags)])
         modules = [
             Module(taxels(_N, kind.name, first_uid=_N * key), key, "6 points", name)
             for key, name in enumerate(_FINGERS)
         ]
-        self.patches: Sequence[Patch] = (Patch(f"{options.side} hand", modules),)
-        self.geometry: Geometry | None = _places(Hand(options.side), kind.name)
+        self.patches = (Patch(f"{options.side} hand", modules),)
+        self.geometry = _places(Hand(options.side), kind.name)
 
     @property
     def polls(self) -> Sequence[Poll]:

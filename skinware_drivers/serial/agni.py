@@ -25,21 +25,13 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Link, Match, Module, Notice, Patch, Sensor, check_options, operation
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import XOR
-from skinware_drivers.serial.framing import Encoding, Field, Framing, Unframed
-from skinware_drivers.serial.packets import LengthTable, Packet
+from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -82,30 +74,27 @@ def command(number: int, arguments: bytes = b"") -> bytes:
     return sent + XOR.to_bytes(sent)
 
 
-def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEGIN), header: int = 3) -> Packet:
+def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEGIN)) -> Packet:
     table = LengthTable(at, totals)
-    return Packet(sync=sync, length=table, checksum=XOR, identifier=Field(2), header=header)
+    return Packet(sync=sync, length=table, checksum=XOR, identifier=Field(2), header=3)
 
 
 class AgniDriver(SerialAdapter[AgniOptions]):
     """One device on a serial line."""
 
-    framing: Framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
-    commands: Encoding | None = Unframed(1024)
+    framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
+    commands = Unframed(1024)
+    payload_size = _MOST_BYTES + 8
 
     def __init__(self, options: AgniOptions) -> None:
         super().__init__(options)
         self._period_ms = options.period_ms
-        self.period_s: float = (options.period_ms or options.usual_period_ms) / 1e3
+        self.period_s = (options.period_ms or options.usual_period_ms) / 1e3
         self._configuration = b""
         self._patch: Patch | None = None
         self._n_sensors = 0
-        self.types: Sequence[SensorType] = [PRESSURE.measured(unit="counts")]
-        self.dtype: npt.DTypeLike = np.dtype(options.values).newbyteorder("=")
-
-    @property
-    def payload_size(self) -> int:
-        return _MOST_BYTES + 8
+        self.types = [PRESSURE.measured(unit="counts")]
+        self.dtype = np.dtype(options.values).newbyteorder("=")
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the device for its sensors; it may still be sending for an earlier program.
@@ -142,7 +131,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             )
             first_uid += count
         log.info("%s: device %d with %d sensors", link.bus_name, device, n_sensors)
-        self.layout: Layout = Layout(frames)
+        self.layout = Layout(frames)
         totals = {number: 3 + _TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
         self.change_framing(_framing({**totals, 0: 7 + 4 * n_sensors, _ALIVE: 4, _ERROR: 5}, 2))
         self._configuration, self._n_sensors = configuration, n_sensors

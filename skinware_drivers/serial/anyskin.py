@@ -11,28 +11,23 @@ values: after any error a message counts only if it ends with 0D 0A and the 82 b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
-from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE, SensorType
+from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Layout, Sentinel, Values
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.packets import Packet
+from skinware_drivers import Frame, Layout, Module, Patch, Sentinel, Values, check_options, taxels
+from skinware_drivers.serial import Packet, SerialAdapter
 
 
 class AnySkinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    mags: Annotated[int, msgspec.Meta(description="magnetometers of the board", ge=1, le=64)] = 5
-    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two messages, ms", ge=1)] = 10
+    mags: Annotated[int, Meta(description="magnetometers of the board", ge=1, le=64)] = 5
+    period_ms: Annotated[int, Meta(description="nominal time between two messages, ms", ge=1)] = 10
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -45,18 +40,18 @@ class AnySkinDriver(SerialAdapter[AnySkinOptions]):
     no number are ``SUSPECT``.
     """
 
-    types: Sequence[SensorType] = (
+    types = (
         TEMPERATURE,
         *(t.measured(scale=1e-6) for t in (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)),
     )
-    dtype: npt.DTypeLike = np.float32
+    dtype = np.float32
 
     def __init__(self, options: AnySkinOptions) -> None:
         super().__init__(options)
         size = 16 * options.mags
-        self.framing: Framing = Packet(length=size + 2, trailer=b"\r\n", confirmed=True)
+        self.framing = Packet(length=size + 2, trailer=b"\r\n", confirmed=True)
         no_number = tuple(Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf))
         values = Values(offset=0, dtype="<f4", count=4 * options.mags)
-        self.layout: Layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
+        self.layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
         channels = taxels(options.mags, *(t.name for t in self.types))
-        self.patches: Sequence[Patch] = (Patch("anyskin", (Module(channels, kind="board"),)),)
+        self.patches = (Patch("anyskin", (Module(channels, kind="board"),)),)

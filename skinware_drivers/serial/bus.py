@@ -12,8 +12,7 @@ from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import FrameBatch
-from skinware_drivers.native.kernel_bus import KernelBus
+from skinware_drivers.bus import FrameBatch, KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.framing import Encoding, Framing, Unframed
@@ -145,7 +144,7 @@ class SerialBus(KernelBus):
         return isinstance(self._stream, NativeStream) and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         stream, port = self._stream, self._port
         if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
             return False

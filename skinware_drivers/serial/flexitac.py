@@ -22,23 +22,16 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.fields import Byte, Identifier
+from skinware_drivers import Link, Match, Module, Notice, Patch, check_options, taxels
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Frame, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.framings import Recurring, TextMatrix
-from skinware_drivers.serial.packets import Packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -92,13 +85,12 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
     framing: Framing = Recurring(_MARKER, _MOST_CELLS, _FEWEST_CELLS)
     baudrate = 2_000_000
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=255),)
-    dtype: npt.DTypeLike = np.uint8
-    layout: Layout
+    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=255),)
+    dtype = np.uint8
 
     def __init__(self, options: FlexiTacOptions) -> None:
         super().__init__(options)
-        self.period_s: float = (options.period_ms or _PERIOD_MS[options.firmware]) / 1e3
+        self.period_s = (options.period_ms or _PERIOD_MS[options.firmware]) / 1e3
         self._heard: HeardSize | None = None
         count = math.prod(options.shape) if options.shape else _MOST_CELLS
         self._hearing: Framing = Recurring(_MARKER, max(count, _MOST_CELLS), min(count, _FEWEST_CELLS))

@@ -11,21 +11,12 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import msgspec
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.sensor_types import SensorType
-from skinware_drivers.description import Patch
-from skinware_drivers.layout import Layout
-from skinware_drivers.link import Link, Match
-from skinware_drivers.operations import operation
-from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import Answers, Refused, SerialAdapter
-from skinware_drivers.serial.checksums import CRC32
-from skinware_drivers.serial.delimited import COBS, Delimited
-from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers import Link, Match, Notice, Patch, operation
+from skinware_drivers.serial import COBS, CRC32, Answers, Delimited, Field, Refused, SerialAdapter
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     MAJOR,
@@ -78,10 +69,8 @@ class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     """One open patch on a serial line."""
 
-    framing: Framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
-    types: Sequence[SensorType]
-    dtype: npt.DTypeLike
-    layout: Layout
+    framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    payload_size = MOST_PAYLOAD  # of the protocol: that of the patch is known only after it was asked
 
     def __init__(self, options: OpenPatchOptions) -> None:
         super().__init__(options)
@@ -94,11 +83,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._n_samples: int | None = None  # taken since its reset, as it answered when it was last silent
         self._report: Report | None = None
         self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
-
-    @property
-    def payload_size(self) -> int:
-        """Bytes of the longest payload of the protocol; those of the patch are known only after it was asked."""
-        return MOST_PAYLOAD
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the patch for its description.
@@ -122,7 +106,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
-        self.period_s: float = (self._wanted_us or found.period_us) / 1e6
+        self.period_s = (self._wanted_us or found.period_us) / 1e6
         self._disabled.clear()
         return [self._patch]
 

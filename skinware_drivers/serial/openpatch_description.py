@@ -17,7 +17,7 @@ import numpy as np
 from skinware.errors import BusError, StructureError
 from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers import Module, Patch, Sensor
 from skinware_drivers.layout import (
     AnyFlag,
     Bits,

@@ -17,23 +17,22 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware.sensor_types import SensorType
-from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options, operation
 from skinware_drivers.hand import Hand
-from skinware_drivers.layout import Layout
-from skinware_drivers.link import Link, Match
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice, Poll, Watch, ZeroWatch
-from skinware_drivers.serial import paxini_converter, paxini_high_speed
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import LRC
-from skinware_drivers.serial.framing import Encoding, Framing, Unframed
-from skinware_drivers.serial.packets import LengthTable, Packet
+from skinware_drivers.polling import ZeroWatch
+from skinware_drivers.serial import (
+    LRC,
+    LengthTable,
+    Packet,
+    SerialAdapter,
+    Unframed,
+    paxini_converter,
+    paxini_high_speed,
+)
+from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
 from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, Board
@@ -85,12 +84,13 @@ class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PaxiniDriver(SerialAdapter[PaxiniOptions]):
     """One board on a serial line, with all modules that are attached to it."""
 
-    framing: Framing = _VERSIONS
-    commands: Encoding | None = Unframed(64)
-    baudrate: int = 921_600
-    types: Sequence[SensorType] = TYPES
-    dtype: npt.DTypeLike = np.int16
-    layout: Layout
+    framing = _VERSIONS
+    commands = Unframed(64)
+    baudrate = 921_600
+    payload_size = -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8  # of the largest module
+    types = TYPES
+    dtype = np.int16
+    watch = ZeroWatch
 
     def __init__(self, options: PaxiniOptions) -> None:
         super().__init__(options)
@@ -105,11 +105,6 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
         self._board: Board | None = None
         self._is_asking = False
-
-    @property
-    def payload_size(self) -> int:
-        """Bytes of the largest module; the modules are known only after the board was asked."""
-        return -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -171,10 +166,6 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         patches = await self.describe(link)
         await self.start(link)
         return patches
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

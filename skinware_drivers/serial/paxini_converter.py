@@ -20,14 +20,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware_drivers.description import Patch
-from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout
-from skinware_drivers.link import Link, Match
-from skinware_drivers.polling import Notice, Poll
-from skinware_drivers.serial.adapter import Refused
-from skinware_drivers.serial.checksums import LRC
-from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers import Byte, Frame, Identifier, Layout, Link, Match, Notice, Patch, Poll
+from skinware_drivers.layout import Condition
+from skinware_drivers.serial import LRC, Field, Length, Packet, Refused
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     POINTS_OF_PART,
@@ -119,7 +114,7 @@ class ConverterBoard(Board):
         how: see :class:`Board`; ``period_s`` is the time between two questions to the same sensor.
     """
 
-    framing: Framing = Packet(
+    framing = Packet(
         sync=(0xAA, 0x55, range(256), range(4), range(16), 0x00),
         length=Length(Field(2, 2), more=5),
         maximum=5 + _BODY_HEADER + 1 + _BEFORE_TAXELS + TAXEL * MOST_POINTS,

@@ -28,15 +28,11 @@ from typing import Any
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware_drivers.description import Patch
+from skinware_drivers import Flag, Frame, Identifier, Layout, Link, Match, Notice, Patch
 from skinware_drivers.hand import Hand
-from skinware_drivers.layout import Flag, Frame, Identifier, Layout
-from skinware_drivers.link import Link, Match, Reply
-from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import Refused
-from skinware_drivers.serial.checksums import LRC
-from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.packets import Length, LengthTable, Packet
+from skinware_drivers.link import Reply
+from skinware_drivers.serial import LRC, Field, Length, LengthTable, Packet, Refused, Split
+from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     SATURATED,
@@ -47,7 +43,6 @@ from skinware_drivers.serial.paxini_modules import (
     nominal_places,
     values,
 )
-from skinware_drivers.serial.stream import Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -121,7 +116,7 @@ class HighSpeedBoard(Board):
     def __init__(self, hand: Hand, **how: Any) -> None:
         super().__init__(1 / _USUAL_HZ, **how)
         self._hand = hand
-        self.framing: Framing = UNKNOWN_SLOTS
+        self.framing = UNKNOWN_SLOTS
         self._slots: list[Slot] = []
         self._patch: Patch | None = None
         self._streams = False

@@ -10,11 +10,8 @@ from dataclasses import dataclass
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_X, FORCE_Y, FORCE_Z, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers import Layout, Link, Module, Notice, Patch, Poll, Sentinel, Values, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Layout, Sentinel, Values
-from skinware_drivers.link import Link
-from skinware_drivers.polling import Notice, Poll
 from skinware_drivers.serial.framing import Framing
 
 TAXEL = 3
@@ -73,7 +70,6 @@ _MODELS: Mapping[int, str] = {
 _UID_OF_MODULE = 16
 _PLACES = ("near", "middle", "tip", "nail")
 _FROM_THE_END = ("nail", "tip", "middle", "near")
-_PALMS = 8
 
 
 def model_of(points: int) -> str:

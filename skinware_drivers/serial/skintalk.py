@@ -10,22 +10,17 @@ the last record before a pause waits for the next one. Only two bytes can be che
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Expand, Frame, Layout, Packed, Values
-from skinware_drivers.link import Link
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Encoding, Field, Framing, Unframed
-from skinware_drivers.serial.packets import Packet
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Bits, Expand, Frame, Layout, Link, Module, Packed, Patch, Values, check_options, taxels
+from skinware_drivers.serial import Field, Packet, SerialAdapter, Unframed
 
 _START, _STOP = b"1", b"0"
 _Bytes = npt.NDArray[np.uint8]
@@ -34,13 +29,13 @@ _Bytes = npt.NDArray[np.uint8]
 class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    patches: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
-    cells: Annotated[int, msgspec.Meta(description="cells of each patch", ge=1, le=16)] = 16
+    patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
+    cells: Annotated[int, Meta(description="cells of each patch", ge=1, le=16)] = 16
     negative: Annotated[
         Literal["twos_complement", "off_by_one"],
-        msgspec.Meta(description="negative values: two's complement, or one more, as older skintalk shows them"),
+        Meta(description="negative values: two's complement, or one more, as older skintalk shows them"),
     ] = "twos_complement"
-    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two records of a cell, ms", ge=1)] = 20
+    period_ms: Annotated[int, Meta(description="nominal time between two records of a cell, ms", ge=1)] = 20
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -55,18 +50,18 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
     options do not name are counted as unknown.
     """
 
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
-    dtype: npt.DTypeLike = np.int32
+    types = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
+    dtype = np.int32
     baudrate = 2_000_000
-    framing: Framing = Packet(sync=b"\x55", length=5, identifier=Field(1), confirmed="each")
-    commands: Encoding | None = Unframed()
+    framing = Packet(sync=b"\x55", length=5, identifier=Field(1), confirmed="each")
+    commands = Unframed()
 
     def __init__(self, options: SkintalkOptions) -> None:
         super().__init__(options)
         exact = Values(0, Packed(24, signed=True), 1)
         values = exact if options.negative == "twos_complement" else Expand(_off_by_one)
-        self.layout: Layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
-        self.patches: Sequence[Patch] = tuple(
+        self.layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
+        self.patches = tuple(
             Patch(
                 f"patch {number}",
                 [Module(taxels(1, first_uid=number << 4 | i), key=i, kind="cell") for i in range(options.cells)],

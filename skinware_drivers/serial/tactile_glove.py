@@ -10,20 +10,15 @@ byte are right, and a packet follows: one that lost bytes could otherwise pass w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
-from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Layout, Packed, Values
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.packets import Packet
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Bits, Frame, Layout, Module, Packed, Patch, Values, check_options, taxels
+from skinware_drivers.serial import Field, Packet, SerialAdapter
 
 _FIRST = 0x3C
 _MOST = 64
@@ -32,8 +27,8 @@ _MOST = 64
 class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver."""
 
-    taxels: Annotated[int, msgspec.Meta(description="number of taxels, counted from 0", ge=1, le=_MOST)] = _MOST
-    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
+    taxels: Annotated[int, Meta(description="number of taxels, counted from 0", ge=1, le=_MOST)] = _MOST
+    period_ms: Annotated[int, Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -45,9 +40,9 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
     Values are those of the wire (0 is the greatest pressure); ``physical`` is 4095 - value, as the maker shows it.
     """
 
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
-    dtype: npt.DTypeLike = np.uint16
-    framing: Framing = Packet(
+    types = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
+    dtype = np.uint16
+    framing = Packet(
         sync=(range(_FIRST, _FIRST + _MOST), 0x01),
         length=5,
         trailer=b"\0",
@@ -55,9 +50,9 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
         header=2,
         confirmed="each",
     )
-    layout: Layout = Layout((Frame("taxel", (), (2,), Values(0, Packed(12, skip=4), 1), module=Bits(0, 8)),))
+    layout = Layout((Frame("taxel", (), (2,), Values(0, Packed(12, skip=4), 1), module=Bits(0, 8)),))
 
     def __init__(self, options: TactileGloveOptions) -> None:
         super().__init__(options)
         modules = [Module(taxels(1, first_uid=i), key=_FIRST + i, kind="taxel") for i in range(options.taxels)]
-        self.patches: Sequence[Patch] = (Patch("glove", modules),)
+        self.patches = (Patch("glove", modules),)

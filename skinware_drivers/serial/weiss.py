@@ -9,14 +9,9 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any, ClassVar
 
-from skinware_drivers.description import Patch
-from skinware_drivers.link import Link, Match
+from skinware_drivers import Link, Match, Notice, Patch
 from skinware_drivers.options import OptionsT
-from skinware_drivers.polling import Notice
-from skinware_drivers.serial.adapter import Answers, SerialAdapter
-from skinware_drivers.serial.checksums import CRC16_WEISS
-from skinware_drivers.serial.framing import Field
-from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial import CRC16_WEISS, Answers, Field, Length, Packet, SerialAdapter
 
 _AROUND = 8
 """Bytes of a frame beside its payload."""

@@ -23,23 +23,17 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.geometry import Geometry
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers import Link, Module, Patch, check_options, operation, taxels
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
 from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.polling import Watch, ZeroWatch
-from skinware_drivers.serial.adapter import Answers, Refused
-from skinware_drivers.serial.framing import Encoding, Framing
-from skinware_drivers.serial.stream import Split
+from skinware_drivers.polling import ZeroWatch
+from skinware_drivers.serial import Answers, Refused, Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -95,16 +89,16 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
     packet = _WHOLE
     answers = Answers("controller", {}, dtype="<u2")
     timeout_s, tries = 1.0, 4  # it is silent for some 8 s after power-up
-    framing: Framing = _WHOLE
-    commands: Encoding | None = _WHOLE
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL),)
-    dtype: npt.DTypeLike = np.uint16
-    layout: Layout
+    framing = _WHOLE
+    commands = _WHOLE
+    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL),)
+    dtype = np.uint16
+    watch = ZeroWatch
 
     def __init__(self, options: WeissDsaOptions) -> None:
         super().__init__(options)
-        self.period_s: float = options.period_ms / 1e3
-        self.geometry: Geometry | None = None
+        self.period_s = options.period_ms / 1e3
+        self.geometry = None
         self._cells: tuple[_Matrix, ...] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -160,10 +154,6 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         answer = await self._ask(link, _CONTROLLER, size=7)
         serial_number, hardware, software = struct.unpack_from("<IBH", answer)
         return {"serial_number": serial_number, "hardware": hardware, "software": software}
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return ZeroWatch(tables)
 
     def split(self) -> Split:
         """Return the framing of this controller: a frame for each matrix."""

@@ -24,13 +24,9 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers import Link, Module, Patch, Sensor, check_options, operation
 from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import Answers, Refused
-from skinware_drivers.serial.framing import Framing
+from skinware_drivers.serial import Answers, Refused
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -81,9 +77,8 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
     packet = weiss_packet(_HEADER + 2 * _MOST_CELLS)
     answers = Answers("sensor", _REASONS, dtype="<u2")
     timeout_s, tries = 0.5, 3
-    framing: Framing = packet
-    layout: Layout
-    dtype: npt.DTypeLike = np.uint16
+    framing = packet
+    dtype = np.uint16
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the sensor for its matrix; it may still be sending for an earlier program.

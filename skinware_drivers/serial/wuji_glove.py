@@ -18,21 +18,14 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError
-from skinware.sensor_types import PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers import Link, Match, Module, Patch, Sensor, check_options, operation
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import Answers, SerialAdapter
-from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
-from skinware_drivers.serial.framing import Encoding, Field, Framing
-from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -65,7 +58,7 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     """One board on a serial line."""
 
-    framing: Framing = Packet(
+    framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),
         maximum=3088,
@@ -73,16 +66,16 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         covers=(2, -2),
         identifier=Field(1),
     )
-    commands: Encoding | None = Packet(
+    commands = Packet(
         sync=(0xAA, 0x56),
         length=Length(Field(2, 2), more=0),
         maximum=512,
         checksum=CRC16_CCITT_FALSE,
         covers=(2, -2),
     )
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
-    dtype: npt.DTypeLike = np.float32
-    layout: Layout = Layout(
+    types = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
+    dtype = np.float32
+    layout = Layout(
         [
             Frame(
                 "frame",
@@ -100,7 +93,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         super().__init__(options)
         self._number = 0
         self._wanted_hz = options.rate_hz
-        self.period_s: float = 1 / (options.rate_hz or _USUAL_HZ)
+        self.period_s = 1 / (options.rate_hz or _USUAL_HZ)
         self._on = True
 
     async def describe(self, link: Link) -> Sequence[Patch]:

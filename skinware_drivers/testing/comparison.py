@@ -242,7 +242,10 @@ class Comparison:
                 if match[own] >= _ENOUGH:
                     if words:
                         return f"shows {words} — {look}"
-                    return self._explain_age(lag)
+                    if lag:
+                        older = f"shows what it felt {lag} bursts before the rest of its module"
+                        return f"{older} — are frames of two bursts mixed?"
+                    return "is right by itself, but other sensors of its module are not of the same burst"
                 other = int(match.argmax())
                 if match[other] >= _ENOUGH and len(seen) > 2:
                     whose = sensor_name(structure, device * n + other)
@@ -255,12 +258,6 @@ class Comparison:
             return f"always shows {shown[0]} — is it written at all?"
         example = self._felt[device][newest[-1], own]
         return f"shows {shown[-1]} where {example} was felt — look at `offset`, `dtype` and `bits` of the layout"
-
-    @staticmethod
-    def _explain_age(lag: int) -> str:
-        if lag:
-            return f"shows what it felt {lag} bursts before the rest of its module — are frames of two bursts mixed?"
-        return "is right by itself, but other sensors of its module are not of the same burst"
 
 
 def _as_numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

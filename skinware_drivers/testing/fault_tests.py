@@ -15,7 +15,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
-from skinware_drivers.testing.rig import Running, is_fresh, is_live, play
+from skinware_drivers.testing.rig import Running, in_its_time, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Heard
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
@@ -30,84 +30,73 @@ class FaultTests(Suite):
     """Lost, damaged, repeated and foreign frames."""
 
     @pytest.mark.parametrize("fault", ["lost", "truncated", "repeated"])
-    def test_a_damaged_frame_costs_its_own_burst_only(self, fault: Fault) -> None:
+    @in_its_time
+    async def test_a_damaged_frame_costs_its_own_burst_only(self, clock: HandClock, fault: Fault) -> None:
         """Frames that are lost, cut short, or come twice: nothing torn is shown, every whole burst is."""
+        async with self.running(clock) as rig:
+            await self._damage(rig, fault)
+            comparison = Comparison(rig)
+            comparison.require_right(f"frames were {fault} on the wire")
+            comparison.require_complete(comparison.spoilt(), f" (others were {fault})")
+            if fault == "truncated" and rig.adapter.medium == "can":
+                right = {length for frame in rig.adapter.layout.frames for length in frame.length}
+                least = sum(len(damage.payload) not in right for damage in rig.wire.damages)
+                counted = rig.counters()["bad_length"]
+                require(
+                    least <= counted <= len(rig.wire.damages),
+                    f"{least} frames were cut to lengths that the layout does not know, and {counted} were counted"
+                    " as of wrong length",
+                )
+            self.require_all_counted(rig)
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await self._damage(rig, fault)
-                comparison = Comparison(rig)
-                comparison.require_right(f"frames were {fault} on the wire")
-                comparison.require_complete(comparison.spoilt(), f" (others were {fault})")
-                if fault == "truncated" and rig.adapter.medium == "can":
-                    right = {length for frame in rig.adapter.layout.frames for length in frame.length}
-                    least = sum(len(damage.payload) not in right for damage in rig.wire.damages)
-                    counted = rig.counters()["bad_length"]
-                    require(
-                        least <= counted <= len(rig.wire.damages),
-                        f"{least} frames were cut to lengths that the layout does not know, and {counted} were counted"
-                        " as of wrong length",
-                    )
-                self.require_all_counted(rig)
-
-        play(scenario)
-
-    def test_garbage_raises_nothing(self) -> None:
+    @in_its_time
+    async def test_garbage_raises_nothing(self, clock: HandClock) -> None:
         """Random bytes under the devices' own identifiers: no exception, and all other bursts are right."""
+        async with self.running(clock) as rig:
+            await self._damage(rig, "garbage")
+            comparison = Comparison(rig)
+            spoilt = comparison.spoilt()
+            for update in comparison.wrong:
+                shown_ns = int(rig.record.frames[update.frame].module_time_ns[update.module])
+                require(
+                    spoilt(shown_ns - rig.period_ns) or spoilt(shown_ns),
+                    "values that were never sent are shown, long after the last garbage: does the driver keep state"
+                    " that one bad frame spoils for good?",
+                )
+            comparison.require_complete(spoilt, " (others were garbage)")
+            self.require_all_counted(rig)
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await self._damage(rig, "garbage")
-                comparison = Comparison(rig)
-                spoilt = comparison.spoilt()
-                for update in comparison.wrong:
-                    shown_ns = int(rig.record.frames[update.frame].module_time_ns[update.module])
-                    require(
-                        spoilt(shown_ns - rig.period_ns) or spoilt(shown_ns),
-                        "values that were never sent are shown, long after the last garbage: does the driver keep state"
-                        " that one bad frame spoils for good?",
-                    )
-                comparison.require_complete(spoilt, " (others were garbage)")
-                self.require_all_counted(rig)
-
-        play(scenario)
-
-    def test_foreign_frames_disturb_nothing(self) -> None:
+    @in_its_time
+    async def test_foreign_frames_disturb_nothing(self, clock: HandClock) -> None:
         """Other devices on the bus (on a serial line: noise between frames) are counted and change nothing."""
         if self.driver.medium == "virtual":
             return  # there are no other devices
-
-        async def scenario(clock: HandClock) -> None:
-            rig = self.running(clock)
-            if rig.adapter.medium in ("serial", "modbus"):
-                async with rig:
-                    await self._damage(rig, "noise")
-                    comparison = Comparison(rig)
-                    comparison.require_right("there was noise on the line")
-                    comparison.require_complete(comparison.spoilt(), " (before others there was noise)")
-                return
+        rig = self.running(clock)
+        if rig.adapter.medium in ("serial", "modbus"):
             async with rig:
-                await rig.until_fresh()
-                before = rig.counters()["unknown"]
-                rig.wire.foreign = foreign_identifiers(await self._own_identifiers(rig))
-                await rig.sleep(_BURSTS * rig.adapter.period_s)
-                foreign, rig.wire.foreign = rig.wire.foreign_sent, ()
-                await rig.sleep(4 * rig.adapter.period_s)
-                counted = rig.counters()["unknown"] - before
-                require(
-                    counted == foreign,
-                    f"{foreign} frames of other devices came, {counted} were counted as unknown: the layout takes"
-                    " identifiers that are not its devices'",
-                )
+                await self._damage(rig, "noise")
                 comparison = Comparison(rig)
-                comparison.require_right("among frames of other devices")
-                comparison.require_complete(because=" (among frames of other devices)")
-
-        play(scenario)
-
-    async def _own_identifiers(self, rig: Running) -> Collection[int]:
-        declared: Collection[int] = getattr(rig.devices, "identifiers", ())
-        return declared or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
+                comparison.require_right("there was noise on the line")
+                comparison.require_complete(comparison.spoilt(), " (before others there was noise)")
+            return
+        async with rig:
+            await rig.until_fresh()
+            before = rig.counters()["unknown"]
+            declared: Collection[int] = getattr(rig.devices, "identifiers", ())
+            own = declared or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
+            rig.wire.foreign = foreign_identifiers(own)
+            await rig.sleep(_BURSTS * rig.adapter.period_s)
+            foreign, rig.wire.foreign = rig.wire.foreign_sent, ()
+            await rig.sleep(4 * rig.adapter.period_s)
+            counted = rig.counters()["unknown"] - before
+            require(
+                counted == foreign,
+                f"{foreign} frames of other devices came, {counted} were counted as unknown: the layout takes"
+                " identifiers that are not its devices'",
+            )
+            comparison = Comparison(rig)
+            comparison.require_right("among frames of other devices")
+            comparison.require_complete(because=" (among frames of other devices)")
 
     async def _damage(self, rig: Running, fault: Fault) -> None:
         """Run, damage some frames, and let the last burst come through."""
@@ -128,23 +117,20 @@ _STALE = np.uint8(Status.STALE | Status.NEVER_SEEN)
 class SilenceTests(Suite):
     """Cut cables, lost buses, devices that restart or die."""
 
-    def test_silence_is_shown_and_ends(self) -> None:
+    @in_its_time
+    async def test_silence_is_shown_and_ends(self, clock: HandClock) -> None:
         """A cable that is cut: every value goes stale, and is fresh again when the cable is back."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                rig.wire.silent = True
-                slowest_ns = int(rig.record.frames[-1].structure.group_period_ns.max())
-                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s, 4 * slowest_ns / NS_PER_S))
-                require(
-                    (rig.record.frames[-1].status & _STALE).all(),
-                    "no data has come for seconds, but values are still shown as fresh: is `period_s` far too long?",
-                )
-                rig.wire.silent = False
-                await self._comes_back(rig, "the cable was cut and mended")
-
-        play(scenario)
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            rig.wire.silent = True
+            slowest_ns = int(rig.record.frames[-1].structure.group_period_ns.max())
+            await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s, 4 * slowest_ns / NS_PER_S))
+            require(
+                (rig.record.frames[-1].status & _STALE).all(),
+                "no data has come for seconds, but values are still shown as fresh: is `period_s` far too long?",
+            )
+            rig.wire.silent = False
+            await self._comes_back(rig, "the cable was cut and mended")
 
     def test_a_silent_kind_of_frame_is_not_shown_as_fresh(self) -> None:
         """One kind of frame falls silent while all others continue: sensors that only it carries become stale."""
@@ -172,43 +158,38 @@ class SilenceTests(Suite):
                 " same module. If an Expand is among them, say with `to` which channels it has",
             )
 
-    def test_a_lost_bus_comes_back(self) -> None:
+    @in_its_time
+    async def test_a_lost_bus_comes_back(self, clock: HandClock) -> None:
         """The interface is unplugged and plugged in again: the driver continues by itself."""
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            rig.bus.vanish()
+            await rig.until(
+                lambda frame: frame.bus_state[0] in (BusState.GONE, BusState.DOWN),
+                "the interface went away, but the state of the bus does not show it",
+            )
+            await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s))
+            require(
+                (rig.record.frames[-1].status & _STALE).all(),
+                "the interface is away, but values are shown as fresh",
+            )
+            rig.bus.come_back()
+            await self._comes_back(rig, "the interface was unplugged and plugged in again")
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                rig.bus.vanish()
-                await rig.until(
-                    lambda frame: frame.bus_state[0] in (BusState.GONE, BusState.DOWN),
-                    "the interface went away, but the state of the bus does not show it",
-                )
-                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s))
-                require(
-                    (rig.record.frames[-1].status & _STALE).all(),
-                    "the interface is away, but values are shown as fresh",
-                )
-                rig.bus.come_back()
-                await self._comes_back(rig, "the interface was unplugged and plugged in again")
-
-        play(scenario)
-
-    def test_restarted_devices_come_back(self) -> None:
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock, boot_s=0.5) as rig:
-                await rig.until_fresh()
-                number = rig.numbers[0]
-                await self._restart(rig, number, clock.now_ns)
-                patch = rig.first_patch_of(number)
-                states = await self._until_stale(rig, patch, "a device lost its power, but it is shown as live")
-                disturbed = np.flatnonzero(states.patch_state != PatchState.LIVE)
-                require(
-                    set(disturbed.tolist()) <= {patch},
-                    f"a device lost its power, and patches {disturbed.tolist()} are not live: one holds up the others",
-                )
-                await self._comes_back(rig, "a device lost its power for half a second", within_s=_RESTART_S)
-
-        play(scenario)
+    @in_its_time
+    async def test_restarted_devices_come_back(self, clock: HandClock) -> None:
+        async with self.running(clock, boot_s=0.5) as rig:
+            await rig.until_fresh()
+            number = rig.numbers[0]
+            await self._restart(rig, number, clock.now_ns)
+            patch = rig.first_patch_of(number)
+            states = await self._until_stale(rig, patch, "a device lost its power, but it is shown as live")
+            disturbed = np.flatnonzero(states.patch_state != PatchState.LIVE)
+            require(
+                set(disturbed.tolist()) <= {patch},
+                f"a device lost its power, and patches {disturbed.tolist()} are not live: one holds up the others",
+            )
+            await self._comes_back(rig, "a device lost its power for half a second", within_s=_RESTART_S)
 
     @staticmethod
     async def _restart(rig: Running, number: int, now_ns: int) -> None:
@@ -231,30 +212,27 @@ class SilenceTests(Suite):
         await rig.sleep(4 * rig.adapter.period_s)
         Comparison(rig).require_right(f"{after}, and afterwards")
 
-    def test_a_dead_device_holds_up_no_other(self) -> None:
+    @in_its_time
+    async def test_a_dead_device_holds_up_no_other(self, clock: HandClock) -> None:
         """One device dies: the others continue at their rate."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock, boot_s=1e6) as rig:
-                await rig.until_fresh()
-                if len(rig.numbers) < 2:
-                    return
-                await self._restart(rig, rig.numbers[0], clock.now_ns)
-                await rig.sleep(1.0 + 8 * rig.adapter.period_s)
-                first = len(rig.record.frames)
-                await rig.sleep(_BURSTS * rig.adapter.period_s)
-                comparison = Comparison(rig)
-                comparison.require_right("one device had died")
-                for module in range(comparison.structure.n_modules):
-                    if comparison.structure.module_patch[module] == rig.first_patch_of(rig.numbers[0]):
-                        continue
-                    shown = [u for u in comparison.updates if u.module == module and u.frame >= first]
-                    require(
-                        len(shown) >= _BURSTS - 3,
-                        f"one device is dead, and of another one {len(shown)} of {_BURSTS} bursts were shown",
-                    )
-
-        play(scenario)
+        async with self.running(clock, boot_s=1e6) as rig:
+            await rig.until_fresh()
+            if len(rig.numbers) < 2:
+                return
+            await self._restart(rig, rig.numbers[0], clock.now_ns)
+            await rig.sleep(1.0 + 8 * rig.adapter.period_s)
+            first = len(rig.record.frames)
+            await rig.sleep(_BURSTS * rig.adapter.period_s)
+            comparison = Comparison(rig)
+            comparison.require_right("one device had died")
+            for module in range(comparison.structure.n_modules):
+                if comparison.structure.module_patch[module] == rig.first_patch_of(rig.numbers[0]):
+                    continue
+                shown = [u for u in comparison.updates if u.module == module and u.frame >= first]
+                require(
+                    len(shown) >= _BURSTS - 3,
+                    f"one device is dead, and of another one {len(shown)} of {_BURSTS} bursts were shown",
+                )
 
 
 def _show(

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -48,7 +49,7 @@ def find_kernel(flavour: str) -> Path | None:
         Path("/boot") / f"vmlinuz-{folder.name}" for folder in Path("/lib/modules").glob("*") if _has_modules(folder)
     ]
     present = [kernel for kernel in kernels if kernel.exists() and ("-rt-" in kernel.name) == (flavour == "rt")]
-    return max(present, key=lambda kernel: [int(part) for part in _numbers(kernel.name)], default=None)
+    return max(present, key=lambda kernel: [int(part) for part in re.findall(r"\d+", kernel.name)], default=None)
 
 
 def _has_modules(folder: Path) -> bool:
@@ -57,10 +58,6 @@ def _has_modules(folder: Path) -> bool:
     except OSError:
         return False
     return all(f"/{module}.ko" in known for module in MODULES.split())
-
-
-def _numbers(text: str) -> list[str]:
-    return "".join(c if c.isdigit() else " " for c in text).split()
 
 
 def find_vng() -> str | None:

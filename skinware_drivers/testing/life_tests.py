@@ -19,7 +19,7 @@ from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.layout_check import check_layout
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.leaks import Belongings, files_left
-from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.rig import Running, in_its_time, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
@@ -48,30 +48,28 @@ def _check_matrices(structure: Structure, geometry: Geometry) -> None:
 class LifeTests(Suite):
     """Description, handshakes, stop, listening, leaks."""
 
-    def test_the_description_is_valid_complete_and_stable(self) -> None:
-        async def scenario(clock: HandClock) -> None:
-            async with self.handshakes(clock) as rig:
-                first = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
-                require(
-                    first.structure.n_sensors == rig.n_values,
-                    f"the driver declares {first.structure.n_sensors} sensors, the devices have {rig.n_values}: is a"
-                    " module missing in `describe` or `patches`, or a channel that is no sensor?",
-                )
-                second = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
-                require(
-                    first.structure == second.structure,
-                    "`describe` returns another structure for the same devices when it is called again: readers would"
-                    " have to follow a new structure each time",
-                )
-                other = self.case.adapter()
-                third = self._tables(other, await other.describe(rig.link))
-                require(
-                    first.structure == third.structure,
-                    "another object of the driver describes the same devices in another way: does the class keep"
-                    " something that belongs to the object?",
-                )
-
-        play(scenario)
+    @in_its_time
+    async def test_the_description_is_valid_complete_and_stable(self, clock: HandClock) -> None:
+        async with self.handshakes(clock) as rig:
+            first = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
+            require(
+                first.structure.n_sensors == rig.n_values,
+                f"the driver declares {first.structure.n_sensors} sensors, the devices have {rig.n_values}: is a"
+                " module missing in `describe` or `patches`, or a channel that is no sensor?",
+            )
+            second = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
+            require(
+                first.structure == second.structure,
+                "`describe` returns another structure for the same devices when it is called again: readers would"
+                " have to follow a new structure each time",
+            )
+            other = self.case.adapter()
+            third = self._tables(other, await other.describe(rig.link))
+            require(
+                first.structure == third.structure,
+                "another object of the driver describes the same devices in another way: does the class keep"
+                " something that belongs to the object?",
+            )
 
     @staticmethod
     def _tables(adapter: AnyAdapter, patches: Sequence[Any]) -> SkinTables:
@@ -87,53 +85,48 @@ class LifeTests(Suite):
             _check_matrices(tables.structure, adapter.geometry)
         return tables
 
-    def test_handshakes_in_any_order(self) -> None:
+    @in_its_time
+    async def test_handshakes_in_any_order(self, clock: HandClock) -> None:
         """Stop without start, twice, start again, close twice, use after close: only bus errors may be raised."""
+        async with self.handshakes(clock) as rig:
+            adapter, link = rig.adapter, rig.link
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.handshakes(clock) as rig:
-                adapter, link = rig.adapter, rig.link
+            async def step(name: str, *arguments: Any) -> Any:
+                try:
+                    return await getattr(adapter, name)(link, *arguments)
+                except BusError as error:
+                    return defect(f"`{name}` failed ({story}) though the devices are there: {error}")
+                except Exception as error:  # noqa: BLE001  (reported to the author)
+                    return defect(f"`{name}` raised {type(error).__name__}: {error} ({story}); only BusError may be")
 
-                async def step(name: str, *arguments: Any) -> Any:
-                    try:
-                        return await getattr(adapter, name)(link, *arguments)
-                    except BusError as error:
-                        return defect(f"`{name}` failed ({story}) though the devices are there: {error}")
-                    except Exception as error:  # noqa: BLE001  (reported to the author)
-                        return defect(
-                            f"`{name}` raised {type(error).__name__}: {error} ({story}); only BusError may be"
-                        )
-
-                for story in (
-                    "describe stop stop",
-                    "configure start stop",
-                    "stop configure configure start start stop",
-                    "describe configure start stop",
-                ):
-                    for name in story.split():
-                        result = await step(name)
-                        if name == "describe":
-                            patches = result
-                for patch in patches:
-                    story = "revive without start, then probe"
-                    await step("revive", patch)
-                    await step("probe", patch)
-                await step("stop")
-                rig.close()
-                rig.close()
-                for name in ("describe", "configure", "start", "stop"):
-                    try:
-                        await getattr(adapter, name)(link)
-                    except BusError:
-                        continue
-                    except Exception as error:  # noqa: BLE001  (reported to the author)
-                        defect(f"`{name}` raised {type(error).__name__} on a closed bus: {error}; only BusError may be")
-                rig.open()
-                story = "after the bus was closed and opened again"
-                for name in ("describe", "configure", "start", "stop"):
-                    await step(name)
-
-        play(scenario)
+            for story in (
+                "describe stop stop",
+                "configure start stop",
+                "stop configure configure start start stop",
+                "describe configure start stop",
+            ):
+                for name in story.split():
+                    result = await step(name)
+                    if name == "describe":
+                        patches = result
+            for patch in patches:
+                story = "revive without start, then probe"
+                await step("revive", patch)
+                await step("probe", patch)
+            await step("stop")
+            rig.close()
+            rig.close()
+            for name in ("describe", "configure", "start", "stop"):
+                try:
+                    await getattr(adapter, name)(link)
+                except BusError:
+                    continue
+                except Exception as error:  # noqa: BLE001  (reported to the author)
+                    defect(f"`{name}` raised {type(error).__name__} on a closed bus: {error}; only BusError may be")
+            rig.open()
+            story = "after the bus was closed and opened again"
+            for name in ("describe", "configure", "start", "stop"):
+                await step(name)
 
     def test_it_can_be_stopped_at_any_moment(self) -> None:
         """Between any two steps of its start, also while it waits for devices that are not there."""
@@ -150,36 +143,31 @@ class LifeTests(Suite):
                 play(lambda clock, after_s=after_s, silent=silent: scenario(clock, after_s, silent))  # type: ignore[misc]
         self._require_nothing_left(before, "after it was stopped in the middle of its start")
 
-    def test_devices_that_come_late_are_found(self) -> None:
+    @in_its_time
+    async def test_devices_that_come_late_are_found(self, clock: HandClock) -> None:
         """No device has power when the driver starts; devices that are switched on later are set up and shown."""
+        rig = self.running(clock)
+        rig.wire.silent = True
+        async with rig:
+            await rig.sleep(_ABSENT_S)
+            rig.wire.silent = False
+            await rig.until_fresh()
 
-        async def scenario(clock: HandClock) -> None:
-            rig = self.running(clock)
-            rig.wire.silent = True
-            async with rig:
-                await rig.sleep(_ABSENT_S)
-                rig.wire.silent = False
-                await rig.until_fresh()
-
-        play(scenario)
-
-    def test_devices_are_silent_again_after_stop(self) -> None:
-        async def scenario(clock: HandClock) -> None:
-            rig = self.running(clock)
-            async with rig:
-                rig.wire.skip(clock.now_ns)
-                if self._frames_alone(clock):
-                    return  # they send by themselves: nothing stops them
-                await rig.until_fresh()
-            self._let_pass(rig, 0.1)
-            sent = len(self._let_pass(rig, 1.0))
-            require(
-                not sent,
-                f"the devices continue to send after the driver was stopped ({sent} frames in a second): `stop` does"
-                " not make them silent",
-            )
-
-        play(scenario)
+    @in_its_time
+    async def test_devices_are_silent_again_after_stop(self, clock: HandClock) -> None:
+        rig = self.running(clock)
+        async with rig:
+            rig.wire.skip(clock.now_ns)
+            if self._frames_alone(clock):
+                return  # they send by themselves: nothing stops them
+            await rig.until_fresh()
+        self._let_pass(rig, 0.1)
+        sent = len(self._let_pass(rig, 1.0))
+        require(
+            not sent,
+            f"the devices continue to send after the driver was stopped ({sent} frames in a second): `stop` does"
+            " not make them silent",
+        )
 
     def _frames_alone(self, clock: HandClock) -> int:
         """Return the number of frames that devices send in a second without being started."""
@@ -215,26 +203,24 @@ class LifeTests(Suite):
         left = before.left_since() + files_left(Namespace().path)
         require(not left, f"left behind {when}: {', '.join(left)}: what `start` opens, `stop` must close")
 
-    def test_memory_does_not_grow(self) -> None:
-        async def scenario(clock: HandClock) -> None:
-            rig = self.running(clock)
-            rig.record.keep = False
-            async with rig:
-                await rig.until_fresh()
-                await rig.sleep(10 * rig.adapter.period_s)
-                rig.truth.remember = rig.wire.remember = False  # then only the driver can grow
-                await rig.sleep(20 * rig.adapter.period_s)  # makes what is kept from then on
-                before = _pieces()
-                await rig.sleep(_MANY_BURSTS * rig.adapter.period_s)
-                grown = _pieces() - before
-                if grown > _MANY_BURSTS * _MOST_GROWN:
-                    where = await _where_it_grows(rig)
-                    defect(
-                        f"memory grows with the data: {grown} pieces more after {_MANY_BURSTS} bursts; most of them"
-                        f" seem to be made at {where}"
-                    )
-
-        play(scenario)
+    @in_its_time
+    async def test_memory_does_not_grow(self, clock: HandClock) -> None:
+        rig = self.running(clock)
+        rig.record.keep = False
+        async with rig:
+            await rig.until_fresh()
+            await rig.sleep(10 * rig.adapter.period_s)
+            rig.truth.remember = rig.wire.remember = False  # then only the driver can grow
+            await rig.sleep(20 * rig.adapter.period_s)  # makes what is kept from then on
+            before = _pieces()
+            await rig.sleep(_MANY_BURSTS * rig.adapter.period_s)
+            grown = _pieces() - before
+            if grown > _MANY_BURSTS * _MOST_GROWN:
+                where = await _where_it_grows(rig)
+                defect(
+                    f"memory grows with the data: {grown} pieces more after {_MANY_BURSTS} bursts; most of them"
+                    f" seem to be made at {where}"
+                )
 
     def test_a_listener_sends_nothing(self) -> None:
         async def scenario(clock: HandClock, streaming: bool) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import functools
+import inspect
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
@@ -13,7 +15,7 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.samples import sample_report, sample_text
 from skinware.status import BusState, PatchState, Status
@@ -21,6 +23,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
+from skinware_drivers.proving.captures import snapshots_after
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import run_in_its_time
@@ -95,18 +98,7 @@ class Recorder:
             if runner.builder.writer is None or runner.builder.writer.closed:
                 return
             self.reader = DriverReader(runner.identity.name)
-        while True:
-            last = self.frames[-1].position if self.frames else None
-            newest = self.reader.refresh()
-            if newest is None or newest == last:
-                return
-            try:
-                frame = next(self.reader.in_order(timeout_s=0))
-            except ServiceTimeout:
-                return
-            except StructureChanged:
-                self.reader.reattach()
-                continue
+        for frame in snapshots_after(self.reader, self.frames[-1].position if self.frames else None):
             if not self.keep:
                 self.frames.clear()
                 self.times_ns.clear()
@@ -265,12 +257,14 @@ class Running(Rig):
         """Let time pass until every sensor is fresh; explain why if that does not happen."""
         frames, begun_ns = self.wire.frames, self.clock.now_ns
         heard_ns: int | None = None
+        # from the first data to fresh sensors: a driver repeats its questions within 4 s
+        longest_ns = max(5 * NS_PER_S, 30 * self.period_ns)
 
         def is_decided(frame: DriverSnapshot) -> bool:
             nonlocal heard_ns
             if heard_ns is None and self.wire.frames > frames:
                 heard_ns = self.clock.now_ns
-            is_late = heard_ns is not None and self.clock.now_ns > heard_ns + self._longest_with_data_ns
+            is_late = heard_ns is not None and self.clock.now_ns > heard_ns + longest_ns
             return is_fresh(frame) or is_late
 
         try:
@@ -280,11 +274,6 @@ class Running(Rig):
             self._explain_not_fresh((self.clock.now_ns - begun_ns) / 1e9)
             raise
         return frame
-
-    @property
-    def _longest_with_data_ns(self) -> int:
-        """Return the longest time from the first data to fresh sensors: a driver repeats its questions within 4 s."""
-        return max(5 * NS_PER_S, 30 * self.period_ns)
 
     def _explain_not_fresh(self, within_s: float) -> None:
         from skinware_drivers.testing.comparison import Comparison  # which looks at rigs
@@ -373,3 +362,16 @@ def sensor_name(structure: Structure, sensor: int) -> str:
 def play(scenario: Callable[[HandClock], Coroutine[Any, Any, T]]) -> T:
     clock = HandClock()
     return run_in_its_time(clock, lambda: scenario(clock))
+
+
+def in_its_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Make a test of a coroutine method with the argument ``clock``, which runs in the time of this clock."""
+
+    @functools.wraps(test)
+    def run(suite: Any, *arguments: Any, **named: Any) -> None:
+        play(lambda clock: test(suite, clock, *arguments, **named))
+
+    signature = inspect.signature(test)  # without the clock, which pytest would take for a fixture
+    parameters = [parameter for name, parameter in signature.parameters.items() if name != "clock"]
+    run.__dict__["__signature__"] = signature.replace(parameters=parameters, return_annotation=None)
+    return run

@@ -23,7 +23,7 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.rig import Running, in_its_time
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
@@ -49,63 +49,49 @@ _WHAT_TO_DO = (
 class TornTests(Suite):
     """Runs of lost frames, and senders that stand still and catch up."""
 
-    def test_no_run_of_lost_frames_tears_a_burst(self) -> None:
+    @in_its_time
+    async def test_no_run_of_lost_frames_tears_a_burst(self, clock: HandClock) -> None:
         """Runs up to two bursts long, from every frame on; the frames around them in time, late, or caught up."""
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            if not rig.adapter.layout.cycles:
+                return  # a frame is all of an update
+            heard = Heard(rig)
+            await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
+            recording = heard.recording()
+        if recording is None:
+            defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
+        numbers = counter_values(recording)
+        if len(numbers) == 1:
+            defect(
+                f"the `counter` of the cycle is {numbers[0]} in all frames of {BURSTS} bursts, so that it cannot"
+                " distinguish them: look at its `offset`, `dtype` and `mask`"
+            )
+        outcome = try_troubles(recording)
+        require(outcome.shown >= 2 * outcome.tried, "hardly anything is shown when frames are lost now and then")
+        if outcome.first is not None:
+            defect(
+                f"{outcome.torn} of {outcome.shown} updates show values of two bursts as if they were fresh:"
+                f" {outcome.first.in_words(recording)}; {_WHAT_TO_DO}"
+            )
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                if not rig.adapter.layout.cycles:
-                    return  # a frame is all of an update
-                heard = Heard(rig)
-                await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
-                recording = heard.recording()
-            if recording is None:
-                defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
-            _require_counting(recording)
-            outcome = try_troubles(recording)
-            require(outcome.shown >= 2 * outcome.tried, "hardly anything is shown when frames are lost now and then")
-            if outcome.first is not None:
-                defect(
-                    f"{outcome.torn} of {outcome.shown} updates show values of two bursts as if they were fresh:"
-                    f" {outcome.first.in_words(recording)}; {_WHAT_TO_DO}"
-                )
-
-        play(scenario)
-
-    def test_nothing_torn_is_shown_while_a_sender_stumbles(self) -> None:
+    @in_its_time
+    async def test_nothing_torn_is_shown_while_a_sender_stumbles(self, clock: HandClock) -> None:
         """The driver runs while its devices lose runs of frames, stand still and catch up; then all is fresh again."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                before, bursts = rig.wire.frames, _bursts(rig)
-                await rig.sleep(8 * rig.adapter.period_s)
-                size = round((rig.wire.frames - before) / max(1, _bursts(rig) - bursts))
-                rig.wire.stumbling = Stumbling(rig.period_ns, max(1, size))
-                await rig.sleep(_STUMBLING_PERIODS * rig.adapter.period_s)
-                require(rig.wire.stumbling.stumbles > 3, "the emulated devices send too little to test faults with")
-                rig.wire.stumbling = None
-                end_ns = clock.now_ns
-                await rig.sleep(4 * rig.adapter.period_s)
-                Comparison(rig).require_right("runs of frames were lost, and the sender stood still and caught up")
-                shown_ns = rig.record.frames[-1].module_time_ns
-                require((shown_ns > end_ns).all(), "the sender works again, but not all modules are shown")
-
-        play(scenario)
-
-
-def _require_counting(recording: Recording) -> None:
-    numbers = counter_values(recording)
-    if len(numbers) == 1:
-        defect(
-            f"the `counter` of the cycle is {numbers[0]} in all frames of {BURSTS} bursts, so that it cannot"
-            " distinguish them: look at its `offset`, `dtype` and `mask`"
-        )
-
-
-def _bursts(rig: Running) -> int:
-    return max(len(bursts) for bursts in rig.truth.bursts.values())
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            before, bursts = rig.wire.frames, rig.truth.most_bursts
+            await rig.sleep(8 * rig.adapter.period_s)
+            size = round((rig.wire.frames - before) / max(1, rig.truth.most_bursts - bursts))
+            rig.wire.stumbling = Stumbling(rig.period_ns, max(1, size))
+            await rig.sleep(_STUMBLING_PERIODS * rig.adapter.period_s)
+            require(rig.wire.stumbling.stumbles > 3, "the emulated devices send too little to test faults with")
+            rig.wire.stumbling = None
+            end_ns = clock.now_ns
+            await rig.sleep(4 * rig.adapter.period_s)
+            Comparison(rig).require_right("runs of frames were lost, and the sender stood still and caught up")
+            shown_ns = rig.record.frames[-1].module_time_ns
+            require((shown_ns > end_ns).all(), "the sender works again, but not all modules are shown")
 
 
 class Take(NamedTuple):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from skinware.status import Status
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
-from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.rig import in_its_time
 from skinware_drivers.testing.suite import Suite, extreme
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -23,95 +22,74 @@ _NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_
 class ValueTests(Suite):
     """Values of good data."""
 
-    def test_every_value_is_right_and_in_order(self) -> None:
+    @in_its_time
+    async def test_every_value_is_right_and_in_order(self, clock: HandClock) -> None:
         """Each sensor shows its values, every burst is shown once, and no counter of faults grows."""
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            await rig.sleep(_BURSTS * rig.adapter.period_s)
+            comparison = Comparison(rig)
+            comparison.require_right()
+            comparison.require_complete()
+            wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
+            require(
+                not wrong,
+                f"good data was counted as faulty: {wrong}{rig.samples_in_words()}: does the layout"
+                " know every frame and every length that the devices send?",
+            )
+            self.require_all_counted(rig)
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                await rig.sleep(_BURSTS * rig.adapter.period_s)
-                comparison = Comparison(rig)
-                comparison.require_right()
-                comparison.require_complete()
-                wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
-                require(
-                    not wrong,
-                    f"good data was counted as faulty: {wrong}{rig.samples_in_words()}: does the layout"
-                    " know every frame and every length that the devices send?",
-                )
-                self.require_all_counted(rig)
-
-        play(scenario)
-
-    def test_extreme_values(self) -> None:
+    @in_its_time
+    async def test_extreme_values(self, clock: HandClock) -> None:
         """Least and greatest values, alternating bits, and the sign bit alone are shown as they were sent."""
+        async with self.running(clock, pattern=extreme) as rig:
+            await rig.until_fresh()
+            await rig.sleep(24 * rig.adapter.period_s)
+            Comparison(rig).require_right()
 
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock, pattern=extreme) as rig:
-                await rig.until_fresh()
-                await rig.sleep(24 * rig.adapter.period_s)
-                Comparison(rig).require_right()
-
-        play(scenario)
-
-    def test_nothing_is_valid_before_the_first_data(self) -> None:
+    @in_its_time
+    async def test_nothing_is_valid_before_the_first_data(self, clock: HandClock) -> None:
         """Every sensor is NEVER_SEEN before data comes, and data makes only its own sensors valid."""
-
-        async def scenario(clock: HandClock) -> None:
-            rig = self.running(clock)
-            is_data = self._data_of(rig)
-            rig.wire.keep = lambda identifier, payload: not is_data(identifier, payload)
-            async with rig:
-                await rig.sleep(_SILENCE_S)
-                for frame in rig.record.frames:
-                    seen = np.flatnonzero((frame.status & Status.NEVER_SEEN) == 0)
-                    require(
-                        not len(seen),
-                        f"{len(seen)} sensors are shown as seen before any data came, with values"
-                        f" {frame.values[seen[:4]].tolist()}: nothing may be filled in beforehand",
-                    )
-                passed: set[tuple[int, bytes]] = set()
-
-                def first_of_each_burst(identifier: int, payload: bytes) -> bool:
-                    if not is_data(identifier, payload):
-                        return True
-                    passed.add((identifier, payload[:1]))
-                    return (identifier, payload[:1]) == min(passed)
-
-                rig.wire.keep = first_of_each_burst
-                await rig.sleep(_SILENCE_S)
-                rig.wire.keep = lambda _identifier, _payload: True
-                await rig.until_fresh()
-                Comparison(rig).require_right(
-                    "with most frames missing on the wire, sensors without a frame of theirs were filled in"
+        rig = self.running(clock)
+        bursts = rig.truth.bursts  # before the first of them, all frames are answers
+        rig.wire.keep = lambda _identifier, _payload: not bursts
+        async with rig:
+            await rig.sleep(_SILENCE_S)
+            for frame in rig.record.frames:
+                seen = np.flatnonzero((frame.status & Status.NEVER_SEEN) == 0)
+                require(
+                    not len(seen),
+                    f"{len(seen)} sensors are shown as seen before any data came, with values"
+                    f" {frame.values[seen[:4]].tolist()}: nothing may be filled in beforehand",
                 )
+            passed: set[tuple[int, bytes]] = set()
 
-        play(scenario)
+            def first_of_each_burst(identifier: int, payload: bytes) -> bool:
+                if not bursts:
+                    return True
+                passed.add((identifier, payload[:1]))
+                return (identifier, payload[:1]) == min(passed)
 
-    def _data_of(self, rig: Running) -> Any:
-        """Return a test of a frame: whether it is data. Answers come before the devices send any data."""
-        bursts = rig.truth.bursts
+            rig.wire.keep = first_of_each_burst
+            await rig.sleep(_SILENCE_S)
+            rig.wire.keep = lambda _identifier, _payload: True
+            await rig.until_fresh()
+            Comparison(rig).require_right(
+                "with most frames missing on the wire, sensors without a frame of theirs were filled in"
+            )
 
-        def is_data(_identifier: int, _payload: bytes) -> bool:
-            return bool(bursts)
-
-        return is_data
-
-    def test_the_rate_is_the_declared_one(self) -> None:
+    @in_its_time
+    async def test_the_rate_is_the_declared_one(self, clock: HandClock) -> None:
         """Updates come every ``period_s``: readers, staleness and pairing depend on it."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                await rig.sleep(2 * _BURSTS * rig.adapter.period_s)
-                for number in rig.numbers:
-                    real_s = _mean_interval_s([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])
-                    require(
-                        abs(real_s / rig.adapter.period_s - 1) < _RATE_TOLERANCE,
-                        f"`period_s` is {rig.adapter.period_s:g} s, but device {number} sends every {real_s:.3g} s",
-                    )
-
-        play(scenario)
+        async with self.running(clock) as rig:
+            await rig.until_fresh()
+            await rig.sleep(2 * _BURSTS * rig.adapter.period_s)
+            for number in rig.numbers:
+                real_s = _mean_interval_s([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])
+                require(
+                    abs(real_s / rig.adapter.period_s - 1) < _RATE_TOLERANCE,
+                    f"`period_s` is {rig.adapter.period_s:g} s, but device {number} sends every {real_s:.3g} s",
+                )
 
 
 def _mean_interval_s(times_ns: Sequence[int]) -> float:

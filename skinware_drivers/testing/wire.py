@@ -83,7 +83,7 @@ class Stumbling:
 
 
 Fault = Literal["lost", "repeated", "truncated", "garbage", "noise"]
-"""What happens to a frame: lost, twice, cut short, replaced by random bytes, or preceded by them (serial lines)."""
+"""The fate of a frame: lost, sent twice, cut short, replaced by random bytes, or preceded by them (serial lines)."""
 Values = npt.NDArray[np.int64]
 Pattern = Callable[[int, int, int], Values]
 """(number of the device, number of its burst, number of values) -> values that its sensors feel."""
@@ -128,6 +128,10 @@ class Truth:
         self.remember = True
         self._clock = clock
         self._shown = shown
+
+    @property
+    def most_bursts(self) -> int:
+        return max(len(bursts) for bursts in self.bursts.values())
 
     def __call__(self, number: int, cycle: int) -> Sequence[int]:
         felt: list[int] = self.pattern(number, cycle, self.n_felt).tolist()

@@ -1,4 +1,4 @@
-"""A machine on which nothing runs and nothing is plugged in but what a test brings."""
+"""A machine on which only the devices and programs of a test exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Looks at what a test has broken, until that is found."""
+"""Run the doctor until it finds a fault that a test made."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _FAR_TOO_BUSY = 4.0  # programs that want to run, for each processor
 
 
 def looked(seconds: float = SHORT_S) -> Evidence:
-    """What is seen of the namespace of this test."""
+    """Return the evidence of the namespace of this test."""
     return look(Namespace(), seconds)
 
 
 def found(seconds: float = SHORT_S) -> tuple[Finding, ...]:
-    """What is found in it."""
+    """Return the findings."""
     return examine(looked(seconds)).findings
 
 
@@ -57,5 +57,5 @@ def nothing_found(run_and_look: Callable[[], Sequence[Finding]]) -> None:
 
 
 def of(area: str, words: str) -> Callable[[Finding], bool]:
-    """Whether a finding is of an area and has some words in what it says."""
+    """Return a test of a finding: its area, and words in its text."""
     return lambda finding: finding.area == area and words in finding.what

@@ -145,7 +145,7 @@ def ill_recording(seen: Evidence) -> Evidence:
 
 @pytest.fixture
 def everything() -> list[Examination]:
-    """What is found where everything is wrong, live and recorded, with drivers of several types and buses."""
+    """The findings with every fault, live and recorded, with drivers of several types and buses."""
     structure = placed_structure()
     assert structure.geometry is not None
     structure.geometry.position_m[1], structure.geometry.position_m[5] = structure.geometry.position_m[0], float("nan")

@@ -86,7 +86,7 @@ def test_it_changes_nothing_and_is_no_reader(namespace: Namespace) -> None:
 
 @pytest.mark.parametrize("module", [buses, files, machine, patches, programs, taxels])
 def test_every_link_leads_to_a_section_that_is_there(module: Any) -> None:
-    """Whatever a module may say: the links stand in it as texts."""
+    """The links are texts in the module."""
     source = Path(module.__file__).read_text()
     links = set(re.findall(r'"([a-z0-9/-]+\.md(?:#[a-z0-9-]+)?)"', source))
     assert links

@@ -1,4 +1,4 @@
-"""Whatever is in frames, ``skin-doctor`` looks at it."""
+"""``skin-doctor`` examines snapshots with any contents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``skin-doctor`` finds of drivers that run: nothing where nothing is wrong, and each fault where it was made."""
+"""``skin-doctor`` with running drivers: it finds each fault that was made, and no others."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_board_that_dies(skins: Skins) -> None:
     finding = found_until(of("patches", "board 8 fell silent"))
     assert (finding.severity, finding.see) == (Severity.ERROR, "reference/faults.md#patches")
     assert "1 of 2 patches are live" in finding.evidence
-    assert finding.commands == ("skin-info skin", "skin-find bus0")  # of a driver whose type nobody knows
+    assert finding.commands == ("skin-info skin", "skin-find bus0")  # the type of the driver is unknown
 
 
 def test_a_board_that_never_answered() -> None:
@@ -137,7 +137,7 @@ def test_a_board_that_moves_its_baseline_because_a_triangle_does_not_acknowledge
     skins("roboskin", boards=(7,), pattern="idle", no_ack=("7/2",), no_ack_after_cycles=1)
     finding = found_until(of("taxels", "doubtful"))
     assert finding.what.startswith("192 sensors")
-    assert finding.commands == ("skin-info skin",)  # of a driver whose type nobody knows
+    assert finding.commands == ("skin-info skin",)  # the type of the driver is unknown
 
 
 @pytest.mark.parametrize("status", [Status.NO_ACK, Status.NOT_CONNECTED, Status.OUT_OF_RANGE, Status.SUSPECT])
@@ -327,7 +327,7 @@ def test_times_that_cannot_be() -> None:
 
 
 def test_a_driver_that_is_late() -> None:
-    """One that gets no processor: its periods begin late, and what it publishes is old."""
+    """Without processor time, its periods begin late, and its data is old when it is published."""
     skin = FakeSkin()
     with publishing(skin, rate_hz=50) as late:
         commit = late.writer.commit

@@ -1,4 +1,4 @@
-"""Whole rows and columns of matrices of which nothing good comes are named as such."""
+"""Rows and columns of matrices without a good taxel are named."""
 
 from __future__ import annotations
 

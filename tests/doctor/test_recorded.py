@@ -1,4 +1,4 @@
-"""What ``skin-doctor`` finds in recordings, from the file alone."""
+"""``skin-doctor`` with recordings, from the file alone."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
 
 
 def test_taxels_that_are_noisy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Judged from the file alone: one taxel of a quiet skin rustles, in 25 s that are told in one."""
+    """From the file alone: one taxel of a quiet skin is noisy for 25 s, recorded in one."""
     monkeypatch.setattr(recorded, "_LOOK_EVERY_NS", 0)
     file = tmp_path / "walk.mcap"
     skin = FakeSkin("torso", fake_structure(1, 4))

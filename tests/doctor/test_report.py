@@ -1,4 +1,4 @@
-"""The report to attach to an issue: readable, and without what is nobody's business."""
+"""The report to attach to an issue: readable, and without secrets."""
 
 from __future__ import annotations
 

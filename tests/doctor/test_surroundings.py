@@ -1,4 +1,4 @@
-"""What ``skin-doctor`` finds round a skin: interfaces and ports, the machine, namespaces, programs."""
+"""``skin-doctor`` beside the skin: interfaces and ports, the machine, namespaces, programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.finding.fakes import FakeMachine, add_interface, ip_link, write
 
 
 def evidence(**changes: object) -> Evidence:
-    """Of a machine on which nothing is wrong, and then something."""
+    """Return the evidence of a machine without faults, with some changes."""
     return dataclasses.replace(looked(0.0), **changes)  # type: ignore[arg-type]
 
 

@@ -30,7 +30,7 @@ def nothing_else(namespace: Namespace, tmp_path: Any, monkeypatch: pytest.Monkey
 
 
 def found_on(bus: str, *, probe: bool, drivers: tuple[str, ...] = ("inspire",)) -> dict[str, Any]:
-    """What is told of a bus."""
+    """Return the output on a bus."""
     (found,) = asyncio.run(look((bus,), 0.1, probe=probe, driver_names=drivers))["buses"]
     return dict(found)
 

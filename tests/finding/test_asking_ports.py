@@ -1,4 +1,4 @@
-"""Who answers on a serial port: emulated devices behind pseudo terminals, each asked by all drivers that ask."""
+"""Asking on serial ports: emulated devices behind pseudo terminals, each asked by all drivers that ask."""
 
 from __future__ import annotations
 

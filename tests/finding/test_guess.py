@@ -1,4 +1,4 @@
-"""Layouts held against what was heard."""
+"""Layouts are compared with frames that were heard."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Everything(CanAdapter[NoOptions]):
 
 
 class Long(CanAdapter[NoOptions]):
-    """29-bit identifiers and a constant far behind what classic frames have."""
+    """29-bit identifiers, and a constant beyond the end of classic frames."""
 
     types = (PRESSURE,)
     layout = Layout(
@@ -58,7 +58,7 @@ class NeedsOptions(CanAdapter[msgspec.Struct]):
 
 
 class FindsOut(CanAdapter[NoOptions]):
-    """Knows its layout only when its hardware told it."""
+    """It learns its layout from its hardware."""
 
     types = (PRESSURE,)
 

@@ -1,4 +1,4 @@
-"""Listening and asking, on emulated boards: who is found, and what is (not) sent to whom."""
+"""Listening and asking, on emulated boards: the boards that are found, and the frames that are sent."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def board_sets(*rows: str) -> str:
 
 
 class Made:
-    """A folder of files, and what became of them."""
+    """A folder of files, and the result of their import."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

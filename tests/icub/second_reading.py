@@ -1,7 +1,7 @@
-"""A robot's files read a second time, by other means: what its boards are told, and where its taxels are.
+"""A robot's files are read a second time, by other means: set-ups of its boards, and places of its taxels.
 
-Written from what the files mean (protocol notes and robotology's documentation), with ElementTree and no code of
-``skinware_drivers.icub``: what both agree on is not one author's mistake. It reads good files only.
+Written from protocol notes and robotology's documentation, with ElementTree and no code of
+``skinware_drivers.icub``: if both agree, a mistake of one author is unlikely. It reads good files only.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Hand(CanAdapter[NoOptions]):
 
 
 class TaringHand(Hand):
-    """One that can be told to tare.
+    """A hand that can tare.
 
     Attributes:
         on_tare: does it.
@@ -68,7 +68,7 @@ class TaringHand(Hand):
 
     @operation()
     async def tare(self, link: Link, patches: object) -> None:
-        """Take what is felt now for nothing."""
+        """Take the present values as zero."""
         self.on_tare()
 
 
@@ -109,7 +109,7 @@ class EmulatedHand(Emulator[EmulatorOptions]):
 
 @dataclass
 class PressingPerson:
-    """Does at once what it is asked for, but for what it does not want.
+    """Do each step at once, without those to skip or ignore.
 
     Attributes:
         skipped: modules that it leaves out.

@@ -1,4 +1,4 @@
-"""Captures, decoded again: what is equal, and the first thing that is not."""
+"""Captures are decoded again: equal values, and the first difference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""skin-prove: a program does what it asks for, line by line, and the files that it leaves."""
+"""skin-prove with a program that does each step, and the files that it writes."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def is_there(pid: int) -> bool:
     ],
 )
 def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted: str, number: int) -> None:
-    """Twice, as an impatient person does. There is a report of what was seen, which counts, and nothing goes on."""
+    """Interrupted twice, it ends with a report of the checks so far."""
     stem = tmp_path / "proof"
     with publishing(FakeSkin("hand", MATRICES)) as skin, contextlib.ExitStack() as beside:
         rest = skin.values = STRUCTURE.sensor_uid * 0 + REST
@@ -200,7 +200,7 @@ def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Pa
 
 @pytest.mark.thorough
 def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(tmp_path: Path) -> None:
-    """What was seen until then is shown, whatever became of the files."""
+    """The checks so far are shown, even if the files cannot be written."""
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = STRUCTURE.sensor_uid * 0 + REST
         own = ("--json", "--rest", "0.5", "--wait", "60", "-o", str(tmp_path / "proof"))

@@ -1,4 +1,4 @@
-"""The walk over an emulated hand, pressed by a test that does what it is asked for; planted faults are found."""
+"""The walk over an emulated hand, which a test presses as asked; planted faults are found."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_nobody_presses_anything() -> None:
 
 
 def tared(on_tare: Callable[[EmulatedHand], None], **more: Any) -> Check:
-    """What is said of taring, by a person who presses nothing."""
+    """Return the check of taring, with a person who presses nothing."""
     manner: dict[str, Any] = {"patience_s": 0.1, "only": ["index"], "with_tare": True} | more
     skipped = manner.pop("skipped", [])
     person = PressingPerson(ignored=["press"], skipped=skipped)

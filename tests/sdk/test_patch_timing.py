@@ -11,13 +11,15 @@ from skinware.memory.statistics import BUCKETS, Histogram
 from skinware_drivers.running.publisher import PatchTiming
 from tests.cli.fake_skin import fake_structure
 from tests.sdk.driving import driving, emulated, read_until
+from tests.specification.publishing import count_timing
 
 times = st.integers(-10, 2**40) | st.sampled_from([0, 1, 2, 2**20 - 1, 2**20, 2**30, 2**31 - 1, 2**31, 2**50])
 
 
 @given(st.lists(st.tuples(st.lists(st.booleans(), min_size=6, max_size=6), times, times), max_size=30))
 def test_as_many_and_where_the_plain_way_puts_them(frames: list[tuple[list[bool], int, int]]) -> None:
-    timing = PatchTiming(fake_structure(2, 3))
+    structure = fake_structure(2, 3)
+    timing, group_patch = PatchTiming(structure), structure.group_patch.astype(np.intp)
     ages = [Histogram() for _ in range(2)]
     intervals = [Histogram() for _ in range(2)]
     shown_ns, before_ns = np.full(6, 10**15, np.int64), np.zeros(6, np.int64)
@@ -25,7 +27,7 @@ def test_as_many_and_where_the_plain_way_puts_them(frames: list[tuple[list[bool]
         flags = np.array(updated)
         shown_ns[flags] += step_ns
         time_ns = int(shown_ns.max()) + age_ns
-        timing.count(flags, shown_ns.copy(), time_ns)
+        count_timing(timing, group_patch, flags, shown_ns.copy(), time_ns)
         for module in np.flatnonzero(flags).tolist():
             ages[module // 3].add(time_ns - int(shown_ns[module]))
             if before_ns[module]:

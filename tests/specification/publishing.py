@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.memory.statistics import BUCKETS
 from skinware.realtime import now_ns
 from skinware.status import PatchState, Status
 from skinware_drivers.decoding.skin_state import Updates
-from skinware_drivers.running.publisher import NEVER_NS, Publisher
+from skinware_drivers.running.publisher import NEVER_NS, PatchTiming, Publisher
 from tests.specification.bursts import Bursts
 
 _STALE = np.uint8(Status.STALE)
@@ -80,7 +81,8 @@ class SpecifiedPublisher(Publisher):
         state, time_ns = self.state, now_ns()
         if self._wanted(time_ns):
             self._write(time_ns)
-        state.begin_frame()
+        state.updated[:] = False
+        state.touched[:] = False
         self._due_ns = self._not_before_ns = 0
         self._last_published_ns = time_ns
 
@@ -96,7 +98,7 @@ class SpecifiedPublisher(Publisher):
 
     def _write(self, time_ns: int) -> None:
         state = self.state
-        self.timing.count(state.updated & state.is_prompt, state.group_time_ns, time_ns)
+        count_timing(self.timing, state.group_patch, state.updated & state.is_prompt, state.group_time_ns, time_ns)
         columns = self.writer.begin()
         columns["values"][:] = state.values
         columns["module_time_ns"][:] = state.module_time_ns
@@ -175,3 +177,31 @@ class SpecifiedPublisher(Publisher):
             np.bitwise_or(self.state.status, bits.take(self._sensor_group), out=status)
         else:
             status[:] = self.state.status
+
+
+def count_timing(
+    timing: PatchTiming,
+    group_patch: npt.NDArray[np.intp],
+    updated: npt.NDArray[np.bool_],
+    group_time_ns: npt.NDArray[np.int64],
+    time_ns: int,
+) -> None:
+    """Count what a frame shows for the first time.
+
+    Args:
+        timing: where it is counted.
+        group_patch: (n_groups,) the patch of each group.
+        updated: (n_groups,) bool.
+        group_time_ns: (n_groups,) int64, stamps of what the frame shows.
+        time_ns: when it is published.
+    """
+    group = np.flatnonzero(updated)
+    again = np.flatnonzero(updated & (timing.before_ns > 0))
+    for histograms, groups, times_ns in (
+        (timing.intervals, again, group_time_ns[again] - timing.before_ns[again]),
+        (timing.ages, group, time_ns - group_time_ns[group]),
+    ):
+        # the exponent of a number of nanoseconds is its length in bits, which is its bucket
+        bucket = np.frexp(np.maximum(times_ns, 0).astype(np.float64))[1].astype(np.intp)
+        np.add.at(histograms, (group_patch[groups], np.minimum(bucket, BUCKETS - 1)), 1)
+    timing.before_ns[group] = group_time_ns[group]

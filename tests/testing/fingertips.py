@@ -133,12 +133,12 @@ class Counting(Fingertips):
 
     @property
     def layout(self) -> Layout:  # type: ignore[override]
-        """Halves are told apart by the lower half of the first byte."""
+        """The lower half of the first byte distinguishes the halves."""
         frames = [replace(f, when=[f.when[0], Byte(0, n, 0xF)]) for n, f in enumerate(layout().frames)]
         return Layout(frames, Cycle(["proximal", "distal"], maximum_age_s=0.01, counter=self.counter))
 
 
-# Wrong in what frames mean
+# Errors in the layout
 
 
 class CountsPressures(Counting):
@@ -238,7 +238,7 @@ class AnyLength(Fingertips):
     )
 
 
-# Wrong in what there is
+# Errors in the description
 
 
 class MissingModule(Fingertips):

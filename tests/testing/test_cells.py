@@ -1,4 +1,4 @@
-"""The suite on many modules: ranges of each channel, shifted keys, samples of what was not taken."""
+"""The suite on many modules: ranges of each channel, shifted keys, samples of unused frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The suite finds what is wrong with a driver, and says it in words that name the defect."""
+"""The suite finds the defects of a driver, and names them in words."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class TestCounting(DriverConformance):
 
 @pytest.fixture
 def tidy() -> Iterator[None]:
-    """Ends what wrong drivers leave behind."""
+    """End the threads and tasks that defective drivers leave."""
     f.Hangs.go_on.clear()
     f.Computes.enough.clear()
     f.LeaksThreads.end.clear()

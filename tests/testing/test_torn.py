@@ -1,4 +1,4 @@
-"""The suite sees torn bursts where they are shown, and none where halves are told apart."""
+"""The suite finds torn bursts, and none if halves can be distinguished."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def recording_of(adapter: AnyAdapter, wire: Wire, time_ns: npt.NDArray[np.int64]
 
 
 def fingertips(counter: SequenceNumber | None = None) -> Recording:
-    """Ten bursts of two frames; the number of the burst is in byte 0, beside the bit that tells the halves apart."""
+    """Ten bursts of two frames; the number of the burst is in byte 0, beside the bit that distinguishes the halves."""
     adapter = Fingertips(NoOptions())
     bursts = BURSTS + 2
     wire = np.zeros(2 * bursts, wire_dtype(8))

@@ -25,7 +25,7 @@ class Declared(Fingertips):
 
 
 class AsksFirst(Fingertips):
-    """Its patches are what its devices say."""
+    """It learns its patches from its devices."""
 
     patches = ()
 

@@ -1,4 +1,4 @@
-"""A test of a wrong driver ends soon, says what it saw, and the telling ones come first."""
+"""A test of a defective driver ends soon and says what it saw; tests of values come first."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_it_waits_for_seconds_not_for_frames_and_says_what_it_saw() -> None:
 
 @pytest.mark.thorough
 def test_values_are_tested_first_and_silence_last() -> None:
-    """So that with ``pytest -x`` the byte order is told, and not a silence that comes of it."""
+    """With ``pytest -x``, the byte order is reported, and not a silence that follows from it."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", test_cells.__file__]
     told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     names = [line.rpartition("::")[2] for line in told.splitlines() if "::TestCells::" in line]

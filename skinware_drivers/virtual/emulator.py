@@ -1,12 +1,13 @@
 """The base class of emulators of small devices.
 
 A subclass declares its devices, the commands that they obey, and the frames that they send with given values; see
-:class:`Emulator`. The values that are felt come from here, time, power and faults from :mod:`.stage`. Emulators share
-no code and no table with the drivers that they are there to test.
+:class:`Emulator`. The touch of a wandering finger is here, by time and seed alone; time, power and faults are in
+:mod:`.stage`. Emulators share no code and no table with the drivers that they test.
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from typing import ClassVar, Literal
@@ -17,7 +18,6 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.press import Press
 from skinware_drivers.virtual.stage import DATA, Actor, Device, OptionsT, Stage
 
 CanFrame = tuple[int, bytes]
@@ -26,6 +26,40 @@ Source = Callable[[int, int], Sequence[int]]
 """(number of the device, number of its burst) -> the values that it sends, instead of felt ones."""
 
 _FOREIGN_IDENTIFIERS = 40
+_PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
+_PRESSES, _REST_S = 6, 6.0
+"""Presses in a row, and the rest after them, in which a baseline can begin."""
+_RADIUS = 0.22
+"""Radius of the pressed spot; the device is 1 wide."""
+
+
+class Press:
+    """A wandering press on one device.
+
+    Args:
+        seed: of the emulation.
+        number: of the device; devices with other numbers feel other presses.
+        places: (n, 2) of its sensors, 0 to 1.
+    """
+
+    def __init__(self, seed: int, number: int, places: npt.NDArray[np.float64]) -> None:
+        random = np.random.default_rng([seed, number, 3])
+        self._phase = random.uniform(0, 9)
+        self._first_s = random.uniform(0, _PAUSE_S)
+        self._places = places
+
+    def strength(self, time_s: float) -> npt.NDArray[np.float64]:
+        """Return (n,) strengths, 0 to 1, at a time since the device began to send."""
+        since_s = time_s - self._first_s
+        in_round_s = since_s % (_PRESSES * (_PRESS_S + _PAUSE_S) + _REST_S)
+        is_pressing = since_s > 0 and in_round_s < _PRESSES * (_PRESS_S + _PAUSE_S)
+        moment_s = in_round_s % (_PRESS_S + _PAUSE_S)
+        ramp = min(max(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0.0), 1.0) if is_pressing else 0.0
+        at = time_s + self._phase
+        centre = 0.5 + 0.4 * np.array([math.sin(0.71 * at), math.sin(0.53 * at + 1)])
+        distance2 = ((self._places - centre) ** 2).sum(axis=1)
+        strength: npt.NDArray[np.float64] = ramp * np.exp(distance2 * (-0.5 / _RADIUS**2))
+        return strength
 
 
 class Emulator(Stage[OptionsT]):
@@ -66,7 +100,7 @@ class Emulator(Stage[OptionsT]):
 
     @abstractmethod
     def places(self) -> npt.NDArray[np.float64]:
-        """Return (n, 2) places of a device's n values, 0 to 1; see :func:`.press.on_a_grid`."""
+        """Return (n, 2) places of a device's n values, 0 to 1; see :func:`on_a_grid`."""
 
     @abstractmethod
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
@@ -168,3 +202,11 @@ def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDAr
     if numbers.shape not in ((), (n_values,)):
         raise ConfigurationError(f"{name} has {numbers.size} numbers, `places` has {n_values} values")
     return np.broadcast_to(numbers, n_values)
+
+
+def on_a_grid(count: int, columns: int, each: int = 1) -> npt.NDArray[np.float64]:
+    """Return (count * each, 2) places of sensors in rows, with ``each`` at the same place."""
+    number = np.arange(count)
+    rows = -(-count // columns)
+    places = np.stack([(number % columns + 0.5) / columns, (number // columns + 0.5) / rows], axis=1)
+    return np.repeat(places, each, axis=0)

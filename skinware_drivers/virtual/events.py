@@ -33,27 +33,27 @@ EventName = Literal[
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """One event; as a JSON line it has the fields of its kind.
 
-    =====================  =============================================================================================
-    event                  meaning, and fields besides ``time_ns``
-    =====================  =============================================================================================
-    ``frame_fault``        a data frame was damaged: board, cycle, position, identifier, fault, payload; of a half of a
-                           triangle also triangle, half
-    ``lost_half``          no program received a half of a triangle: board, triangle, cycle, half, reason (``random``,
-                           ``overflow`` of the board's queue, ``died``, ``restarted``)
-    ``wrong_length``       a half of a triangle had a wrong ``length``: board, triangle, cycle, half, length
-    ``burst_delayed``      a burst began ``delay_ns`` late, the next one on time: board, cycle, delay_ns
-    ``board_died``         the board sends and hears nothing from now on: board
-    ``board_restarted``    the board lost power for a moment and is deaf until ``ready_ns``: board, ready_ns
-    ``board_silenced``     a discovery silenced a streaming MTB3, as it does to real ones: board
-    ``error_reported``     a device reported an error (CANopen EMCY), or with code 0 its end: board, code
-    ``recalibrated``       a board took new baselines, so that values jump: board, cycle (the first with them), reason
-                           (``power_up``, ``command``, ``no_ack``)
-    ``triangle_fault``     a triangle changed: board, triangle, cycle (the first that shows it), fault (``unplugged``,
-                           ``plugged_in``, ``no_ack``, ``ack``)
-    ``taxel_out_of_range`` a taxel is broken from power-up on: board, triangle, taxel
-    ``foreign_frame``      another device on the bus sent a frame: identifier, length
-    ``command_received``   boards obeyed or answered a frame of the host: identifier, payload, boards
-    =====================  =============================================================================================
+    ======================  ============================================================================================
+    event                   meaning, and fields besides ``time_ns``
+    ======================  ============================================================================================
+    ``frame_fault``         a data frame was damaged: board, cycle, position, identifier, fault, payload; for a half of
+                            a triangle also triangle, half
+    ``lost_half``           no program received a half of a triangle: board, triangle, cycle, half, reason (``random``,
+                            ``overflow`` of the board's queue, ``died``, ``restarted``)
+    ``wrong_length``        a half of a triangle had a wrong ``length``: board, triangle, cycle, half, length
+    ``burst_delayed``       a burst began ``delay_ns`` late, the next one on time: board, cycle, delay_ns
+    ``board_died``          the board sends and hears nothing from now on: board
+    ``board_restarted``     the board lost power for a moment and is deaf until ``ready_ns``: board, ready_ns
+    ``board_silenced``      a discovery silenced a streaming MTB3, as it does to real ones: board
+    ``error_reported``      a device reported an error (CANopen EMCY), or with code 0 its end: board, code
+    ``recalibrated``        a board took new baselines, so that values jump: board, cycle (the first with them), reason
+                            (``power_up``, ``command``, ``no_ack``)
+    ``triangle_fault``      a triangle changed: board, triangle, cycle (the first that shows it), fault (``unplugged``,
+                            ``plugged_in``, ``no_ack``, ``ack``)
+    ``taxel_out_of_range``  a taxel is broken from power-up on: board, triangle, taxel
+    ``foreign_frame``       another device on the bus sent a frame: identifier, length
+    ``command_received``    boards obeyed or answered a frame of the host: identifier, payload, boards
+    ======================  ============================================================================================
 
     Attributes:
         event: its kind.

@@ -173,7 +173,7 @@ def test_a_writer_counts_its_publications() -> None:
         assert (told.published, told.before_boot, told.ahead) == (6, 2, 1)
         assert told.wall.count == told.cpu.count == told.age.total == 6
         assert told.age.counts[0] >= 1  # what is newer than its publication
-        assert told.age.counts[22] + told.age.counts[23] >= 1  # 3 ms, if the machine did not stand still
+        assert sum(told.age.counts[22:]) >= 1  # 3 ms, and what the machine stood still
         assert 0 < told.wall.best_ns <= told.wall.mean_ns <= told.wall.worst_ns
         assert 0 <= told.cpu.best_ns <= told.cpu.worst_ns <= told.cpu.total_ns
         words = reader._ring._slot_words[6 % 3]
@@ -197,9 +197,13 @@ def test_a_signal_ends_a_wait(way: str) -> None:
             take = taking(reader, way)
             publish(writer, 1)
             take()
-            signal.setitimer(signal.ITIMER_REAL, 0.02)
-            with pytest.raises(Rang):
+
+            def wait() -> None:
+                signal.setitimer(signal.ITIMER_REAL, 0.02)  # it may ring before the wait begins
                 take()
+
+            with pytest.raises(Rang):
+                wait()
             publish(writer, 2)
             frame = taking(reader, way)()  # a generator that raised is over
             assert is_whole(frame, 2)

@@ -138,7 +138,7 @@ def test_health_that_does_not_fit_is_begun_anew(
         LearnedState(path, skin.health).restore(skin.chain)
         skin.go_on(PERIOD_NS)
         assert skin.health.faulty == 0
-    assert ("what was learned is lost" in caplog.text) == (damage != "of another scale")
+    assert ("the learned state does not fit" in caplog.text) == (damage != "of another scale")
 
 
 def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace) -> None:
@@ -216,7 +216,7 @@ def test_services_of_another_kind_or_form_are_refused(into: Namespace) -> None:
     columns = {name: (dtype, (n,)) for name, (dtype, _) in COLUMNS.items()}
     with (
         HealthWriter(fake_structure(), "fake", namespace=into),
-        pytest.raises(BadServiceFile, match="none of contacts"),
+        pytest.raises(BadServiceFile, match="not of kind 'contacts'"),
     ):
         ContactsReader("health", namespace=into)
     for wrong in (

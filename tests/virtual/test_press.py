@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skinware_drivers.virtual import on_a_grid
-from skinware_drivers.virtual.press import Press
+from skinware_drivers.virtual.emulator import Press
 
 
 def test_a_device_is_touched_and_then_rests_for_longer_than_a_baseline_takes() -> None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
-from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
+from skinware_drivers.virtual.devices.weiss_wts import BEGIN, crc, cut_commands
 
 _OK, _WRONG = 0, 1
 

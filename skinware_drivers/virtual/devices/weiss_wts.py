@@ -1,4 +1,4 @@
-"""An emulated WTS tactile sensor of Weiss Robotics.
+"""An emulated WTS tactile sensor of Weiss Robotics, and the checksum and commands of that maker.
 
 Source: the programs wts_driver and wts_ft; the vectors in tests/serial/test_weiss_wts.py.
 """
@@ -13,11 +13,39 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
-from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
+from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
+BEGIN = b"\xaa\xaa\xaa"
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
 _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
+
+
+def crc(data: bytes) -> int:
+    """Return the checksum bit by bit: the polynomial of the CCITT, shifted the other way."""
+    state = 0xFFFF
+    for byte in data:
+        entry = ((state ^ byte) & 0xFF) << 8
+        for _ in range(8):
+            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
+        state = entry ^ state >> 8
+    return state
+
+
+def cut_commands(heard: bytes, *, bare_when_empty: bool = False) -> tuple[list[bytes], bytes]:
+    """Return the whole commands, by the length in each, and the rest.
+
+    Args:
+        heard: bytes of the line.
+        bare_when_empty: a command without payload has no checksum.
+    """
+
+    def size(part: bytes) -> int:
+        if len(part) < 6:
+            return 0
+        length = int.from_bytes(part[4:6], "little")
+        return 8 + length if length or not bare_when_empty else 6
+
+    return cut_packets(heard, BEGIN, size)
 
 
 def message(command: int, payload: bytes) -> bytes:

@@ -21,17 +21,9 @@ from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
-from skinware.state import (
-    bus_reason_name,
-    bus_state_name,
-    life_of,
-    patch_ages_ns,
-    patch_state_name,
-    rate_now_hz,
-    status_now,
-    untouched,
-)
+from skinware.state import DriverReport, life_of, rate_now_hz, report_of
 from skinware.status import DataPath, load_report
+from skinware.structure import Structure
 from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
@@ -184,6 +176,7 @@ def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
 
 def _skin(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> dict[str, Any]:
     structure = driver.structure
+    report = report_of(driver, frame, life=life)
     return {
         "driver_type": driver.driver_type,
         "dtype": structure.dtype.name,
@@ -196,55 +189,50 @@ def _skin(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> dict
             {"name": t.name, "sensors": int((structure.sensor_type == t.id).sum()), "unit": t.unit}
             for t in structure.types
         ],
-        "buses": _buses(driver, frame),
-        "patch_list": _patches(driver, frame, life),
+        "buses": _buses(structure, frame, report),
+        "patch_list": _patches(structure, frame, report),
     }
 
 
-def _buses(driver: DriverReader, frame: DriverSnapshot | None) -> list[dict[str, Any]]:
+def _buses(structure: Structure, frame: DriverSnapshot | None, report: DriverReport) -> list[dict[str, Any]]:
     if frame is None:
-        return [{"name": name, "state": None} for name in driver.structure.buses]
+        return [{"name": name, "state": None} for name in structure.buses]
     time_ns = now_ns()
     entries = []
-    for bus, counters in enumerate(driver.bus_counters(frame)):
-        since_ns = int(frame.bus_since_ns[bus])
+    for at, bus in enumerate(report.buses):
+        since_ns = int(frame.bus_since_ns[at])
         own = {
-            "name": frame.structure.buses[bus],
-            "state": bus_state_name(int(frame.bus_state[bus])),
-            "reason": bus_reason_name(int(frame.bus_reason[bus])),
+            "name": bus.name,
+            "state": bus.state,
+            "reason": bus.reason,
             "state_age_s": round((time_ns - since_ns) / NS_PER_S, 3) if since_ns else None,
-            **load_report(int(frame.bus_load[bus])),
-            "data_path": DataPath(int(frame.bus_data_path[bus])).name.lower(),
-            "samples": sample_report(frame.bus_samples[bus]),
+            **load_report(int(frame.bus_load[at])),
+            "data_path": DataPath(int(frame.bus_data_path[at])).name.lower(),
+            "samples": sample_report(frame.bus_samples[at]),
         }
-        entries.append(_with_counters(own, counters))
+        entries.append(_with_counters(own, bus.counters))
     return entries
 
 
-def _patches(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> list[dict[str, Any]]:
-    structure = driver.structure if frame is None else frame.structure
-    modules = np.bincount(structure.module_patch, minlength=structure.n_patches).tolist()
-    patch_sensors = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
-    entries: list[dict[str, Any]] = [
-        {"name": name.decode(), "bus": structure.buses[bus], "state": None, "age_ms": None}
-        for name, bus in zip(structure.patch_name.tolist(), structure.patch_bus.tolist(), strict=True)
-    ]
-    for patch, entry in enumerate(entries):
-        entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0, "untouched": 0}
+def _patches(structure: Structure, frame: DriverSnapshot | None, report: DriverReport) -> list[dict[str, Any]]:
+    modules, sensors = (
+        np.bincount(patches, minlength=structure.n_patches).tolist()
+        for patches in (structure.module_patch, structure.sensor_patch)
+    )
+    entries: list[dict[str, Any]] = []
+    for at, (name, bus) in enumerate(zip(structure.patch_names, structure.patch_bus.tolist(), strict=True)):
+        entry = {"name": name, "bus": structure.buses[bus], "state": None, "age_ms": None}
+        entries.append(entry | {"modules": modules[at], "sensors": sensors[at], "fresh": 0, "untouched": 0})
     if frame is None:
         return entries
-    is_fresh = status_now(life, frame) == 0
-    fresh = np.bincount(structure.sensor_patch[is_fresh], minlength=structure.n_patches).tolist()
-    dark = np.bincount(structure.sensor_patch[untouched(frame)], minlength=structure.n_patches).tolist()
-    for patch, (entry, age_ns) in enumerate(zip(entries, patch_ages_ns(frame), strict=True)):
-        entry["state"] = patch_state_name(int(frame.patch_state[patch]))
-        entry["age_ms"] = None if age_ns is None else round(age_ns / 1e6, 3)
-        entry["fresh"], entry["untouched"] = fresh[patch], dark[patch]
-        entry["interval"] = _histogram(Histogram(frame.patch_interval_counts[patch].tolist()))
-        entry["age"] = _histogram(Histogram(frame.patch_age_counts[patch].tolist()))
-    return [
-        _with_counters(entry, counters) for entry, counters in zip(entries, driver.patch_counters(frame), strict=True)
-    ]
+    for at, (entry, patch) in enumerate(zip(entries, report.patches, strict=False)):  # none while the structure changes
+        entry["state"] = patch.state
+        entry["age_ms"] = None if patch.age_ns is None else round(patch.age_ns / 1e6, 3)
+        entry["fresh"], entry["untouched"] = patch.fresh, patch.untouched
+        entry["interval"] = _histogram(Histogram(frame.patch_interval_counts[at].tolist()))
+        entry["age"] = _histogram(Histogram(frame.patch_age_counts[at].tolist()))
+        entries[at] = _with_counters(entry, patch.counters)
+    return entries
 
 
 def _with_counters(own: dict[str, Any], counters: dict[str, int]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.text import NO_VALUE, age_text, count_text, plural, rate_text, state_shown, table
+from skinware.text import NO_VALUE, age_text_ms, count_text, plural, rate_text, state_shown, table
 
 if TYPE_CHECKING:
     from skinware.bridge import Watcher
@@ -232,20 +232,17 @@ def _rows_of(robot: dict[str, Any], has_namesakes: bool) -> list[tuple[str, ...]
         f"{robot['robot']} ({robot.get('host') or '?'}, {robot['instance'][:8]})" if has_namesakes else robot["robot"]
     )
     clock = robot["clock"]
-    error = NO_VALUE if clock is None else f"± {age_text(clock['error_ms'] * 1e6)}"
+    error = NO_VALUE if clock is None else f"± {age_text_ms(clock['error_ms'])}"
     nothing = (NO_VALUE,) * 6
     if not robot.get("drivers"):
         return [(called, NO_VALUE, robot["state"], *nothing, error)]
-    return [
-        (called, name, _state_of(robot, driver), *_figures_of(driver), error)
-        for name, driver in robot["drivers"].items()
-    ]
-
-
-def _state_of(robot: dict[str, Any], driver: dict[str, Any]) -> str:
-    if robot["state"] != "live":
-        return f"was {driver['state']}"
-    return state_shown(driver["state"], driver["fresh"], driver["sensors"])
+    rows = []
+    for name, driver in robot["drivers"].items():
+        state = f"was {driver['state']}"
+        if robot["state"] == "live":
+            state = state_shown(driver["state"], driver["fresh"], driver["sensors"])
+        rows.append((called, name, state, *_figures_of(driver), error))
+    return rows
 
 
 def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
@@ -253,7 +250,7 @@ def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
     more = driver["n_silent"] - len(driver["silent"])
     return (
         rate_text(driver["rate_hz"]),
-        age_text(None if driver["age_ms"] is None else driver["age_ms"] * 1e6),
+        age_text_ms(driver["age_ms"]),
         f"{count_text(driver['fresh'])} of {count_text(driver['sensors'])}",
         count_text(driver["lost"]),
         f"{names} and {more} more" if more else names or NO_VALUE,

@@ -9,6 +9,7 @@ Measurements", 1999). Late frames do not move it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from itertools import pairwise
 from typing import Any
@@ -110,7 +111,9 @@ class DeviceClock:
         self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
         np.maximum.accumulate(np.maximum(times_ns, self._last_ns), out=times_ns)
         np.minimum(times_ns, received, out=times_ns)
-        if self._is_far_behind():
+        # the newest whole part shows that the clock stands still
+        _, x, y = self._points[-2] if len(self._points) > 1 else (0, 0.0, -math.inf)
+        if y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS:
             self.stops += 1
             self._stamp = -1  # the next one restarts the clock
             times_ns = received.copy()
@@ -171,13 +174,6 @@ class DeviceClock:
         oldest = self._points[-1][0] - self._window_parts
         recent = [point for point in list(self._points)[-_RECENT_PARTS:] if point[0] > oldest]
         self._offset_ns = min(y - self._slope * x for _, x, y in recent)
-
-    def _is_far_behind(self) -> bool:
-        """Return whether the newest whole part shows that the clock stands still."""
-        if len(self._points) < 2:
-            return False
-        _, x, y = self._points[-2]
-        return y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS
 
     def _fit_slope(self) -> None:
         whole = list(self._points)[:-1]  # the best point of the newest part may be yet to come

@@ -43,8 +43,7 @@ import msgspec
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.limits import LIMITS, read_json, unpack
 from skinware.memory.ring import Sample
-from skinware.tactile.choosing import SensorChoice
-from skinware.tactile.regions import Region, Regions
+from skinware.tactile.regions import Region, Regions, SensorChoice
 
 VERSION = 1
 RAW, CODED = 0, 1

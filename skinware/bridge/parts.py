@@ -23,7 +23,7 @@ from skinware.memory.ring import Sample
 from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
-from skinware.tactile.choosing import SensorChoice
+from skinware.tactile.regions import SensorChoice
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _KEPT_NS = 10 * NS_PER_S

@@ -1,9 +1,9 @@
-"""What all commands share: how they end, one clear line per error, JSON lines, and the common options.
+"""Run commands: exit statuses, one clear line for each error, and the options that several commands have.
 
 A command is a module with a click command and::
 
     def main() -> None:
-        run(command)
+        cli.run(command)
 """
 
 from __future__ import annotations
@@ -14,28 +14,36 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
 from skinware.cli._terminal import Formatter, echo, patient_output
 from skinware.errors import BadRecording, ConfigurationError, SkinwareError
 
+if TYPE_CHECKING:
+    from skinware.tactile.regions import Regions
+
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 """For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
 
+DEFAULT_REGIONS = "regions.toml"
+"""File of regions where none is named, in the current folder."""
+
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
+FILE = click.Path(path_type=Path)
+"""For ``click.option(type=...)``: the path of a file or folder, which need not exist."""
 
 
 def seconds(text: str) -> float:
-    """A time in seconds, 0 or more and finite; for ``click.option(type=...)``.
+    """Return a time in seconds, 0 or more and finite; for ``click.option(type=...)``.
 
     Raises:
-        click.BadParameter: it is not one.
+        click.BadParameter: the text is no such number.
     """
     try:
         number = float(text)
@@ -47,7 +55,7 @@ def seconds(text: str) -> float:
 
 
 def examples(*lines: str) -> str:
-    """Examples for ``click.command(epilog=...)``, which keep their line breaks."""
+    """Return examples for ``click.command(epilog=...)``, with their line breaks."""
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
 
 
@@ -65,7 +73,6 @@ def group_option(command: _Decorated) -> _Decorated:
 
 
 def verbose_option(command: _Decorated) -> _Decorated:
-    """``--verbose``, for :func:`log_to_stderr`."""
     return click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")(command)
 
 
@@ -84,7 +91,7 @@ def caller_option(command: _Decorated) -> _Decorated:
         "callers",
         multiple=True,
         metavar="NAME",
-        help="Only certificates of this name may call operations (tare ...); repeatable.",
+        help="Only certificates of this name may call operations (tare ...); may be repeated.",
     )(command)
 
 
@@ -96,8 +103,87 @@ def version_option(command: _Decorated) -> _Decorated:
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
 
 
+def type_option(what: str) -> Callable[[_Decorated], _Decorated]:
+    return click.option("--type", "type_name", metavar="TYPE", help=what)
+
+
+def driver_option(command: _Decorated) -> _Decorated:
+    return click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")(command)
+
+
+def duration_option(what: str = "End after SECONDS.") -> Callable[[_Decorated], _Decorated]:
+    """``-T SECONDS``: the command ends by itself after this time."""
+    return click.option("-T", "duration_s", metavar="SECONDS", type=seconds, help=what)
+
+
+def timeout_option(what: str) -> Callable[[_Decorated], _Decorated]:
+    """``-T SECONDS`` or ``--timeout SECONDS``: the command fails after this time without what it waits for."""
+    return click.option("-T", "--timeout", "timeout_s", metavar="SECONDS", type=seconds, help=what)
+
+
+def output_option(
+    what: str, *, name: str = "output", metavar: str = "FILE", required: bool = False, default: str | None = None
+) -> Callable[[_Decorated], _Decorated]:
+    """``-o FILE``: where the command writes."""
+    shown = default is not None
+    return click.option(
+        "-o",
+        "--output",
+        name,
+        metavar=metavar,
+        type=FILE,
+        required=required,
+        default=default,
+        show_default=shown,
+        help=what,
+    )
+
+
+def regions_option(command: _Decorated) -> _Decorated:
+    return click.option(
+        "--regions",
+        "region_files",
+        metavar="FILE",
+        multiple=True,
+        type=FILE,
+        help=f"File with regions; may be repeated.  [default with --region: {DEFAULT_REGIONS}]",
+    )(command)
+
+
+def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
+    """Return the regions of files, or of the default file.
+
+    Args:
+        files: to read; empty: the default one.
+        names: of regions that must be in them.
+
+    Raises:
+        ConfigurationError: a file cannot be read, or a region is missing.
+    """
+    from skinware.tactile.regions import read_regions, unknown
+
+    regions = read_regions(*(files or (DEFAULT_REGIONS,)))
+    for why in unknown("region", names, [region.name for region in regions]):
+        raise ConfigurationError(why)
+    return regions
+
+
+def regions_asked_for(names: Collection[str], files: Sequence[Path]) -> Regions:
+    """Return the regions of files if some are named, otherwise none.
+
+    Raises:
+        click.UsageError: there are files but no names.
+        ConfigurationError: as :func:`regions_of`.
+    """
+    from skinware.tactile.regions import Regions
+
+    if files and not names:
+        raise click.UsageError("--regions names files of regions: choose regions with --region")
+    return regions_of(files, names) if names else Regions(())
+
+
 def warn(text: str) -> None:
-    """One line on stderr under the running command's name, for what is worth knowing but no error."""
+    """Print one line on stderr under the running command's name: a note that is no error."""
     echo(f"{click.get_current_context().info_name}: {text}", err=True)
 
 
@@ -113,11 +199,11 @@ def log_to_stderr(verbose: bool) -> None:
 def signals_end(
     stop: Callable[[], object], others: Mapping[signal.Signals, Callable[[], object]] | None = None
 ) -> Iterator[None]:
-    """SIGINT and SIGTERM end what runs in this block in good order, whatever it is doing.
+    """End the block in good order on SIGINT and SIGTERM.
 
     Args:
-        stop: what they call, in the main thread.
-        others: what other signals call.
+        stop: called by them, in the main thread.
+        others: called by other signals.
     """
     calls = {signal.SIGINT: stop, signal.SIGTERM: stop, **(others or {})}
     before = {number: signal.signal(number, lambda *_, call=call: call()) for number, call in calls.items()}
@@ -129,42 +215,50 @@ def signals_end(
 
 
 def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
-    """Run a command with the arguments of this process, and exit as :func:`exit_status` says.
+    """Run a command with the arguments of this process, and exit with the status of :func:`exit_status`.
 
     SIGTERM ends a command as Ctrl-C does.
 
     Args:
-        command: which.
-        goes_on: its work goes on while nobody reads its output; by default it waits for who reads, as ``| less`` wants.
+        command: to run.
+        goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
-    signal.signal(signal.SIGTERM, _interrupt)
+
+    def interrupt(_signal: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
     with patient_output() if goes_on else contextlib.nullcontext():
         status = exit_status(command, sys.argv[1:])
     sys.exit(status)
 
 
 def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
-    """Run a command: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, files that it names included.
+    """Run a command and return its exit status.
 
-    Every expected error becomes one line on stderr. Output that nobody reads any more (``| head -1``) ends the command
-    in silence. ``NO_COLOR`` in the environment takes the colours away.
+    It is 0 when the command is done or interrupted, 1 when it failed, and 2 for wrong usage or configuration, including
+    the files that it names. Every expected error becomes one line on stderr. A closed output (``| head -1``) ends the
+    command in silence. ``NO_COLOR`` in the environment removes the colours.
     """
     name = command.name or os.path.basename(sys.argv[0])
     if f"_{name}_COMPLETE".upper().replace("-", "_") in os.environ:
         command.main(list(arguments), prog_name=name)  # the shell asks for completions
     try:
-        # not command.main(): that one makes a closed pipe a failure
-        color = False if os.environ.get("NO_COLOR") else None  # None: where there is a terminal
+        # command.main() makes a closed pipe a failure
+        color = False if os.environ.get("NO_COLOR") else None  # None: colours on a terminal
         with command.make_context(name, list(arguments), color=color) as context:
             command.invoke(context)
-        _flush_output()
+        if sys.stdout is not None:  # None: started with stdout closed
+            sys.stdout.flush()
         return EXIT_DONE
     except (KeyboardInterrupt, click.Abort):
         return EXIT_DONE
     except click.exceptions.Exit as done:
         return done.exit_code
     except click.ClickException as error:
-        _show(error)
+        text = io.StringIO()
+        error.show(file=text)
+        echo(text.getvalue(), nl=False, err=True)
         return error.exit_code
     except BrokenPipeError:
         _discard_output()
@@ -179,24 +273,9 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
         return EXIT_USAGE if isinstance(error, FileNotFoundError | FileExistsError) else EXIT_FAILED
 
 
-def _show(error: click.ClickException) -> None:
-    text = io.StringIO()
-    error.show(file=text)
-    echo(text.getvalue(), nl=False, err=True)
-
-
-def _flush_output() -> None:
-    if sys.stdout is not None:  # None: started with stdout closed
-        sys.stdout.flush()
-
-
 def _discard_output() -> None:
-    """Send what is still buffered nowhere, or Python complains about it when it exits."""
+    """Discard buffered output, or Python reports it as an error when it exits."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())
         os.close(null)
-
-
-def _interrupt(_signal: int, _frame: object) -> None:
-    raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Contacts beside the drivers that are looked at, told as lines and as JSON, and as labels of a picture."""
+"""Write contacts as lines, as JSON, and as labels of a picture."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from skinware.views.live import TouchedPlace
 
 _LONGEST_PLACE = 22
 TITLES = f"{'id':>4}  {'kind':<7}  {'at':<{_LONGEST_PLACE}} {'x, y, z in m':<20} {'load':>6} {'mm/s':>5} {'age':>6}"
-"""Over the lines of :func:`line_of`."""
+"""The titles over the lines of :func:`line_of`."""
 
 
 def line_of(place: TouchedPlace) -> str:
-    """One contact on a line of 78 columns, under ``TITLES``."""
+    """Return one contact in a line of 78 columns, under ``TITLES``."""
     contact, module = place.contact, place.module
     if len(module) > _LONGEST_PLACE:
         module = f"{module[: _LONGEST_PLACE - 3]}..."
@@ -30,7 +30,7 @@ def line_of(place: TouchedPlace) -> str:
 
 
 def lines_of(places: Sequence[TouchedPlace], most: int) -> list[str]:
-    """Titles and contacts on at most so many lines, the last of which tells how many there was no room for."""
+    """Return titles and contacts in at most this many lines; the last one counts contacts without room."""
     lines = [line_of(place) for place in places]
     if len(lines) < max(most, 1):
         return [TITLES, *lines]
@@ -61,8 +61,8 @@ def as_data(place: TouchedPlace) -> dict[str, Any]:
         "kind": contact.kind.name.lower(),
         "module": place.module,
         "frame": contact.frame,
-        "cop_m": _rounded(contact.cop_m),
-        "velocity_m_s": _rounded(contact.velocity_m_s),
+        "cop_m": [round(value, 6) for value in contact.cop_m.tolist()],
+        "velocity_m_s": [round(value, 6) for value in contact.velocity_m_s.tolist()],
         "load": round(contact.load, 3),
         "unit": place.unit,
         "force_n": contact.force_n,
@@ -72,10 +72,10 @@ def as_data(place: TouchedPlace) -> dict[str, Any]:
 
 
 def labels_of(places: Sequence[TouchedPlace], arrangement: Arrangement) -> dict[int, list[Label]]:
-    """The identities of contacts as labels of a picture, by line, each over its nearest sensor.
+    """Return the identities of contacts as labels of a picture, by line, each over its nearest sensor.
 
     Args:
-        places: the contacts; those elsewhere than in the picture have no label.
+        places: the contacts; contacts outside the picture have no label.
         arrangement: of the picture.
     """
     labels: dict[int, list[Label]] = {}
@@ -102,7 +102,3 @@ def _at_text(contact: Contact) -> str:
 def _speed_text(contact: Contact) -> str:
     speed = float(np.linalg.norm(contact.velocity_m_s))
     return f"{1e3 * speed:.0f}" if np.isfinite(speed) else NO_VALUE
-
-
-def _rounded(values: np.ndarray[Any, Any]) -> list[float]:
-    return [round(value, 6) for value in values.tolist()]

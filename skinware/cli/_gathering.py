@@ -1,4 +1,4 @@
-"""Gather presses or strokes for skin-calibrate, and show the coverage and what is wrong with a geometry."""
+"""Gather presses or strokes for skin-calibrate, and show the coverage and the faults of a geometry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._command import warn
+from skinware.cli import _command as cli
 from skinware.cli._heat_map import arrange
 from skinware.cli._terminal import echo, print_json, terminal_width
 from skinware.driver_service import DriverReader
@@ -22,18 +22,18 @@ from skinware.text import plural
 from skinware.views.driver_snapshots import after, enter_pressed, frames_until
 
 SIGNS = "·▂▃▄▅▆▇█"
-"""Of a sensor: nothing at all; in between; all that is wanted."""
+"""Signs of sensors from nothing to all that is wanted."""
 _BAR = 20
 _HEIGHT = 40
 
 
 def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]) -> Iterator[str]:
-    """A line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
+    """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
 
     Args:
         structure: of the driver.
         type_name: of the sensors.
-        coverage: (n,) 0 to 1 of each.
+        coverage: (n,) 0 to 1 for each sensor.
     """
     patch = structure.patch_of(type_name)
     width = max(map(len, structure.patch_names))
@@ -45,12 +45,12 @@ def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]
 
 
 def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64], width: int) -> Iterator[str]:
-    """The sensors, module by module as ``skin-top`` draws them, each with a sign for what it has.
+    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage.
 
     Args:
         structure: of the driver.
         type_name: of the sensors.
-        coverage: (n,) 0 to 1 of each.
+        coverage: (n,) 0 to 1 for each sensor.
         width: of the terminal.
     """
     drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
@@ -68,10 +68,10 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
 
 
 def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict[str, Any]:
-    """For programs.
+    """Return a finding for programs.
 
     Args:
-        finding: of sensors of one type.
+        finding: about sensors of one type.
         structure: of the skin.
         type_name: of the sensors.
     """
@@ -86,9 +86,9 @@ def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict
 
 
 def finding_text(finding: Finding, structure: Structure, type_name: str) -> str:
-    """One line for people; arguments as of :func:`finding_data`."""
-    told = finding_data(finding, structure, type_name)
-    names = told["modules"] or told["patches"]
+    """Return a finding for people in one line; arguments as of :func:`finding_data`."""
+    found = finding_data(finding, structure, type_name)
+    names = found["modules"] or found["patches"]
     count, whose = plural(len(finding.taxels), "sensor"), ", ".join(names)
     sensor = structure.sensor_name(int(_sensors(finding, structure, type_name)[0]))
     text = {
@@ -103,35 +103,35 @@ def finding_text(finding: Finding, structure: Structure, type_name: str) -> str:
 
 
 def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDArray[np.int64]:
-    """(k,) positions in a frame of the sensors that are meant."""
+    """Return (k,) positions in a snapshot of the sensors of a finding."""
     sensors: npt.NDArray[np.int64] = np.arange(structure.n_sensors)[structure.index(type_name)][finding.taxels]
     return sensors
 
 
-_TELL_EVERY_S = 1.0
+_REPORT_EVERY_S = 1.0
 _SAVE_EVERY_S = 10.0
 _WIDTH = 100
 
 
 class Gathering:
-    """Takes the frames of a driver into a session, and tells how far it is.
+    """Take the snapshots of a driver into a session, and report the progress.
 
     Args:
         reader: of the driver.
         session: that gathers.
         source: of the loads.
-        poses: of the presses; None: the session wants none.
-        state_path: file of what was gathered.
-        fresh: begin anew, whatever that file has.
-        as_json: how to tell.
+        poses: of the presses; None: the session needs none.
+        state_path: file of gathered data.
+        fresh: begin with nothing, and ignore that file.
+        as_json: print JSON, not text.
 
     Attributes:
         structure: of the driver.
         type_name: of the sensors.
-        restored: whether it goes on with what the state file had.
+        restored: whether it continues with the data of the state file.
 
     Raises:
-        ConfigurationError: the state file cannot be gone on with.
+        ConfigurationError: the data of the state file do not fit.
     """
 
     def __init__(
@@ -151,17 +151,17 @@ class Gathering:
         self.type_name: str = source.type_name
         self._uid: npt.NDArray[np.uint64] = reader.structure.sensor_uid[reader.structure.index(source.type_name)]
         self.restored: bool = not fresh and restore_session(state_path, session, source.type_name, self._uid)
-        self._told = -1.0
+        self._reported = -1.0
 
     def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
-        """Gather until that part of the sensors have all that is wanted, or for so long, or until Enter.
+        """Gather until enough sensors have all that is wanted, for a time, or until Enter.
 
-        What was gathered is in the state file then, also after Ctrl-C. A person sees what is covered.
+        Gathered data are in the state file afterwards, also after Ctrl-C.
 
         Args:
             what_to_do: for the person.
-            share: 0 to 1.
-            duration_s: at most so long, once the rest is known; None: no limit.
+            share: part of the sensors that is enough, 0 to 1.
+            duration_s: longest time after the baselines are known; None: no limit.
 
         Raises:
             ServiceTimeout: the driver is silent.
@@ -169,16 +169,16 @@ class Gathering:
         """
         try:
             self._run(what_to_do, share, duration_s)
-            self._tell_coverage()
+            self._report_coverage()
         except KeyboardInterrupt:
             if self._as_json:
                 print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})
             else:
-                echo(f"\nwhat was gathered is in {self._state_path}; the same command goes on with it")
+                echo(f"\nthe gathered data are in {self._state_path}; the same command continues with them")
             raise
 
-    def _tell_coverage(self) -> None:
-        """For people: how far each patch is, and a picture of the skin."""
+    def _report_coverage(self) -> None:
+        """Show the coverage of each patch to people, and a picture of the skin."""
         if self._as_json:
             return
         structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
@@ -194,7 +194,7 @@ class Gathering:
         try:
             if gathers:
                 self._wait_for_rest()
-            self._tell_ready(what_to_do)
+            self._report_ready(what_to_do)
             if gathers:
                 self._gather(share, duration_s)
         finally:
@@ -202,17 +202,17 @@ class Gathering:
 
     def _gather(self, share: float, duration_s: float | None) -> None:
         time_is_over = after(math.inf if duration_s is None else duration_s)
-        tell, save = after(_TELL_EVERY_S), after(_SAVE_EVERY_S)
+        report_due, save_due = after(_REPORT_EVERY_S), after(_SAVE_EVERY_S)
         for frame in frames_until(
             self._reader, lambda: self._session.is_complete(share) or time_is_over() or enter_pressed()
         ):
             pose = None if self._poses is None else self._poses.newest()
             self._session.take(frame.acquired_ns, self._source.loads(frame), pose)
-            if tell():
-                tell = after(_TELL_EVERY_S)
-                self._tell_progress()
-            if save():
-                save = after(_SAVE_EVERY_S)
+            if report_due():
+                report_due = after(_REPORT_EVERY_S)
+                self._report_progress()
+            if save_due():
+                save_due = after(_SAVE_EVERY_S)
                 self._save()
 
     def _wait_for_rest(self) -> None:
@@ -223,7 +223,7 @@ class Gathering:
             self._source.loads(frame)
             if self._source.refused_share and not refused:
                 refused = self._source.refused_share
-                warn(f"{100 * refused:.0f} % of the sensors move and have no baseline yet; leave them alone")
+                cli.warn(f"{100 * refused:.0f} % of the sensors move and have no baseline yet; leave them alone")
 
     def _save(self) -> None:
         save_session(self._state_path, self._session, self.type_name, self._uid)
@@ -232,29 +232,29 @@ class Gathering:
         coverage = self._session.coverage
         return {**self._session.figures, "sensors": len(coverage), "covered": int((coverage >= 1).sum())}
 
-    def _tell_ready(self, what_to_do: str) -> None:
+    def _report_ready(self, what_to_do: str) -> None:
         if self._as_json:
-            told = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
-            print_json({"event": "ready", **told, **self._figures()})
+            what = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
+            print_json({"event": "ready", **what, **self._figures()})
             return
         if self.restored:
-            echo(f"going on with what is in {self._state_path}")
+            echo(f"continuing with the data in {self._state_path}")
         echo(what_to_do)
 
-    def _tell_progress(self) -> None:
+    def _report_progress(self) -> None:
         structure, coverage = self.structure, self._session.coverage
         figures = self._figures()
         if self._as_json:
             patch = structure.patch_of(self.type_name)
-            of_patch = {
+            patches = {
                 name: round(float((coverage[patch == number] >= 1).mean()), 3)
                 for number, name in enumerate(structure.patch_names)
                 if (patch == number).any()
             }
-            print_json({"event": "progress", **figures, "patches": of_patch})
+            print_json({"event": "progress", **figures, "patches": patches})
             return
         mean = float(coverage.mean())
-        if mean != self._told:
-            self._told = mean
+        if mean != self._reported:
+            self._reported = mean
             gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
             echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")

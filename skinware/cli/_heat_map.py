@@ -1,8 +1,8 @@
-"""From a frame to coloured squares: which sensor is drawn where, in which of a few codes. Pure functions.
+"""Place sensors as coloured squares, each in one of a few codes. Pure functions.
 
 A *pixel* is one column wide and half a line high, so that it looks square; a sensor is a square of ``zoom`` by ``zoom``
-pixels. What is drawn of a sensor is its *code*: ``mark * LEVELS + level``, where the mark tells its status (0 = fresh)
-and the level its value. Few codes mean few redraws: that keeps a terminal over ssh usable.
+pixels. A sensor is drawn in its *code*, ``mark * LEVELS + level``: the mark is its status (0 = fresh), the level its
+value. Few codes mean few redraws, which keeps a terminal over ssh usable.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_
 FIRST_WITHOUT_VALUE = NO_ACK
 """From this mark on, the level means nothing and is not drawn. ``UNMOVED``: never moved in a wipe test."""
 BACKGROUND = 255
-"""Code of a pixel that is no sensor."""
+"""Code of a pixel without a sensor."""
 
 _HOLD = 0.75
-"""A level is kept while the value is within so many levels of its middle: noise on an edge does not flicker."""
+"""A level stays while the value is within this many levels of its middle, so that noise on an edge does not flicker."""
 _LABEL_ROOM = 2
 _SIZES = (
     (8, _LABEL_ROOM),
@@ -40,7 +40,7 @@ _SIZES = (
     (1, _LABEL_ROOM),
     (1, 0),
 )
-"""Zooms, and room in pixels above a block for the name of its module; the first that fits is taken."""
+"""Zooms, and pixels above a block for the name of its module; the first that fits is used."""
 _LONGEST_NAME = 16
 _NAMES_FROM_WIDTH = 48
 _MARK_BITS = (
@@ -53,11 +53,11 @@ _MARK_BITS = (
     (UNHEALTHY, Status.UNHEALTHY),
     (OUT_OF_RANGE, Status.OUT_OF_RANGE),
 )
-"""Which mark wins where a sensor has several bits: the first."""
+"""The marks of status bits; the first one wins where a sensor has several."""
 
 
 def marks_of(status: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """(n,) uint8: the one mark that each sensor is drawn with."""
+    """Return (n,) uint8, the mark of each sensor."""
     marks = np.full(len(status), FRESH, np.uint8)
     for mark, bit in reversed(_MARK_BITS):
         marks[(status & np.uint8(bit)) != 0] = mark
@@ -67,13 +67,13 @@ def marks_of(status: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 def levels_of(
     values: npt.NDArray[np.float32], low: float, high: float, before: npt.NDArray[np.uint8] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """(n,) uint8, 0 to 15: where values lie between ``low`` and ``high``.
+    """Return (n,) uint8, 0 to 15: where values lie between ``low`` and ``high``.
 
     Args:
         values: (n,) physical values.
-        low: what is level 0.
-        high: what is level 15.
-        before: the levels drawn so far, which are kept as long as they are nearly right.
+        low: value of level 0.
+        high: value of level 15.
+        before: the levels drawn so far, which stay while they are nearly right.
     """
     span = high - low if high > low else 1.0
     exact = np.clip(np.nan_to_num((values - low) / span), 0.0, 1.0) * LEVELS
@@ -84,7 +84,7 @@ def levels_of(
 
 
 def codes_of(levels: npt.NDArray[np.uint8], marks: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """(n,) uint8: the codes of sensors with these levels and marks."""
+    """Return (n,) uint8, the codes of sensors with these levels and marks."""
     return marks * np.uint8(LEVELS) + np.where(marks < FIRST_WITHOUT_VALUE, levels, np.uint8(0))
 
 
@@ -93,9 +93,9 @@ class Label:
     """A word at a column of the terminal.
 
     Attributes:
-        column: where it begins.
+        column: of its first character.
         text: the word.
-        is_mark: it stands over sensors and marks something there, instead of beside or above them.
+        is_mark: it stands over sensors and marks something there; otherwise it stands beside or above them.
     """
 
     column: int
@@ -105,12 +105,12 @@ class Label:
 
 @dataclass(frozen=True, eq=False)
 class Arrangement:
-    """Where sensors are drawn.
+    """The places of sensors in a picture.
 
     Attributes:
-        sensors: (n,) int64, positions in a frame of the sensors that are drawn.
+        sensors: (n,) int64, positions in a snapshot of the sensors that are drawn.
         pixels: (2 * lines, columns) int64, index into ``sensors`` of the sensor at each pixel; -1 = none.
-        labels: words in the free places, by line of the terminal.
+        labels: words in free places, by line of the terminal.
         zoom: pixels along the side of a sensor.
     """
 
@@ -128,21 +128,21 @@ class Arrangement:
         return int(self.pixels.shape[1])
 
     def draw(self, codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """(2 * lines, columns) uint8: the code of every pixel, from the codes of ``sensors``."""
+        """Return (2 * lines, columns) uint8, the code of every pixel, from the codes of ``sensors``."""
         return np.append(codes, np.uint8(BACKGROUND))[self.pixels]  # pixel -1 is the last one
 
     def limited(self, only: npt.NDArray[np.bool_]) -> Arrangement:
-        """The same, with nothing in the places of other sensors.
+        """Return the same picture without the other sensors.
 
         Args:
-            only: (n_sensors,) bool, which sensors of a frame stay.
+            only: (n_sensors,) bool, the sensors of a snapshot that stay.
         """
         stays = only[self.sensors]
         number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)  # pixel -1 is the last one
         return Arrangement(self.sensors[stays], number[self.pixels], self.labels, self.zoom)
 
     def sensor_at(self, line: int, column: int) -> int | None:
-        """Position in a frame of the sensor at a place of the terminal, None between sensors."""
+        """Return the position in a snapshot of the sensor at a place of the terminal, None between sensors."""
         if not (0 <= line < self.lines and 0 <= column < self.columns):
             return None
         upper, lower = (int(pixel) for pixel in self.pixels[2 * line : 2 * line + 2, column])
@@ -160,19 +160,18 @@ def arrange(
     smallest: int = 1,
     only: npt.NDArray[np.bool_] | None = None,
 ) -> Arrangement:
-    """Lay out the sensors of one type on some patches, module by module, as large as they fit.
+    """Place the sensors of one type on some patches, module by module, as large as they fit.
 
-    What does not fit even at the smallest size becomes higher than ``height`` (and is scrolled).
+    A picture that does not fit at the smallest size is higher than ``height``, and is scrolled.
 
     Args:
-        structure: what they belong to.
-        patches: which patches; more than one are drawn below each other with their names.
-        type_name: which sensors.
+        structure: of the driver.
+        patches: to draw; several are drawn below each other with their names.
+        type_name: of the sensors.
         width: columns of the terminal.
         height: lines of the terminal.
         smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
-        only: (n_sensors,) bool, sensors of a region: modules without any are left out, as are the other sensors of
-            modules that have some.
+        only: (n_sensors,) bool, sensors of a region; other sensors are left out, and modules without any of these.
 
     Raises:
         StructureError: there is no such type.
@@ -193,7 +192,8 @@ def arrange(
         for module, start, end in zip(modules.tolist(), starts, [*starts[1:], len(positions)], strict=True)
     ]
     labels = [
-        _within_patch(structure.module_names[block.module], structure.patch_names[block.patch]) for block in blocks
+        structure.module_names[block.module].removeprefix(structure.patch_names[block.patch]).removeprefix(", ")
+        for block in blocks
     ]
     patches = sorted({block.patch for block in blocks}) if only is not None else patches
     names = {patch: structure.patch_names[patch] for patch in patches} if len(patches) > 1 else {}
@@ -202,20 +202,15 @@ def arrange(
     return arrangement if only is None else arrangement.limited(only)
 
 
-def _within_patch(module: str, patch: str) -> str:
-    """What a module is called within its patch; empty for the only one of a patch."""
-    return module.removeprefix(patch).removeprefix(", ")
-
-
 def _short(label: str) -> str:
-    """The number at the end of a name, else the name."""
+    """Return the number at the end of a name, or else the name."""
     last = label.rpartition(" ")[2]
     return last if last.isdigit() else label
 
 
 @dataclass(frozen=True)
 class _Block:
-    """The sensors of one module: from ``start`` to ``end`` of those that are drawn."""
+    """The sensors of one module: from ``start`` to ``end`` of all that are drawn."""
 
     module: int
     patch: int
@@ -244,23 +239,23 @@ class _Grid:
     """Room below a block."""
     margin: int
     compact: bool
-    """Every block as a rectangle: what has another shape takes less room so."""
+    """Draw every block as a rectangle, which takes less room than other shapes."""
     name: int
     """Columns of the longest name above a block."""
 
     @property
     def width(self) -> int:
-        """Columns of a place: of a block, or of a name that is longer."""
+        """Columns of a place: those of a block, or of a longer name."""
         return max((self.halves * self.zoom + 1) // 2, self.name)
 
     @property
     def pitch(self) -> int:
-        """From the top of a block to that of the one below; names need whole lines."""
+        """Pixels from the top of a block to the top of the next one below; names need whole lines."""
         pitch = self.head + self.rows * self.zoom + self.gap
         return pitch + pitch % 2 if self.head else pitch
 
     def group_lines(self, count: int) -> int:
-        """Lines of the terminal for ``count`` blocks of one patch, with the gap below."""
+        """Return the lines of the terminal for ``count`` blocks of one patch, with the gap below."""
         return math.ceil(math.ceil(count / self.per_line) * self.pitch / 2)
 
     def lines(self, groups: list[list[_Block]]) -> int:
@@ -269,7 +264,7 @@ class _Grid:
         return sum(self.group_lines(count) for count in above) + math.ceil(last_pixels / 2)
 
     def shape(self, block: _Block) -> Shape:
-        """How a block is drawn: in its own shape, where that is not wider than there is room."""
+        """Return the shape in which a block is drawn: its own, unless that is too wide."""
         own = block.shape(self.compact)
         return own if own.halves <= self.halves else rows_of(len(own.cells), self.halves // 2)
 
@@ -277,7 +272,7 @@ class _Grid:
 def _choose_grid(
     blocks: list[_Block], labels: list[str], names: dict[int, str], width: int, height: int, smallest: int
 ) -> _Grid:
-    """The largest zoom at which everything fits, else the smallest."""
+    """Return the grid with the largest zoom at which everything fits, or else the smallest."""
     margin = min(_LONGEST_NAME, max(map(len, names.values()))) + 2 if names and width >= _NAMES_FROM_WIDTH else 0
     room = width - margin
     label_width = max(len(_short(label)) for label in labels)

@@ -1,4 +1,4 @@
-"""Collect what skin-info shows of a namespace, and of the health of sensors, without taking part in it."""
+"""Collect what skin-info shows of a namespace, and the health of sensors, without announcing a reader."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from skinware.status import DataPath, load_report
 from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
-from skinware.text import age_text, count_text, plural, table, wrapped
+from skinware.text import age_text_ms, count_text, plural, table, words, wrapped
 from skinware.views import bridges
 
 SampleT = TypeVar("SampleT", bound=Sample)
 
 
 def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
-    """Everything that can be seen of a namespace, as ``skin-info --json`` prints it.
+    """Return everything that can be seen of a namespace, as ``skin-info --json`` prints it.
 
     Args:
-        namespace: where to look.
-        only: name of the one service to look at.
+        namespace: to show.
+        only: name of the only service to show.
 
     Raises:
-        ServiceNotFound: ``only`` names nothing here.
+        ServiceNotFound: no service has the name ``only``.
         NamespaceError: the namespace cannot be trusted or read.
         ConfigurationError: ``only`` cannot be a name.
     """
@@ -69,16 +69,16 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
         except (ServiceNotFound, ConfigurationError) as error:
             if only is not None:
                 raise
-            if isinstance(error, ConfigurationError):  # a file whose name cannot be a service's
+            if isinstance(error, ConfigurationError):  # the name of the file cannot be that of a service
                 problems.append(f"{namespace.ring_path(name)}: {error}")
-            continue  # otherwise it was withdrawn this very moment
+            continue  # otherwise it has just been withdrawn
         entry["readers"] = [record for record in readers if record["service"] == name]
         (drivers if entry["kind"] == KIND else services).append(entry)
     return {"namespace": namespace.name, "drivers": drivers, "services": services, "problems": problems}
 
 
 def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
-    """Every sensor of a driver in the order of its frames.
+    """Return every sensor of a driver in the order of its snapshots.
 
     Raises:
         ServiceNotFound: there is no such driver.
@@ -106,9 +106,9 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
 def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
     with ServiceReader[Sample](name, namespace=namespace, announce=False) as service:
         if service.kind != KIND:
-            told: dict[str, Any] = {"description": service.schema.description, "columns": _columns(service)}
-            told |= {"bridge": _bridge(namespace, name)} if service.kind == bridge_state.KIND else {}
-            return _common(service, _newest(service)) | told
+            entry = _common(service, _newest(service))
+            entry |= {"description": service.schema.description, "columns": _columns(service)}
+            return entry | ({"bridge": _bridge(namespace, name)} if service.kind == bridge_state.KIND else {})
     with DriverReader(name, namespace=namespace, announce=False) as driver:
         frame = _newest(driver)
         common = _common(driver, frame)
@@ -116,7 +116,7 @@ def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
 
 
 def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
-    """What a bridge tells of itself; None before it has told anything."""
+    """Return the state that a bridge publishes; None before its first sample."""
     with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
         frame = _newest(reader)
         return None if frame is None else {"robot": frame.state.robot, **bridges.as_data(frame.state)}
@@ -128,7 +128,7 @@ def _newest(service: ServiceReader[SampleT]) -> SampleT | None:
     try:
         return service.read(timeout_s=0.0)
     except (ServiceTimeout, Overrun):
-        return None  # between two lives of its writer, or too fast for a copy
+        return None  # its writer restarts, or is too fast for a copy
 
 
 def _common(service: ServiceReader[Any], frame: Sample | None) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def _reader(record: ReaderRecord) -> dict[str, Any]:
 
 
 def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
-    """How long things took: extremes and means, histograms with two bounds taken from them."""
+    """Return times: extremes and means, and histograms with two bounds from them."""
     spreads = {
         name: {"count": s.count, "best_ns": s.best_ns, "mean_ns": round(s.mean_ns), "worst_ns": s.worst_ns}
         for name, s in (("wall", of.wall), ("cpu", of.cpu))
@@ -248,25 +248,25 @@ def _patches(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> l
 
 
 def _with_counters(own: dict[str, Any], counters: dict[str, int]) -> dict[str, Any]:
-    """``own`` keys first; a counter never takes the place of one."""
+    """Return an entry with counters after its own keys; a counter never replaces one of them."""
     return own | {name: count for name, count in counters.items() if name not in own}
 
 
 _NOTHING = """\
-Nobody looks after the health of sensors here. For a driver NAME:
-  skin-calm NAME    (beside which it is published, in the namespace calm)"""
+No service publishes the health of sensors here. For a driver NAME:
+  skin-calm NAME    (publishes it beside the calmed driver, in the namespace calm)"""
 _FAULT_COLOUR = "yellow"
 
 
 def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> None:
-    """Print it: see :func:`health`.
+    """Print the health of sensors: see :func:`health`.
 
     Raises:
-        ServiceNotFound: no service reports the health of that driver.
+        ServiceNotFound: no service publishes the health of that driver.
     """
     found = health(namespaces, driver)
     if driver is not None and not (found["health"] or found["problems"]):
-        raise ServiceNotFound(f"no service reports the health of driver {driver!r}; start one: skin-calm {driver}")
+        raise ServiceNotFound(f"no service publishes the health of driver {driver!r}; start one: skin-calm {driver}")
     if as_json:
         print_json(found)
     else:
@@ -274,11 +274,11 @@ def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> 
 
 
 def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any]:
-    """The health of all sensors that somebody looks after, as ``skin-info --health --json`` prints it.
+    """Return the health of all sensors that services publish, as ``skin-info --health --json`` prints it.
 
     Args:
-        namespaces: where to look.
-        driver: name of the one driver to look at.
+        namespaces: to look in.
+        driver: name of the only driver to show.
 
     Raises:
         NamespaceError: a namespace cannot be trusted or read.
@@ -290,7 +290,7 @@ def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any
             try:
                 entry = _entry(namespace, name, driver)
             except ServiceNotFound:
-                continue  # it was withdrawn this very moment
+                continue  # it has just been withdrawn
             except BadServiceFile as error:
                 problems.append(str(error))
                 continue
@@ -301,11 +301,10 @@ def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any
 def as_text(found: dict[str, Any]) -> list[str]:
     lines: list[str] = []
     for entry in found["health"]:
-        counts = {name.replace("_", " "): count for name, count in entry["kinds"].items() if count}
-        told = ", ".join(f"{count_text(count)} {name}" for name, count in counts.items())
+        kinds = ", ".join(f"{count_text(count)} {words(kind)}" for kind, count in entry["kinds"].items() if count)
         name = style(entry["driver"], bold=True)
-        age = "" if entry["state"] == "live" else f" ({entry['state']}, as of {age_text(entry['age_ms'] * 1e6)} ago)"
-        lines += [f"{name} in namespace {entry['namespace']}: {plural(entry['sensors'], 'sensor')}: {told}{age}"]
+        age = "" if entry["state"] == "live" else f" ({entry['state']}, as of {age_text_ms(entry['age_ms'])} ago)"
+        lines += [f"{name} in namespace {entry['namespace']}: {plural(entry['sensors'], 'sensor')}: {kinds}{age}"]
         rows = [(fault["name"], fault["type"], fault["kind"], fault["evidence"]) for fault in entry["faults"]]
         head, *body = table(("sensor", "type", "fault", "evidence"), rows, left=4)
         lines += [f"  {head}", *(style(f"  {line}", fg=_FAULT_COLOUR) for line in body)] if rows else []
@@ -315,7 +314,7 @@ def as_text(found: dict[str, Any]) -> list[str]:
 
 
 def _entry(namespace: Namespace, name: str, driver: str | None) -> dict[str, Any] | None:
-    """What one service tells; None: it is none of health, of another driver, or has told nothing yet."""
+    """Return the health that a service publishes; None for another service or driver, and before a sample."""
     with ServiceReader[Any](name, namespace=namespace, announce=False) as service:
         if service.kind != HEALTH_KIND:
             return None
@@ -332,9 +331,16 @@ def _entry(namespace: Namespace, name: str, driver: str | None) -> dict[str, Any
     known = np.isfinite(report.still_s)
     counts = np.bincount(report.kind[known], minlength=len(HealthKind)).tolist()
     kinds = {kind.name.lower(): counts[kind] for kind in HealthKind} | {"unknown": int((~known).sum())}
-    told: dict[str, Any] = {"driver": source.driver, "namespace": namespace.name, "service": name, "state": state}
-    told |= {"age_ms": round(frame.age_ns / 1e6, 3), "sensors": len(known)}
-    return told | {"kinds": kinds, "faults": _faults(namespace, frame, report)}
+    return {
+        "driver": source.driver,
+        "namespace": namespace.name,
+        "service": name,
+        "state": state,
+        "age_ms": round(frame.age_ns / 1e6, 3),
+        "sensors": len(known),
+        "kinds": kinds,
+        "faults": _faults(namespace, frame, report),
+    }
 
 
 def _faults(namespace: Namespace, frame: HealthSample, report: HealthReport) -> list[dict[str, Any]]:

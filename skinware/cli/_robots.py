@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    caller_option,
-    examples,
-    insecure_option,
-    json_option,
-    signals_end,
-    tls_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
@@ -39,8 +31,8 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
 
 @click.command(
     "route",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            the router",
         "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   on a robot",
         "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            on another machine",
@@ -55,20 +47,24 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
 @click.option(
     "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here, too."
 )
-@tls_option
-@caller_option
+@cli.tls_option
+@cli.caller_option
 @click.option(
     "--robot",
     "robots",
     multiple=True,
     metavar="R",
-    help="Only certificates of this name may serve, and only robot R; repeatable.",
+    help="Only certificates of this name may serve, and only robot R; may be repeated.",
 )
 @click.option(
-    "--router", "routers", multiple=True, metavar="NAME", help="Name in the certificate of another router; repeatable."
+    "--router",
+    "routers",
+    multiple=True,
+    metavar="NAME",
+    help="Certificate name of another router; may be repeated.",
 )
-@insecure_option
-@json_option
+@cli.insecure_option
+@cli.json_option
 def route(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
@@ -94,7 +90,7 @@ def route(
     )
     with contextlib.closing(Link(places)) as link:
         watcher = Watcher(link, asks=False)
-        with signals_end(watcher.stop):
+        with cli.signals_end(watcher.stop):
             if as_json:
                 print_json({"event": "ready", "listen": list(places.listen), "connect": list(places.connect)})
             else:
@@ -121,16 +117,16 @@ class _Routed:
 
 @click.command(
     "list",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-bridge list --connect tcp/192.168.1.10:7448 --connect tcp/192.168.1.11:7448",
         "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all robots, every second",
     ),
 )
 @click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT.")
-@tls_option
+@cli.tls_option
 @click.option("--watch", is_flag=True, help="Update every second.")
-@json_option
+@cli.json_option
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
     """Show the drivers of all robots that are reached: rate, age, losses, silent patches, problems, clock error.
 
@@ -146,7 +142,7 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
         listed = _Listed(watcher, places.connect, tls, as_json=as_json, watch=watch)
         if watch and as_json:
             print_json({"event": "ready", "connect": list(places.connect)})
-        with signals_end(watcher.stop):
+        with cli.signals_end(watcher.stop):
             watcher.run(listed.tell)
     if listed.why:
         raise BridgeError(listed.why)

@@ -1,4 +1,4 @@
-"""Print to stdout, stderr and terminals, without waiting for a reader that stopped."""
+"""Print to stdout, stderr and terminals, also without waiting for a reader that stopped."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ import msgspec
 from skinware.text import printable
 
 _MOST_WAITING = 1 << 20
-"""Bytes that wait to be read; what comes after them is left out."""
+"""Bytes that may wait to be read; later text is left out."""
 _SLICE = select.PIPE_BUF
 _AT_THE_END_S = 1.0
-"""How long the end of a command waits for who reads."""
+"""Time that the end of a command waits for a reader."""
 
 
 class PatientStream(io.TextIOBase):
-    """Takes text at once, and writes it when it is read.
+    """Accept text at once, and write it when the reader takes it.
 
     Args:
-        stream: where it goes.
+        stream: to write to.
 
     Attributes:
-        left_out: writes that were left out because too much waited.
+        left_out: writes that were left out because too much text waited.
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self._own_fd: int | None = None  # first: Python also closes one that could not be made
+        self._own_fd: int | None = None  # first: Python also closes a stream that could not be made
         self._waiting: deque[bytes] = deque()
         self._size = 0
         self._lock = threading.RLock()
@@ -69,10 +69,10 @@ class PatientStream(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Take text, and write what can be written now.
+        """Accept text, and write as much as possible now.
 
         Raises:
-            BrokenPipeError: nobody will read it any more.
+            BrokenPipeError: the reader is gone.
         """
         data = text.encode(self.encoding, self.errors or "strict")
         with self._lock:
@@ -85,10 +85,10 @@ class PatientStream(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write what can be written now.
+        """Write as much as possible now.
 
         Raises:
-            BrokenPipeError: nobody will read it any more.
+            BrokenPipeError: the reader is gone.
         """
         with self._lock:
             while self._waiting:
@@ -103,7 +103,7 @@ class PatientStream(io.TextIOBase):
                     return
 
     def end(self) -> None:
-        """Write what waits, for as long as somebody reads it."""
+        """Write the text that waits, while the reader takes it."""
         until_s = time.monotonic() + _AT_THE_END_S
         with contextlib.suppress(OSError):
             self.flush()
@@ -113,7 +113,7 @@ class PatientStream(io.TextIOBase):
         self._give_back()
 
     def close(self) -> None:
-        """What still waits is lost: Python closes what nobody has any more, and tells errors to who may not read."""
+        """Discard the text that waits: Python closes unused streams, and prints errors of it where they may block."""
         self._waiting.clear()
         self._give_back()
         super().close()
@@ -124,7 +124,7 @@ class PatientStream(io.TextIOBase):
             os.close(fd)
 
     def _write(self, data: bytes) -> int:
-        """How much could be written without a wait."""
+        """Write without waiting, and return the number of bytes."""
         if self._own_fd is not None:
             try:
                 return os.write(self._own_fd, data)
@@ -139,7 +139,7 @@ class PatientStream(io.TextIOBase):
 
 
 def _reopened(fd: int) -> int | None:
-    """The same pipe or terminal, opened once more: writes need not wait there. None: it cannot be opened again."""
+    """Open the same pipe or terminal again, without waits in writes; None if it cannot be opened again."""
     kind = os.fstat(fd).st_mode
     if not (stat.S_ISFIFO(kind) or stat.S_ISCHR(kind)):
         return None
@@ -151,7 +151,7 @@ def _reopened(fd: int) -> int | None:
 
 @contextlib.contextmanager
 def patient_output() -> Iterator[None]:
-    """``sys.stdout`` and ``sys.stderr`` never wait in this block. At its end, one line tells what was left out."""
+    """Let ``sys.stdout`` and ``sys.stderr`` never wait in this block; at its end, report lines that were left out."""
     before = sys.stdout, sys.stderr
     streams = [_patient(stream) for stream in before]
     sys.stdout, sys.stderr = (stream or old for stream, old in zip(streams, before, strict=True))
@@ -163,14 +163,14 @@ def patient_output() -> Iterator[None]:
         if out is not None:
             if err is not None and out.left_out:
                 with contextlib.suppress(OSError):
-                    err.write(f"{out.left_out} lines of output were left out: nobody read them\n")
+                    err.write(f"{out.left_out} lines of output were left out: they were not read\n")
             out.end()
         if err is not None:
             err.end()
 
 
 def _patient(stream: TextIO | None) -> PatientStream | None:
-    """Of a stream that has a file; None of others (those of tests)."""
+    """Return a patient stream for a stream with a file; None for others (those of tests)."""
     if stream is None:
         return None
     try:
@@ -189,12 +189,12 @@ _KEPT = "\n\t"
 
 
 def style(text: str, **how: Any) -> str:
-    """A text with colours, as :func:`click.style` has them; only :func:`echo` prints it."""
+    """Return a text with colours as of :func:`click.style`, for :func:`echo`."""
     return _SGR.sub(lambda found: f"\x1b[{_OWN};{found[1]}m", click.style(text, **how))
 
 
 def shown(text: str) -> str:
-    """A text as a terminal may have it: with the colours of :func:`style`, and without control characters of others."""
+    """Return a text for a terminal: with the colours of :func:`style`, without control characters of others."""
     parts = _OWN_SGR.split(text)
     parts[0::2] = [printable(part, _KEPT) for part in parts[0::2]]
     parts[1::2] = [part.replace(f"{_OWN};", "") for part in parts[1::2]]
@@ -202,12 +202,12 @@ def shown(text: str) -> str:
 
 
 def echo(text: str = "", *, nl: bool = True, err: bool = False) -> None:
-    """Print a text, without colours where there is no terminal."""
+    """Print a text, with colours only on a terminal."""
     click.echo(shown(text), nl=nl, err=err)
 
 
 def overwrite(text: str, *, err: bool = False) -> None:
-    """Print a text in the place of the line on the terminal."""
+    """Replace the line on the terminal."""
     click.echo(f"\r{shown(text)}\x1b[K", nl=False, err=err, color=True)
 
 
@@ -229,12 +229,12 @@ def redraw(lines: list[str]) -> None:
 
 
 def print_json(data: object) -> None:
-    """One object on one line, at once. Numbers that JSON does not have (``nan``, ``inf``) become null."""
+    """Print one object in one line at once. ``nan`` and ``inf`` become null."""
     click.echo(json_text(data))
 
 
 def json_text(data: object) -> str:
-    """An object as JSON; what cannot be printed is escaped in it, so that programs have it and terminals do not."""
+    """Return an object as JSON, in which characters that cannot be printed are escaped."""
     text = msgspec.json.encode(data).decode()
     return text if text.isprintable() else "".join(map(_escaped, text))
 
@@ -247,8 +247,7 @@ def _escaped(sign: str) -> str:
 
 
 class Formatter(logging.Formatter):
-    """Lines of the log, for a terminal."""
+    """Format lines of the log for a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """See :class:`logging.Formatter`."""
         return shown(super().format(record))

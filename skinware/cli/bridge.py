@@ -16,13 +16,14 @@ from skinware.cli._command import (
     insecure_option,
     json_option,
     namespace_option,
+    regions_asked_for,
+    regions_option,
     run,
     signals_end,
     tls_option,
     version_option,
     warn,
 )
-from skinware.cli._regions import regions_asked_for, regions_option
 from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json
 

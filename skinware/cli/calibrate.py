@@ -1,4 +1,4 @@
-"""``skin-calibrate``: where the sensors of a skin are, by touching it; and whether a geometry is right."""
+"""``skin-calibrate``: find the places of sensors by touching the skin, and check a geometry."""
 
 from __future__ import annotations
 
@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    EXIT_DONE,
-    EXIT_FAILED,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
@@ -32,7 +22,6 @@ if TYPE_CHECKING:
     from skinware.tactile.calibration.shapes import Shape
 
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
-_PATH = click.Path(path_type=Path)
 _POSES_TIMEOUT_S = 5.0
 _MM = 1e3
 _STROKE = "stroke the whole skin with one finger"
@@ -48,7 +37,7 @@ def _options(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorat
     return decorate
 
 
-_output = click.option("-o", "--output", "file", type=_PATH, metavar="GEOMETRY", required=True, help="File to write.")
+_output = cli.output_option("File to write.", name="file", metavar="GEOMETRY", required=True)
 _pitch = click.option(
     "--pitch",
     "pitch_m",
@@ -59,27 +48,29 @@ _pitch = click.option(
     help="Distance between neighbouring sensors, metres.",
 )
 _gathering = _options(
-    click.option("--driver", metavar="DRIVER", help="Driver to read, if several run."),
-    click.option("--type", "type_name", metavar="TYPE", help="Sensors.  [default: pressure, or the first type]"),
+    cli.driver_option,
+    cli.type_option("Sensors.  [default: pressure, or the first type]"),
     click.option(
         "--share",
         type=click.FloatRange(0, 1),
         default=0.95,
         show_default=True,
-        help="Stop when this part of the sensors have enough.",
+        help="Stop when this part of the sensors has enough.",
     ),
-    click.option("-T", "duration_s", type=seconds, help="Gather for SECONDS at most; 0: use what was gathered."),
-    click.option("--state", metavar="FILE", type=_PATH, help="What was gathered.  [default: GEOMETRY.state.npz]"),
-    click.option("--fresh", is_flag=True, help="Begin anew, whatever that file has."),
-    namespace_option,
-    json_option,
-    version_option,
+    cli.duration_option("Gather for SECONDS at most; 0: use the state file as it is."),
+    click.option(
+        "--state", metavar="FILE", type=cli.FILE, help="File of gathered data.  [default: GEOMETRY.state.npz]"
+    ),
+    click.option("--fresh", is_flag=True, help="Begin with nothing, and ignore that file."),
+    cli.namespace_option,
+    cli.json_option,
+    cli.version_option,
 )
 _pressing = _options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
-    click.option("--poses-namespace", metavar="NAME", help="Where that service is.  [default: as --namespace]"),
-    click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted of each sensor."),
-    click.option("--frame", metavar="NAME", help="Whose axes the poses are in.  [default: name of the service]"),
+    click.option("--poses-namespace", metavar="NAME", help="Namespace of that service.  [default: as --namespace]"),
+    click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted on each sensor."),
+    click.option("--frame", metavar="NAME", help="Coordinate frame of the poses.  [default: name of the service]"),
 )
 
 
@@ -97,20 +88,20 @@ class _How:
     as_json: bool
 
 
-@click.group("skin-calibrate", context_settings=CONTEXT_SETTINGS)
-@version_option
+@click.group("skin-calibrate", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
-    """Find where the sensors of a skin are, by touching it; check a geometry.
+    """Find the places of sensors by touching the skin; check a geometry.
 
-    Gathering ends when enough is there, or with Enter. Ctrl-C interrupts it: what was gathered is in a state file, and
-    the same command goes on with it.
+    Gathering ends when there is enough, or with Enter. Ctrl-C interrupts it: gathered data stay in a state file, and
+    the same command continues with them.
     """
 
 
 @command.command(
-    epilog=examples(
+    epilog=cli.examples(
         "skin-calibrate topology -o map.toml                    stroke the skin for some minutes",
-        "skin-calibrate topology --namespace calm -o map.toml    with what skin-calm publishes",
+        "skin-calibrate topology --namespace calm -o map.toml    with the driver of skin-calm",
     )
 )
 @_output
@@ -119,8 +110,8 @@ def command() -> None:
 def topology(file: Path, pitch_m: float, **options: Any) -> None:
     """Find which sensors lie side by side, from strokes with a finger, and draw a map of each piece of skin.
 
-    Nothing but a finger is needed. Curved pieces come out unrolled. The longer, the better: it goes on until 95 % of
-    the sensors have felt the finger in 20 frames.
+    Only a finger is needed. Curved pieces are unrolled. It ends when 95 % of the sensors have felt the finger in 20
+    frames; longer strokes give better maps.
     """
     import numpy as np
 
@@ -137,7 +128,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
         groups = unrolled_groups(gathering.structure, gathering.type_name, found)
         file.write_text(geometry_to_toml(groups, unrolled_comment(found)), encoding="utf-8")
     pieces = np.bincount(found.piece[found.piece >= 0]).tolist()
-    _tell_done(
+    _report_done(
         how.as_json,
         {"file": str(file), "placed": sum(pieces), "pieces": pieces, "neighbours": len(found.pairs)},
         f"{file}: {sum(pieces)} sensors in {plural(len(pieces), 'piece')}, {len(found.pairs)} pairs of neighbours",
@@ -145,7 +136,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
 
 
 @command.command(
-    epilog=examples(
+    epilog=cli.examples(
         "skin-calibrate touch --poses robot -o skin.toml                       the robot publishes point_m",
         "skin-calibrate touch --poses robot --layout cad.toml -o skin.toml     modules are shaped as in cad.toml",
     )
@@ -153,14 +144,14 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
 @_output
 @_pressing
 @click.option("--column", metavar="NAME", default="point_m", show_default=True, help="With the points, metres.")
-@click.option("--layout", metavar="FILE", type=_PATH, help="Geometry whose modules have the right shapes.")
+@click.option("--layout", metavar="FILE", type=cli.FILE, help="Geometry whose modules have the right shapes.")
 @click.option(
     "--offset",
     "offset_m",
     type=float,
     metavar="M",
     default=0.0,
-    help="From sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
+    help="Distance from sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
 )
 @_pitch
 @_gathering
@@ -176,17 +167,17 @@ def touch(
     pitch_m: float,
     **options: Any,
 ) -> None:
-    """Find where the sensors are, from presses at points that a service publishes.
+    """Find the places of sensors from presses at points that a service publishes.
 
-    A press is a touch whose point rests for 0.2 s. Wrong ones are found and left out. With the shapes of the modules
-    places are twice as good, sensors that were not touched are placed too, and it is known where outside is.
+    A press is a touch whose point rests for 0.2 s. Wrong presses are found and left out. With the shapes of the
+    modules, places are twice as good, untouched sensors are placed too, and normals are known.
     """
     from skinware.tactile.calibration.placing import place
     from skinware.tactile.calibration.state import PressSession
 
     how = _How(**options)
     if offset_m and layout is None:
-        raise click.UsageError("--offset needs --layout: which way is out?")
+        raise click.UsageError("--offset needs --layout, which has the normals")
     session_of = partial(PressSession, wanted=touches)
     where = (service, poses_namespace, column, (3,))
     with _opened(_beside(file, how), session_of, how, where) as (gathering, session):
@@ -194,11 +185,11 @@ def touch(
         gathering.run(_PRESS, how.share, how.duration_s)
         placement = place(session.presses, shapes, offset_m=offset_m)
         _write(file, gathering, placement, frame or service, pitch_m)
-    _tell_placed(how.as_json, file, placement, {}, "")
+    _report_placed(how.as_json, file, placement, {}, "")
 
 
 @command.command(
-    epilog=examples(
+    epilog=cli.examples(
         "skin-calibrate finger --poses robot --layout cad.toml -o skin.toml    the robot publishes pose, 4 x 4",
         "skin-calibrate finger --poses robot --layout cad.toml --tip 0 0 0.12 -o skin.toml",
     )
@@ -207,10 +198,15 @@ def touch(
 @_pressing
 @click.option("--column", metavar="NAME", default="pose", show_default=True, help="With the poses, 4 x 4, metres.")
 @click.option(
-    "--layout", metavar="FILE", type=_PATH, required=True, help="Geometry whose modules have the right shapes."
+    "--layout", metavar="FILE", type=cli.FILE, required=True, help="Geometry whose modules have the right shapes."
 )
 @click.option(
-    "--tip", "tip_m", type=float, nargs=3, default=(0, 0, 0), help="Where the tip may be, in the carrier's frame."
+    "--tip",
+    "tip_m",
+    type=float,
+    nargs=3,
+    default=(0, 0, 0),
+    help="Estimate of the tip in the frame of its carrier.",
 )
 @_pitch
 @_gathering
@@ -226,10 +222,10 @@ def finger(
     pitch_m: float,
     **options: Any,
 ) -> None:
-    """Find where the modules are and how long the finger is, from poses of what carries the finger.
+    """Find the places of modules and the length of the finger, from poses of the part that carries the finger.
 
-    For robots that touch themselves: the pose of the hand is known, in the frame of the skin, but not exactly where the
-    tip of the finger is.
+    For robots that touch themselves: the pose of the hand is known in the coordinate frame of the skin, but the tip of
+    the finger is not known exactly.
     """
     from skinware.tactile.calibration.finger import place_finger
     from skinware.tactile.calibration.state import PressSession
@@ -244,24 +240,24 @@ def finger(
         _write(file, gathering, found.placement, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
     words = f"; the tip is at {', '.join(f'{_MM * number:.1f}' for number in tip)} mm"
-    _tell_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+    _report_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
 
 
 @command.command(
-    epilog=examples(
+    epilog=cli.examples(
         "skin-calibrate check skin.toml                       stroke the skin for some minutes",
         "skin-calibrate check skin.toml --state map.toml.state.npz -T 0    with strokes of skin-calibrate topology",
     )
 )
-@click.argument("file", metavar="GEOMETRY", type=_PATH)
+@click.argument("file", metavar="GEOMETRY", type=cli.FILE)
 @_pitch
 @_gathering
 @click.pass_context
 def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any) -> None:
     """Compare a geometry with strokes over the skin.
 
-    Names modules and patches that are at each other's places, modules that are mirrored or turned, sensors at one place
-    or without any, and sensors that are more than 10 mm off.
+    Reports exchanged modules and patches, mirrored and turned modules, sensors that share a place or have none, and
+    sensors that are more than 10 mm off.
 
     Exit status: 0 nothing found, 1 something is wrong.
     """
@@ -286,16 +282,16 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
             print_json({"event": "finding", **finding_data(finding, structure, type_name)})
         else:
             echo(finding_text(finding, structure, type_name))
-    _tell_done(
+    _report_done(
         how.as_json,
         {"file": str(file), "findings": len(found), "compared": session.sums.frames > 0},
         f"{file}: {len(found) or 'nothing'} found{'' if session.sums.frames else '; no strokes to compare it with'}",
     )
-    context.exit(EXIT_FAILED if found else EXIT_DONE)
+    context.exit(cli.EXIT_FAILED if found else cli.EXIT_DONE)
 
 
 def _beside(file: Path, how: _How) -> Path:
-    """The state file: the one that was given, or beside the geometry."""
+    """Return the state file: the given one, or one beside the geometry."""
     return how.state or file.with_name(f"{file.name}.state.npz")
 
 
@@ -306,11 +302,11 @@ def _opened(
     how: _How,
     poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[Gathering, Any]]:
-    """What gathers, with driver and poses open, and the session that it gathers into.
+    """Yield a gathering, with driver and poses open, and its session.
 
     Args:
-        state_path: where what was gathered is kept.
-        session_of: makes a session of a number of sensors.
+        state_path: file of gathered data.
+        session_of: makes a session for a number of sensors.
         how: options of all commands that gather.
         poses: service, its namespace, column and shape.
     """
@@ -357,21 +353,21 @@ def _write(file: Path, gathering: Gathering, placement: Placement, frame: str, p
     file.write_text(geometry_to_toml(groups, placed_comment(structure, type_name, placement)), encoding="utf-8")
 
 
-def _tell_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
+def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
     known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
     figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
     text = (
         f"{file}: {known} sensors placed, {wrong} presses left out, residual {_MM * placement.spread_m:.1f} mm{words}"
     )
-    _tell_done(as_json, {"file": str(file), **figures, **also}, text)
+    _report_done(as_json, {"file": str(file), **figures, **also}, text)
 
 
-def _tell_done(as_json: bool, told: Mapping[str, Any], words: str) -> None:
+def _report_done(as_json: bool, result: Mapping[str, Any], words: str) -> None:
     if as_json:
-        print_json({"event": "done", **told})
+        print_json({"event": "done", **result})
     else:
         echo(words)
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

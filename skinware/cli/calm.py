@@ -1,4 +1,4 @@
-"""``skin-calm``: publish a driver with baselines that hold."""
+"""``skin-calm``: publish a driver with 0 where nothing touches it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    group_option,
-    json_option,
-    log_to_stderr,
-    namespace_option,
-    run,
-    signals_end,
-    verbose_option,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -30,11 +18,11 @@ if TYPE_CHECKING:
 
 @click.command(
     "skin-calm",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-calm torso                        skin-top --namespace calm shows it",
         "skin-calm torso --config chain.toml    with a filter, or in N",
-        "skin-calm torso --regions parts.toml   and where to what touches its parts moves",
+        "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
         "skin-calm torso --into quiet           into another namespace",
     ),
 )
@@ -42,35 +30,35 @@ if TYPE_CHECKING:
 @click.option(
     "--into",
     metavar="NAMESPACE",
-    help="Where the calmed driver is.  [default: calm; of drivers in another namespace than 'default', NAMESPACE-calm]",
+    help="Namespace of the calmed driver.  [default: calm; NAMESPACE-calm for drivers outside 'default']",
 )
 @click.option(
     "--config",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="TOML file with the stages: baseline, curve, filter, scaler, amplifier.  [default: a baseline]",
 )
 @click.option(
     "--state",
     "state_path",
     metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Where baselines and health are kept over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
+    type=cli.FILE,
+    help="File that keeps baselines and health over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
 )
 @click.option(
     "--contacts",
     metavar="NAME",
     default="contacts",
     show_default=True,
-    help="Name of the service of its contacts, beside it; NAME-contacts, if that is taken; empty: none.",
+    help="Name of the service of its contacts; NAME-contacts if that is taken; empty: none.",
 )
 @click.option(
     "--regions",
     "region_files",
     multiple=True,
     metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="File with regions, whose motion is published beside the contacts; repeat it for several.",
+    type=cli.FILE,
+    help="File with regions whose motion is published; may be repeated.",
 )
 @click.option("--motion", metavar="NAME", default="motion", show_default=True, help="Name of the service of motion.")
 @click.option(
@@ -78,13 +66,13 @@ if TYPE_CHECKING:
     metavar="NAME",
     default="health",
     show_default=True,
-    help="Name of the service of its sensors' health, beside it; empty: none, and no sensor is marked.",
+    help="Name of the service of its sensors' health; empty: none, and no sensor is marked.",
 )
-@group_option
-@namespace_option
-@json_option
-@version_option
-@verbose_option
+@cli.group_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
+@cli.verbose_option
 def command(
     name: str,
     into: str | None,
@@ -99,12 +87,12 @@ def command(
     as_json: bool,
     verbose: bool,
 ) -> None:
-    """Calm driver NAME: 0 = no touch, whatever drifts, under the same name in another namespace.
+    """Publish driver NAME again in another namespace, with 0 where nothing touches it, whatever drifts.
 
-    The first seconds it measures what untouched sensors read. It goes on when the driver restarts or changes; what it
-    learned is kept for 10 minutes over a restart of its own. Programs may ask it to tare, hold and change settings.
-    Beside the driver it publishes its contacts, of pressure sensors if there are any, and the health of its sensors:
-    stuck, noisy, clipped, dead and weak ones have the status UNHEALTHY (skin-info --health tells why).
+    In the first seconds the untouched skin is measured. Restarts and changes of the driver do not end it. A restart of
+    skin-calm itself keeps baselines for 10 minutes. Programs can call operations: tare, hold, change settings. It also
+    publishes the contacts of the driver, of pressure sensors if there are any, and the health of its sensors: stuck,
+    noisy, clipped, dead and weak sensors get the status UNHEALTHY (skin-info --health shows why).
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
@@ -115,7 +103,7 @@ def command(
     from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
 
-    log_to_stderr(verbose)
+    cli.log_to_stderr(verbose)
     check_name(name, "driver")
     for service_name in filter(None, (contacts, motion, health)):
         check_name(service_name, "service")
@@ -137,17 +125,17 @@ def command(
     if name not in services:
         nearest = difflib.get_close_matches(name, services, n=1)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
-        there_are = ", ".join(services) or "none"
-        warn(f"waiting for driver {name!r} in {source.name!r}{hint} There are: {there_are}")
-    with signals_end(service.stop):
-        report = (lambda: _tell_status(service)) if as_json else lambda: None
-        service.run(report, on_ready=lambda: _tell_ready(service, as_json))
+        others = ", ".join(services) or "none"
+        cli.warn(f"waiting for driver {name!r} in {source.name!r}{hint} There are: {others}")
+    with cli.signals_end(service.stop):
+        report = (lambda: _report_status(service)) if as_json else lambda: None
+        service.run(report, on_ready=lambda: _report_ready(service, as_json))
     if as_json:
         with contextlib.suppress(BrokenPipeError):
             print_json({"event": "stopped", "name": service.name, **service.status()})
 
 
-def _tell_ready(service: CalmService, as_json: bool) -> None:
+def _report_ready(service: CalmService, as_json: bool) -> None:
     chain = service.chain
     if chain is None:
         return
@@ -169,13 +157,13 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         ]
         restored = f"; goes on with {service.restored} baselines" if service.restored else ""
         echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
-        there = ", ".join(filter(None, beside.values()))
-        there = f" and, beside it, {there}" if there else ""
-        echo(f"publishing it{there} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+        services = ", ".join(filter(None, beside.values()))
+        services = f" and, beside it, {services}" if services else ""
+        echo(f"publishing it{services} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
 
 
 def _services_beside(service: CalmService) -> dict[str, str]:
-    """Names of the services of contacts, motion and health; empty: there is none."""
+    """Return the names of the services of contacts, motion and health; empty: there is none."""
     contacts, health = service.contacts, service.health
     return {
         "contacts": contacts.name if contacts is not None else "",
@@ -184,7 +172,7 @@ def _services_beside(service: CalmService) -> dict[str, str]:
     }
 
 
-def _tell_status(service: CalmService) -> None:
+def _report_status(service: CalmService) -> None:
     try:
         print_json({"event": "status", "name": service.name, **service.status()})
     except BrokenPipeError:
@@ -192,4 +180,4 @@ def _tell_status(service: CalmService) -> None:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)

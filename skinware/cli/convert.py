@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    run,
-    seconds,
-    signals_end,
-    version_option,
-    warn,
-)
-from skinware.cli._regions import regions_asked_for, regions_option
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -28,14 +18,12 @@ if TYPE_CHECKING:
     from skinware.conversion.converting import Converted
     from skinware.conversion.learning import LearningSet
 
-_Command = Callable[..., Any]
-
 
 def _window(text: str) -> int:
-    """How many frames; 0: all.
+    """Return a number of frames; 0: all.
 
     Raises:
-        click.BadParameter: it is no number of frames.
+        click.BadParameter: the text is no such number.
     """
     if text == "all":
         return 0
@@ -49,30 +37,30 @@ _OPTIONS = (
         "--also",
         metavar="FILE",
         multiple=True,
-        type=click.Path(path_type=Path),
-        help="Of lerobot: a further recording; repeat it for several.",
+        type=cli.FILE,
+        help="lerobot: a further recording; may be repeated.",
     ),
     click.option(
-        "--fps", type=click.IntRange(1), default=30, show_default=True, metavar="N", help="Likewise: rows a second."
+        "--fps", type=click.IntRange(1), default=30, show_default=True, metavar="N", help="lerobot: rows a second."
     ),
-    click.option("--task", metavar="TEXT", help="Likewise: what is done in it.  [default: FILE's name]"),
+    click.option("--task", metavar="TEXT", help="lerobot: the task that is shown.  [default: FILE's name]"),
     click.option(
         "--episode",
         metavar="START..END",
         multiple=True,
-        help="Likewise: an episode, s since the recording began; repeat it for several.  [default: all of it is one]",
+        help="lerobot: an episode, s since the recording began; may be repeated.  [default: all of it is one]",
     ),
     click.option(
         "--episodes",
         metavar="CSV",
-        type=click.Path(path_type=Path),
-        help="Likewise: a file of episodes: start_s,end_s,task,file.",
+        type=cli.FILE,
+        help="lerobot: a file of episodes: start_s,end_s,task,file.",
     ),
     click.option(
         "--gap",
-        type=seconds,
+        type=cli.seconds,
         metavar="SECONDS",
-        help="Likewise: where a driver published nothing for longer, the next episode begins.",
+        help="lerobot: a longer silence of a driver begins the next episode.",
     ),
     click.option(
         "--window",
@@ -80,32 +68,32 @@ _OPTIONS = (
         default="1",
         show_default=True,
         metavar="N",
-        help="Likewise: of how many frames of a driver each row has the values; all: as many as come between two rows.",
+        help="lerobot: frames of a driver in each row; all: every frame between two rows.",
     ),
     click.option(
         "--join",
         metavar="FEATURE=FILE[:COLUMN,...]",
         multiple=True,
-        help="Likewise: columns of a CSV, Parquet or NPZ file with times, as a feature; repeat it for several.",
+        help="lerobot: columns of a CSV, Parquet or NPZ file with times, as a feature; may be repeated.",
     ),
     click.option(
         "--match",
         type=click.Choice(["previous", "nearest"]),
         default="previous",
         show_default=True,
-        help="Likewise: which time of those is a row's.",
+        help="lerobot: which of those times belongs to a row.",
     ),
     click.option(
         "--within",
-        type=seconds,
+        type=cli.seconds,
         metavar="SECONDS",
-        help="Likewise: how far from the row that may be.  [default: the time between two rows]",
+        help="lerobot: longest distance of that time from the row.  [default: the time between two rows]",
     ),
     click.option(
-        "--at", metavar="FEATURE", default="", help="Likewise: rows at the times of a joined feature: of a camera."
+        "--at", metavar="FEATURE", default="", help="lerobot: rows at the times of a joined feature, such as a camera."
     ),
     click.option(
-        "--each-structure", is_flag=True, help="Likewise: a set for each structure of the drivers, in folders 1, 2 ..."
+        "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."
     ),
 )
 _NAMES = (
@@ -114,21 +102,20 @@ _NAMES = (
 )
 
 
-def learning_options(command: _Command) -> _Command:
-    """Gives them to a command, as further keyword arguments, for :func:`learning_set`."""
+def _learning_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
 
 
-def asked_for() -> list[str]:
+def _asked_for() -> list[str]:
     context = click.get_current_context()
     given = [name for name in _NAMES if context.get_parameter_source(name) is not ParameterSource.DEFAULT]
     return ["--" + name.replace("_", "-") for name in given]
 
 
-def learning_set(options: Mapping[str, Any]) -> tuple[list[Path], LearningSet]:
-    """Further recordings, and how a set is made of all of them.
+def _learning_set(options: Mapping[str, Any]) -> tuple[list[Path], LearningSet]:
+    """Return further recordings, and the set to make of all of them.
 
     Raises:
         ConfigurationError: an option is wrong.
@@ -160,13 +147,13 @@ _LEARNING_FORMATS = ("lerobot",)
 
 @click.command(
     "skin-convert",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-convert walk.mcap --to npz                        writes walk.npz",
         "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
         "skin-convert walk.mcap --to parquet --region palm -o palm",
         "skin-convert walk.mcap --to mcap --end 12 -o part.mcap a part, still a recording",
-        "skin-convert walk.mcap --to candump                    what went over CAN buses, for canplayer",
+        "skin-convert walk.mcap --to candump                    the frames on CAN buses, for canplayer",
         "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
         "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
         "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
@@ -181,22 +168,18 @@ _LEARNING_FORMATS = ("lerobot",)
     required=True,
     help="Format to write.",
 )
+@cli.output_option("The new file, or folder for csv, parquet, ros2 and lerobot.  [default: beside FILE]", metavar="OUT")
+@click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; may be repeated.")
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated.")
 @click.option(
-    "-o",
-    "--output",
-    metavar="OUT",
-    type=click.Path(path_type=Path),
-    help="The new file; of csv, parquet, ros2 and lerobot, folder.  [default: beside FILE]",
+    "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
 )
-@click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; repeat it for several.")
-@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; likewise.")
-@click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; likewise.")
-@regions_option
-@click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
-@click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
-@learning_options
-@json_option
-@version_option
+@cli.regions_option
+@click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
+@click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
+@_learning_options
+@cli.json_option
+@cli.version_option
 def command(
     file: Path,
     names: tuple[str, ...],
@@ -213,29 +196,31 @@ def command(
 ) -> None:
     """Write a recording in another format: all drivers and services in it, or only NAME...
 
-    candump and pcapng are of what went over the buses, if that was recorded (skin-record --wire). lerobot is a learning
-    set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
+    candump and pcapng contain the frames on the buses, if they were recorded (skin-record --wire). lerobot is a
+    learning set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
 
-    FILE may also be what this command wrote as npz, hdf5 or parquet. It is only read; what is damaged in it is left out
-    and told. The new file is there when it is complete, not before.
+    FILE may also be a file that this command wrote as npz, hdf5 or parquet. FILE does not change; its damaged parts are
+    left out and reported. The new file appears when it is complete.
     """
-    selection = _selection(names, types, patches, in_regions, region_files)
+    from skinware.conversion import Selection
+
+    selection = Selection(names, types, patches, cli.regions_asked_for(in_regions, region_files), in_regions)
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
-    asked = asked_for()
+    asked = _asked_for()
     if asked and format_name not in _LEARNING_FORMATS:
         raise click.UsageError(f"{asked[0]} is for --to {', '.join(_LEARNING_FORMATS)}")
     stop = Event()
-    with signals_end(stop.set):  # not in the middle of what libraries do
+    with cli.signals_end(stop.set):  # not inside a library
         converted = _written(
             file, output, format_name, selection, learning, start_s=start_s, end_s=end_s, is_stopped=stop.is_set
         )
     for note in converted.notes:
-        warn(note)
+        cli.warn(note)
     in_episodes = {"episodes": converted.episodes} if converted.episodes is not None else {}
     if as_json:
-        told = {"file": str(converted.path), "format": format_name, "frames": dict(converted.frames), **in_episodes}
-        print_json({"event": "converted", **told, "notes": converted.notes})
+        result = {"event": "converted", "file": str(converted.path), "format": format_name}
+        print_json({**result, "frames": dict(converted.frames), **in_episodes, "notes": converted.notes})
         return
     frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
     echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
@@ -254,23 +239,11 @@ def _written(
     if format_name in _LEARNING_FORMATS:
         from skinware.conversion.learning import convert_to_learning_set
 
-        also, wanted = learning_set(learning)
+        also, wanted = _learning_set(learning)
         return convert_to_learning_set([file, *also], output, wanted, selection, **time_and_end)
     write = convert_wires if format_name in _WIRE_FORMATS else convert
     return write(file, output, format_name, selection, **time_and_end)
 
 
-def _selection(
-    names: tuple[str, ...],
-    types: tuple[str, ...],
-    patches: tuple[str, ...],
-    in_regions: tuple[str, ...],
-    region_files: tuple[Path, ...],
-) -> Selection:
-    from skinware.conversion import Selection
-
-    return Selection(names, types, patches, regions_asked_for(in_regions, region_files), in_regions)
-
-
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -1,4 +1,4 @@
-"""``skin-dump``: print frames."""
+"""``skin-dump``: print the snapshots of a driver."""
 
 from __future__ import annotations
 
@@ -8,21 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from skinware._columns import Index
     from skinware.driver_service import DriverReader
     from skinware.driver_snapshot import DriverSnapshot
@@ -34,8 +23,8 @@ _LOOK_EVERY_S = 0.1
 
 @click.command(
     "skin-dump",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-dump -n 3                              three frames",
         "skin-dump -T 2 --type pressure              fail if no frame arrives for 2 s",
         "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
@@ -43,14 +32,14 @@ _LOOK_EVERY_S = 0.1
 )
 @click.argument("name", required=False)
 @click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
-@click.option("-T", "timeout_s", type=seconds, help="Fail after SECONDS without a frame; also wait for the driver.")
-@click.option("--type", "type_name", metavar="TYPE", help="Only the sensors of one type, such as pressure.")
+@cli.timeout_option("Fail after SECONDS without a frame; also wait for the driver.")
+@cli.type_option("Only the sensors of one type, such as pressure.")
 @click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
 @click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
 @click.option("--physical", is_flag=True, hidden=True)
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 def command(
     name: str | None,
     count: int | None,
@@ -62,7 +51,7 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
+    """Print the frames of driver NAME, or of the only one, each once and in order.
 
     Values are physical, in the unit of their type, as skin-top shows them.
 
@@ -75,7 +64,7 @@ def command(
     if physical:
         if counts:
             raise click.UsageError("--counts and --physical are opposites")
-        warn("--physical is not needed any more: values are physical")
+        cli.warn("--physical is not needed any more: values are physical")
     taken = 0
     with _attach(Namespace(namespace), name, timeout_s) as reader:
         _check_type(reader.structure, type_name)
@@ -92,9 +81,11 @@ def command(
 
 
 def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, counts: bool) -> dict[str, Any]:
-    """One frame as JSON prints it; with ``type_name`` only those sensors, and their uids."""
+    """Return a snapshot for JSON; with ``type_name`` only those sensors, with their uids."""
+    from skinware.views.quantities import physical_values
+
     index: Index = slice(None) if type_name is None else frame.structure.index(type_name)
-    values = (frame.values if counts else _physical(frame))[index]
+    values = (frame.values if counts else physical_values(frame))[index]
     data = {
         "driver": reader.name,
         "sequence": frame.sequence,
@@ -110,13 +101,14 @@ def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, 
 
 
 def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
-    """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
+    """Return a snapshot for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
-    from skinware.text import age_text, figure_text
+    from skinware.text import NO_VALUE, age_text, figure_text
+    from skinware.views.quantities import physical_values
 
     parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
-    all_values = frame.values if counts else _physical(frame)
+    all_values = frame.values if counts else physical_values(frame)
     not_fresh = 0
     for sensor_type in frame.structure.types:
         if type_name in (None, sensor_type.name):
@@ -124,7 +116,7 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
             fresh = frame.status[index] == 0
             not_fresh += int(np.count_nonzero(~fresh))
             values = all_values[index][fresh]
-            figures, mean = "-", ""
+            figures, mean = NO_VALUE, ""
             if len(values):
                 figures, mean = (
                     f"{figure_text(values.min(), 5)} to {figure_text(values.max(), 5)}",
@@ -132,16 +124,6 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
                 )
             parts.append(f"{sensor_type.name} {figures} {'raw' if counts else sensor_type.unit}{mean}")
     return "  ".join([*parts, f"{not_fresh} not fresh"])
-
-
-def _physical(frame: DriverSnapshot) -> npt.NDArray[Any]:
-    """(n_sensors,) float32: every value in the unit of its type."""
-    import numpy as np
-
-    values = np.empty(frame.structure.n_sensors, np.float32)
-    for sensor_type in frame.structure.types:
-        values[frame.structure.index(sensor_type.name)] = frame.physical(sensor_type.name)
-    return values
 
 
 def _check_type(structure: Structure, type_name: str | None) -> None:
@@ -162,12 +144,12 @@ def _attach(namespace: Namespace, name: str | None, timeout_s: float | None) -> 
         name = _only_driver(namespace, end_s)
     reader = DriverReader(name, namespace=namespace, timeout_s=max(0.0, end_s - time.monotonic()))
     if not reader.alive:
-        warn(f"driver {name!r} is dead; this is its last frame. Waiting for it to come back")
+        cli.warn(f"driver {name!r} is dead; this is its last frame. Waiting for it to come back")
     return reader
 
 
 def _only_driver(namespace: Namespace, end_s: float) -> str:
-    """The one living driver, else the one dead one.
+    """Return the only living driver, or else the only dead one.
 
     Raises:
         ConfigurationError: there are several.
@@ -204,12 +186,12 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
                 if service.kind == KIND:
                     found[name] = service.alive
         except (BadServiceFile, ConfigurationError, ServiceNotFound):
-            continue  # nothing that can be read, or just withdrawn
+            continue  # it cannot be read, or was just withdrawn
     return found
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    """Frames indefinitely, over restarts of the driver; says on stderr when it came back."""
+    """Yield snapshots without end, also after restarts of the driver, which are reported on stderr."""
     from skinware.errors import StructureChanged
     from skinware.text import plural
 
@@ -220,17 +202,17 @@ def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None
             for frame in frames:
                 if frame.generation != generation:
                     generation = frame.generation
-                    warn(f"driver {reader.name!r} was started again")
+                    cli.warn(f"driver {reader.name!r} was started again")
                 yield frame
         except StructureChanged:
             _reattach(reader, timeout_s)
             generation = reader.generation
             sensors = plural(reader.structure.n_sensors, "sensor")
-            warn(f"driver {reader.name!r} came back with another structure: {sensors} now")
+            cli.warn(f"driver {reader.name!r} came back with another structure: {sensors} now")
 
 
 def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
-    """Go over to the driver's new structure; if it is gone again already, wait for it.
+    """Read the driver's new structure, and wait for a driver that is gone again.
 
     Raises:
         ServiceNotFound: it was gone for ``timeout_s``.
@@ -249,11 +231,11 @@ def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
 
 
 def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    """The newest frame at the deadlines of a rate, each frame once.
+    """Yield the newest snapshot at the deadlines of a rate, each once.
 
     Raises:
         StructureChanged: the driver came back with another structure.
-        ServiceTimeout: no newer frame for ``timeout_s``.
+        ServiceTimeout: no newer snapshot for ``timeout_s``.
     """
     from skinware.realtime import Periodic
 
@@ -266,4 +248,4 @@ def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> I
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

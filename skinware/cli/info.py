@@ -1,4 +1,4 @@
-"""``skin-info``: who publishes in a namespace, and who reads."""
+"""``skin-info``: show drivers, services and readers of a namespace."""
 
 from __future__ import annotations
 
@@ -10,26 +10,31 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
-from skinware.text import NO_VALUE, NOT_FRESH, age_text, count_text, plural, rate_text, state_shown, table, wrapped
+from skinware.text import (
+    NO_VALUE,
+    NOT_FRESH,
+    age_text,
+    age_text_ms,
+    count_text,
+    plural,
+    rate_text,
+    state_shown,
+    table,
+    words,
+    wrapped,
+)
 from skinware.views.bridges import as_lines
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
 
 _WATCH_PERIOD_S = 1.0
-_OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
-"""What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
-and of an update's age when it was published."""
-_ABOUT_A_PATCH = "99 %: 99th percentile; interval: time between two updates; delay: time until publication"
+_TIMES_OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
+"""Columns of a patch, where its driver publishes them: 99th percentile of the time between two updates of a module, and
+of the age of an update when it was published."""
+_ABOUT_TIMES = "99 %: 99th percentile; interval: time between two updates; delay: time until publication"
 _INDENT = 2
 _LIFE_COLOURS = {
     "live": "green",
@@ -43,11 +48,11 @@ _LIFE_COLOURS = {
 
 @click.command(
     "skin-info",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-info                       everything in this namespace",
         "skin-info roboskin --sensors    every sensor of one driver, in frame order",
-        "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm finds them",
+        "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm found them",
         "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
     ),
 )
@@ -61,9 +66,9 @@ _LIFE_COLOURS = {
 @click.option(
     "--watch", is_flag=True, help="Update every second; many patches share a line where the terminal is too low."
 )
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 def command(name: str | None, sensors: bool, health: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
     """Show all drivers with their buses and patches, other services, and their readers.
 
@@ -95,13 +100,11 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
 
 
 def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
-    """The report for people, as lines with colours (which ``echo`` takes out where there is no terminal).
-
-    On a terminal no line is wider than it.
+    """Return the report for people, as lines with colours; on a terminal no line is wider than it.
 
     Args:
         found: the report.
-        brief: patches of a bus that are in order share a line.
+        brief: patches of a bus without problems share a line.
     """
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
@@ -127,8 +130,8 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
     untouched = sum(patch["untouched"] for patch in driver["patch_list"])
-    told = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
-    timed = _OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
+    columns = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
+    timed = _TIMES_OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
     timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     lines = [
         f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
@@ -136,8 +139,8 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         "",
         *_counter_table(
             driver["buses"],
-            ("bus", "state", *told),
-            lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in told.values())),
+            ("bus", "state", *columns),
+            lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in columns.values())),
             {"frames", "lost"},
         ),
         *_sample_lines(driver["buses"]),
@@ -150,12 +153,12 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
                 patch["bus"],
                 _state(driver, patch),
                 f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
-                age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+                age_text_ms(patch["age_ms"]),
                 *(_bound(patch[key]) for key in timed.values()),
             ),
             {"orphans"},
         ),
-        *([_ABOUT_A_PATCH] if timed else []),
+        *([_ABOUT_TIMES] if timed else []),
         *_path_lines(driver),
     ]
     return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
@@ -170,7 +173,7 @@ def _path_lines(driver: dict[str, Any]) -> list[str]:
 
 
 def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
-    """Patches of which something is to be told, each; the others of each bus as if they were one."""
+    """Return patches with a problem one by one, and the others of each bus as if they were one."""
     good: dict[str, list[dict[str, Any]]] = {}
     for patch in driver["patch_list"]:
         if driver["state"] == patch["state"] == "live" and patch["fresh"] == patch["sensors"]:
@@ -184,15 +187,15 @@ def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
             for key, first in patches[0].items():
                 if isinstance(first, int):
                     entry[key] = sum(patch[key] for patch in patches)
-            for key in _OF_A_PATCH.values():
+            for key in _TIMES_OF_A_PATCH.values():
                 if key in entry:
-                    entry[key] = max((patch[key] for patch in patches), key=lambda told: told["p99_ns"] or 0)
+                    entry[key] = max((patch[key] for patch in patches), key=lambda times: times["p99_ns"] or 0)
         entries.append(entry)
     return entries
 
 
 def _content_lines(service: dict[str, Any]) -> list[str]:
-    """What a bridge tells; what the frames of another service that is no driver consist of."""
+    """Return the state of a bridge, or the columns of another service."""
     if service.get("bridge") is not None:
         return [*as_lines(service["bridge"]["robot"], service["bridge"]), ""]
     rows = [
@@ -215,16 +218,16 @@ def _dtype_text(descr: Any) -> str:
 
 
 def _statistics_lines(entry: dict[str, Any]) -> list[str]:
-    """How long its writer takes, once it has published anything."""
-    told = entry["statistics"]
-    if not told["wall"]["count"]:
+    """Return the times of a writer, once it has published anything."""
+    statistics = entry["statistics"]
+    wall, cpu = statistics["wall"], statistics["cpu"]
+    if not wall["count"]:
         return []
-    wall, cpu = told["wall"], told["cpu"]
     mean, worst, on_cpu = age_text(wall["mean_ns"]), age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
     lines = [f"a frame takes {mean} to fill (worst {worst}); with all else {on_cpu} of processor time"]
-    lines.append(f"99 % of its frames are published at most {_bound(told['age'])} after their newest data")
-    if told["lateness"]["p99_ns"] is not None:
-        lines.append(f"99 % of its periods begin up to {_bound(told['lateness'])} late")
+    lines.append(f"99 % of its frames are published at most {_bound(statistics['age'])} after their newest data")
+    if statistics["lateness"]["p99_ns"] is not None:
+        lines.append(f"99 % of its periods begin up to {_bound(statistics['lateness'])} late")
     return lines
 
 
@@ -233,7 +236,7 @@ def _bound(histogram: dict[str, Any]) -> str:
 
 
 def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
-    """State of a bus or patch: the last one that is known, where the driver says nothing new."""
+    """Return the state of a bus or patch; ``was live`` if the driver publishes nothing new."""
     if part["state"] is None:
         return NO_VALUE
     if driver["state"] != "live":
@@ -241,29 +244,22 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     return state_shown(part["state"], part["fresh"], part["sensors"]) if "fresh" in part else part["state"]
 
 
-def _reason(bus: dict[str, Any]) -> str | None:
-    reason = bus.get("reason")
-    return reason and reason.replace("_", "-")
-
-
-def _duration(bus: dict[str, Any]) -> str | None:
-    age_s = bus.get("state_age_s")
-    return None if age_s is None else age_text(age_s * 1e9)
-
-
 def _load(bus: dict[str, Any]) -> str | None:
-    """How much of the bus' time is in use."""
     if bus.get("load_unknown") == "filter":
         return "unknown (filter)"
     return None if bus.get("load") is None else f"{100 * bus['load']:.0f} %"
 
 
-_OF_A_BUS = {"reason": _reason, "for": _duration, "load": _load}
-"""What is shown of a bus where it is told, by the column's title."""
+_OF_A_BUS: dict[str, Callable[[dict[str, Any]], str | None]] = {
+    "reason": lambda bus: (bus.get("reason") or "").replace("_", "-"),
+    "for": lambda bus: None if bus.get("state_age_s") is None else age_text(bus["state_age_s"] * 1e9),
+    "load": _load,
+}
+"""Columns of a bus that are shown where any bus has a text for them."""
 
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:
-    life, age = entry["state"], age_text(None if entry["age_ms"] is None else entry["age_ms"] * 1e6)
+    life, age = entry["state"], age_text_ms(entry["age_ms"])
     patches = entry.get("patch_list", ())
     shown = state_shown(life, sum(patch["fresh"] for patch in patches), entry.get("sensors", 0))
     parts = [style(life, fg=_LIFE_COLOURS.get(shown), bold=True)]
@@ -289,7 +285,7 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
 
 _OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown", "samples", "data_path"}
 _OWN_KEYS |= {"bus", "age_ms", "modules", "sensors", "fresh"}
-_OWN_KEYS |= set(_OF_A_PATCH.values())
+_OWN_KEYS |= set(_TIMES_OF_A_PATCH.values())
 
 
 def _counter_table(
@@ -298,24 +294,22 @@ def _counter_table(
     cells: Callable[[dict[str, Any]], tuple[str, ...]],
     always: set[str],
 ) -> list[str]:
-    """Rows with those of their counters that are not 0 everywhere (and ``always``, where there are such counters)."""
+    """Return rows with their counters that are not 0 everywhere, and with those in ``always``."""
     names = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in _OWN_KEYS]
     shown = [name for name in names if name in always or any(row.get(name) for row in rows)]
     return _table(
-        [*titles, *(name.replace("_", " ") for name in shown)],
+        [*titles, *map(words, shown)],
         [[*cells(row), *(count_text(row.get(name)) for name in shown)] for row in rows],
         left=min(len(titles), 3),
     )
 
 
 def _sample_lines(buses: list[dict[str, Any]]) -> list[str]:
-    """A few of the frames that were not used: identifier, length, first bytes."""
+    """Return a few of the frames that were not used: identifier, length, first bytes."""
     from skinware.samples import sample_text
 
     rows = [
-        [bus["name"], sample["why"].replace("_", " "), sample_text(sample)]
-        for bus in buses
-        for sample in bus.get("samples", ())
+        [bus["name"], words(sample["why"]), sample_text(sample)] for bus in buses for sample in bus.get("samples", ())
     ]
     return ["", *table(("bus", "not used", "for example"), rows, left=3)] if rows else []
 
@@ -329,7 +323,7 @@ def _reader_lines(entry: dict[str, Any]) -> list[str]:
             reader["kind"],
             str(reader["pid"]),
             rate_text(reader["rate_hz"]),
-            age_text(reader["age_ms"] * 1e6),
+            age_text_ms(reader["age_ms"]),
             _bound(reader["age"]),
             age_text(reader["wall"]["mean_ns"] if reader["wall"]["count"] else None),
             age_text(reader["cpu"]["mean_ns"] if reader["cpu"]["count"] else None),
@@ -364,7 +358,7 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
     while True:
         try:
             found = report(namespace, name)
-        except ServiceNotFound as error:  # it may come
+        except ServiceNotFound as error:  # it may start later
             found = {"namespace": namespace.name, "drivers": [], "services": [], "problems": [str(error)]}
         if as_json:
             print_json(found)
@@ -378,4 +372,4 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

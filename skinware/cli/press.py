@@ -1,19 +1,12 @@
-"""``skin-press``: press an emulated skin, in whatever process it is."""
+"""``skin-press``: press an emulated skin, in any process."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, ServiceNotFound, SkinwareError
 
@@ -26,8 +19,8 @@ _ASK_S = 1.0
 
 @click.command(
     "skin-press",
-    context_settings={**CONTEXT_SETTINGS, "ignore_unknown_options": True},  # -0.02 is a coordinate
-    epilog=examples(
+    context_settings={**cli.CONTEXT_SETTINGS, "ignore_unknown_options": True},  # -0.02 is a coordinate
+    epilog=cli.examples(
         "skin-driver --bus virtual                       an emulated forearm and hand, in another terminal",
         "skin-press 0.07 0.0225 0                        for one second",
         "skin-press 0.19 0 -0.0125 --seconds 60          its palm, for a minute",
@@ -39,15 +32,21 @@ _ASK_S = 1.0
 @click.argument("z", type=float)
 @click.option("--force", "force_n", type=float, metavar="N", default=3.0, show_default=True, help="Newtons.")
 @click.option(
-    "--radius", "radius_m", type=float, metavar="M", default=0.006, show_default=True, help="Of what presses, metres."
+    "--radius",
+    "radius_m",
+    type=float,
+    metavar="M",
+    default=0.006,
+    show_default=True,
+    help="Radius of the touch, metres.",
 )
 @click.option(
-    "--seconds", type=float, metavar="S", default=1.0, show_default=True, help="How long; the command does not wait."
+    "--seconds", type=float, metavar="S", default=1.0, show_default=True, help="Duration; the command does not wait."
 )
 @click.option("--name", metavar="NAME", help="Driver or emulator.  [default: the only one that can be pressed]")
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 def command(
     x: float,
     y: float,
@@ -59,11 +58,11 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Press an emulated skin at a place: X, Y and Z in metres, in the frame of its geometry.
+    """Press an emulated skin at a place: X, Y and Z in metres, in the coordinate frame of its geometry.
 
-    The skin is one of "skin-driver --bus virtual", or of "skin-emulate --name NAME": emulated ROBOSKIN boards, which
-    cover a forearm along x, from 0 to 0.14, and a hand from there to 0.23. Other emulated devices and hands cannot be
-    pressed at a place; they are touched by themselves, six times in half a minute.
+    The skin belongs to "skin-driver --bus virtual" or "skin-emulate --name NAME": emulated ROBOSKIN boards that cover a
+    forearm along x from 0 to 0.14, and a hand from there to 0.23. Other emulated devices and hands cannot be pressed at
+    a place; they feel six touches of their own in half a minute.
 
     Exit status: 0 pressed, 1 nothing would feel it or no such skin runs, 2 wrong usage.
     """
@@ -80,11 +79,13 @@ def command(
         print_json({"name": name, "pressed": pressed})
         return
     for bus, nearest in pressed.items():
-        echo(f"{name} on {bus}: {force_n:g} N for {seconds:g} s; the nearest taxel: {_in_words(nearest)}")
+        distance_m = nearest.pop("distance_m")
+        place_of = [*(f"{key} {value}" for key, value in nearest.items()), f"{1e3 * distance_m:.1f} mm away"]
+        echo(f"{name} on {bus}: {force_n:g} N for {seconds:g} s; the nearest taxel: {', '.join(place_of)}")
 
 
 def _the_only_one(namespace: Namespace) -> str:
-    """The service that can be pressed.
+    """Return the only service that can be pressed.
 
     Raises:
         ServiceNotFound: there is none.
@@ -93,9 +94,9 @@ def _the_only_one(namespace: Namespace) -> str:
     able = [name for name in namespace.services() if _can_be_pressed(namespace, name)]
     if not able:
         raise ServiceNotFound(
-            f"nothing in the namespace {namespace.name!r} can be pressed: only emulated ROBOSKIN boards can, of"
-            " skin-driver --bus virtual, or of skin-emulate with --name. Other emulated devices and hands are touched"
-            " by themselves"
+            f"nothing in the namespace {namespace.name!r} can be pressed: only emulated ROBOSKIN boards can,"
+            " those of skin-driver --bus virtual or skin-emulate --name. Other emulated devices and hands feel"
+            " touches of their own"
         )
     if len(able) > 1:
         raise ConfigurationError(f"several can be pressed; give --name: {', '.join(able)}")
@@ -109,17 +110,11 @@ def _can_be_pressed(namespace: Namespace, name: str) -> bool:
         with ServiceReader(name, namespace=namespace, announce=False) as reader:
             return _OPERATION in reader.operations(timeout_s=_ASK_S)
     except SkinwareError:
-        return False  # dead, hung, just withdrawn, not ours to read, or it takes no requests
-
-
-def _in_words(nearest: dict[str, Any]) -> str:
-    """``board 8, triangle 3, channel 7, 1.1 mm away``."""
-    distance_m = nearest.pop("distance_m")
-    return ", ".join([*(f"{key} {value}" for key, value in nearest.items()), f"{distance_m * 1e3:.1f} mm away"])
+        return False  # dead, hanging, just withdrawn, not readable, or without requests
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)
 
 
 if __name__ == "__main__":

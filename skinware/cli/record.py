@@ -1,4 +1,4 @@
-"""``skin-record``: record everything that is published."""
+"""``skin-record``: record drivers and services."""
 
 from __future__ import annotations
 
@@ -17,17 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    signals_end,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -37,19 +27,27 @@ if TYPE_CHECKING:
 _LOOK_S = 0.1
 
 
-def is_there() -> bool:
-    """Whether somebody can press it: there is a terminal."""
+def has_enter() -> bool:
+    """Return whether a person can press Enter: there is a terminal."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 @contextlib.contextmanager
-def pressed_calls(call: Callable[[], object]) -> Iterator[None]:
-    """Enter calls something, in another thread, as long as the block lasts. Nothing without a terminal."""
-    if not is_there():
+def on_enter(call: Callable[[], object]) -> Iterator[None]:
+    """Call a function in another thread whenever Enter is pressed in this block; do nothing without a terminal."""
+    if not has_enter():
         yield
         return
-    ended = threading.Event()
-    thread = threading.Thread(target=_listen, args=(sys.stdin.fileno(), call, ended), name="Enter", daemon=True)
+    ended, fd = threading.Event(), sys.stdin.fileno()
+
+    def listen() -> None:
+        while not ended.wait(_LOOK_S):
+            with contextlib.suppress(OSError):  # the terminal is gone
+                in_foreground = os.tcgetpgrp(fd) == os.getpgrp()  # a program that reads in the background is stopped
+                if in_foreground and select.select([fd], [], [], 0)[0] and os.read(fd, 4096).endswith(b"\n"):
+                    call()
+
+    thread = threading.Thread(target=listen, name="Enter", daemon=True)
     thread.start()
     try:
         yield
@@ -58,12 +56,9 @@ def pressed_calls(call: Callable[[], object]) -> Iterator[None]:
         thread.join()
 
 
-def _listen(fd: int, call: Callable[[], object], ended: threading.Event) -> None:
-    while not ended.wait(_LOOK_S):
-        with contextlib.suppress(OSError):  # the terminal is gone
-            in_foreground = os.tcgetpgrp(fd) == os.getpgrp()  # who reads in the background is stopped
-            if in_foreground and select.select([fd], [], [], 0)[0] and os.read(fd, 4096).endswith(b"\n"):
-                call()
+def _interrupt_at_eof() -> None:
+    sys.stdin.read()  # the kernel closes it when the other program is killed
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
@@ -72,10 +67,10 @@ _TIME = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min)?")
 
 
 def size(text: str) -> int:
-    """A number of bytes: ``500MB``, ``2GiB``; for ``click.option(type=...)``.
+    """Return a number of bytes: ``500MB``, ``2GiB``; for ``click.option(type=...)``.
 
     Raises:
-        click.BadParameter: it is not one.
+        click.BadParameter: the text is no such number.
     """
     found = _SIZE.fullmatch(text)
     if not found or found[2] not in _UNITS or not float(found[1]):
@@ -84,10 +79,10 @@ def size(text: str) -> int:
 
 
 def past(text: str) -> float:
-    """A time: ``60``, ``60s``, ``5min``; likewise.
+    """Return a time: ``60``, ``60s``, ``5min``; for ``click.option(type=...)``.
 
     Raises:
-        click.BadParameter: it is not one.
+        click.BadParameter: the text is no such time.
     """
     found = _TIME.fullmatch(text)
     if not found or not float(found[1]):
@@ -97,9 +92,9 @@ def past(text: str) -> float:
 
 @click.command(
     "skin-record",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-record                          all that runs or comes, until Ctrl-C",
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
+        "skin-record                          everything, until Ctrl-C",
         "skin-record torso -o walk.mcap -T 60  one driver, one minute",
         "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
         "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
@@ -107,14 +102,8 @@ def past(text: str) -> float:
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option(
-    "-o",
-    "--output",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="The new file.  [default: skin-DATE-TIME.mcap]",
-)
-@click.option("-T", "duration_s", metavar="SECONDS", type=seconds, help="End after SECONDS.")
+@cli.output_option("The new file.  [default: skin-DATE-TIME.mcap]")
+@cli.duration_option()
 @click.option(
     "--split", "split_size", metavar="SIZE", type=size, help="Begin another file after SIZE (1GB): FILE-001 ..."
 )
@@ -132,12 +121,13 @@ def past(text: str) -> float:
     "--viewers",
     "for_viewers",
     is_flag=True,
-    help="Record also what Foxglove and Lichtblick show: points, images and states, 30 times a second.",
+    help="Record also points, images and states for Foxglove and Lichtblick, 30 times a second.",
 )
-@click.option("--wire", "with_wires", is_flag=True, help="Record the frames and bytes on the drivers' buses, too.")
-@namespace_option
-@json_option
-@version_option
+@click.option("--wire", "with_wires", is_flag=True, help="Record also the frames and bytes on the drivers' buses.")
+@click.option("--until-eof", is_flag=True, hidden=True)
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 def command(
     names: tuple[str, ...],
     output: Path | None,
@@ -147,14 +137,15 @@ def command(
     last_s: float | None,
     for_viewers: bool,
     with_wires: bool,
+    until_eof: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Record drivers and services NAME..., or all there are and come, with all counters and states.
+    """Record drivers and services NAME..., or all of them, with all counters and states.
 
     Frames that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
-    the last 0.3 s is in the file; skin-recover then makes it whole. If the file is deleted, moved or changed meanwhile,
-    the recording ends within a second, with status 1.
+    the last 0.3 s is in the file, and skin-recover repairs it. If the file is deleted, moved or changed meanwhile, the
+    recording ends within a second with status 1.
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
@@ -173,9 +164,11 @@ def command(
     target = _target(path, split_size, max_size, last_s)
     beside = Viewers() if for_viewers else None
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
-    report = _Report(recorder, target, path, as_json)
-    keys = pressed_calls(recorder.save) if last_s is not None else contextlib.nullcontext()
-    with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
+    report = _Progress(recorder, target, path, as_json)
+    keys = on_enter(recorder.save) if last_s is not None else contextlib.nullcontext()
+    if until_eof:
+        threading.Thread(target=_interrupt_at_eof, daemon=True).start()
+    with cli.signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
         report.ready(names, place.name, is_past=last_s is not None)
         try:
             recorder.run(duration_s, report.status)
@@ -195,8 +188,8 @@ def _target(path: Path, split_size: int | None, max_size: int | None, last_s: fl
     return Files(path, split_size=split_size, max_size=max_size)
 
 
-class _Report:
-    """What is told of a recording while it runs, and at its end."""
+class _Progress:
+    """Report a recording while it runs and at its end."""
 
     def __init__(self, recorder: Recorder, target: Target, path: Path, as_json: bool) -> None:
         self._recorder, self._target, self._path, self._as_json = recorder, target, path, as_json
@@ -206,13 +199,13 @@ class _Report:
         self._saved: list[Path] = []
 
     def ready(self, names: tuple[str, ...], namespace: str, *, is_past: bool) -> None:
-        """Recording begins; only the past is kept, or all of it."""
+        """Report the beginning of a recording of everything, or of the past only."""
         self._is_past = is_past
         if self._as_json:
             print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})
         else:
             what = ", ".join(names) or "all drivers and services"
-            keys = f"{'Enter saves, ' * (is_past and is_there())}Ctrl-C ends"
+            keys = f"{'Enter saves, ' * (is_past and has_enter())}Ctrl-C ends"
             echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
@@ -240,13 +233,13 @@ class _Report:
             if self._as_json:
                 with contextlib.suppress(BrokenPipeError):
                     print_json(event)
-            warn(_text_of(event))
+            cli.warn(_text_of(event))
 
     def stopped(self, *, is_complete: bool) -> None:
         """Report the end.
 
         Args:
-            is_complete: all that was taken is in the files; otherwise an error follows.
+            is_complete: everything that was taken is in the files; otherwise an error follows.
         """
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
@@ -274,4 +267,8 @@ def _text_of(event: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)
+
+
+if __name__ == "__main__":
+    main()

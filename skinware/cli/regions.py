@@ -1,4 +1,4 @@
-"""``skin-regions``: named parts of a skin, listed and painted by hand."""
+"""``skin-regions``: list named parts of a skin, and paint them by hand."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-)
-from skinware.cli._regions import DEFAULT_REGIONS, regions_of
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
+from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,31 +19,31 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.driver_snapshot import DriverSnapshot
 
-_TELL_EVERY_S = 1.0
+_REPORT_EVERY_S = 1.0
 
 
-@click.group("skin-regions", context_settings=CONTEXT_SETTINGS)
-@version_option
+@click.group("skin-regions", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
-    """Name parts of a skin: regions, which programs and skin-top find by name."""
+    """Name parts of a skin: regions, which programs and skin-top use by name."""
 
 
 @command.command(
     "list",
-    epilog=examples(
-        "skin-regions list                     of regions.toml, with what the running skin has of them",
-        "skin-regions list a.toml b.toml       of several files, which are one set",
+    epilog=cli.examples(
+        "skin-regions list                     regions of regions.toml, with their sensors of the running skin",
+        "skin-regions list a.toml b.toml       several files are one set",
     ),
 )
-@click.argument("files", nargs=-1, metavar="[FILE...]", type=click.Path(path_type=Path))
-@namespace_option
-@json_option
+@click.argument("files", nargs=-1, metavar="[FILE...]", type=cli.FILE)
+@cli.namespace_option
+@cli.json_option
 def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None:
     """List regions, and how many sensors the running drivers have in each."""
     from skinware.skin import Skin
     from skinware.text import plural
 
-    regions = regions_of(files)
+    regions = cli.regions_of(files)
     with Skin(namespace) as skin:
         layout = skin.refresh()
     counts: dict[str, dict[str, int]] = {region.name: {} for region in regions}
@@ -68,29 +60,20 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
 
 
 @command.command(
-    epilog=examples(
+    epilog=cli.examples(
         "skin-regions paint palm               stroke the palm, then press Enter",
         "skin-regions paint palm --namespace calm --driver left_hand",
         "skin-regions paint palm -T 20 --json  for programs: paint for 20 s",
     ),
 )
 @click.argument("name")
-@click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")
-@click.option("--type", "type_name", metavar="TYPE", help="Sensors to paint.  [default: the driver's first type]")
-@click.option(
-    "-o",
-    "--output",
-    "file",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    default=DEFAULT_REGIONS,
-    show_default=True,
-    help="Write the region into this file, new or not.",
-)
+@cli.driver_option
+@cli.type_option("Sensors to paint.  [default: the driver's first type]")
+@cli.output_option("Write the region into this file, new or not.", name="file", default=cli.DEFAULT_REGIONS)
 @click.option("-f", "--force", is_flag=True, help="Replace a region of this name.")
-@click.option("-T", "duration_s", type=seconds, help="Paint for SECONDS, not until Enter.")
-@namespace_option
-@json_option
+@cli.duration_option("Paint for SECONDS, not until Enter.")
+@cli.namespace_option
+@cli.json_option
 def paint(
     name: str,
     driver: str | None,
@@ -106,12 +89,13 @@ def paint(
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
     from skinware.memory.namespace import Namespace
-    from skinware.tactile.regions import Region, put_region
+    from skinware.tactile.regions import Region, put_region, read_regions
     from skinware.views.driver_snapshots import reader_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
-    _refuse_early(file, name, force)
+    if file.exists() and not force and name in [region.name for region in read_regions(file)]:
+        raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
     with reader_of(Namespace(namespace), driver, "--driver") as reader:
         painter = _Painter(reader, type_name, as_json)
         stroked, in_region = painter.paint(duration_s)
@@ -120,28 +104,19 @@ def paint(
         raise click.ClickException("nothing was touched; nothing is written")
     put_region(file, Region(name, painter.type_name, (reader.name,), tuple(uid.tolist())), replace=force)
     if as_json:
-        told = {"region": name, "file": str(file), "touched": stroked, "sensors": len(uid)}
-        print_json({"event": "done", **told})
+        print_json({"event": "done", "region": name, "file": str(file), "touched": stroked, "sensors": len(uid)})
     else:
         holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
         echo(f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
 
 
-def _refuse_early(file: Path, name: str, force: bool) -> None:
-    from skinware.errors import ConfigurationError
-    from skinware.tactile.regions import read_regions
-
-    if file.exists() and not force and name in [region.name for region in read_regions(file)]:
-        raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
-
-
 class _Painter:
-    """Gathers what is touched.
+    """Collect the sensors that are touched.
 
     Args:
         reader: of the driver.
-        type_name: which sensors; None: of its first type.
-        as_json: how to tell.
+        type_name: of the sensors; None: the driver's first type.
+        as_json: print JSON, not text.
     """
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
@@ -153,11 +128,10 @@ class _Painter:
         self._rest = Rest(reader.structure)
 
     def paint(self, duration_s: float | None) -> tuple[int, npt.NDArray[np.bool_]]:
-        """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
+        """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""
         import numpy as np
 
-        from skinware.tactile.neighbours import neighbours
-        from skinware.tactile.regions import without_holes
+        from skinware.tactile.neighbours import neighbours, without_holes
         from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
 
@@ -165,11 +139,11 @@ class _Painter:
             self._touched(frame)
         stroked = np.zeros(len(self._reader.structure.module_of(self.type_name)), bool)
         self._say("ready", f"stroke the region{' and press Enter' if duration_s is None else ''}", stroked)
-        is_due = after(_TELL_EVERY_S)
+        is_due = after(_REPORT_EVERY_S)
         for frame in frames_until(self._reader, enter_pressed if duration_s is None else after(duration_s)):
             stroked |= self._touched(frame)
             if is_due():
-                is_due = after(_TELL_EVERY_S)
+                is_due = after(_REPORT_EVERY_S)
                 self._say("painting", f"{stroked.sum()} sensors", stroked)
         geometry = self._reader.structure.geometry
         if geometry is None:
@@ -177,11 +151,11 @@ class _Painter:
         return int(stroked.sum()), without_holes(stroked, neighbours(geometry[self._index]))
 
     def _touched(self, frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which sensors of the type are far from rest."""
-        from skinware.views.driver_snapshots import physical_of
+        """Return (n,) bool: the sensors of the type that are far from rest."""
         from skinware.views.history import threshold
+        from skinware.views.quantities import physical_values
 
-        physical = physical_of(frame, self.type_name)
+        physical = physical_values(frame)
         fresh = frame.status == 0
         self._rest.follow(physical, fresh, frame.published_ns)
         change = self._rest.change(physical)[self._index]
@@ -190,11 +164,11 @@ class _Painter:
 
     def _say(self, event: str, text: str, stroked: npt.NDArray[np.bool_]) -> None:
         if self._as_json:
-            told = {"driver": self._reader.name, "type": self.type_name}
-            print_json({"event": event, **(told if event == "ready" else {}), "touched": int(stroked.sum())})
+            what = {"driver": self._reader.name, "type": self.type_name} if event == "ready" else {}
+            print_json({"event": event, **what, "touched": int(stroked.sum())})
         else:
             echo(text)
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -1,4 +1,4 @@
-"""``skin-replay``: publish a recording again, under control of keys."""
+"""``skin-replay``: publish a recording again, controlled by keys."""
 
 from __future__ import annotations
 
@@ -15,16 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    run,
-    seconds,
-    signals_end,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
@@ -39,10 +30,10 @@ _BAR = 20
 
 
 class Terminal:
-    """Keys and the line. Without a terminal, or in the background of one, there are none.
+    """The keys and the line of progress; without a terminal, or in its background, there are none.
 
     Args:
-        replayer: what the keys control.
+        replayer: controlled by the keys.
     """
 
     def __init__(self, replayer: Replayer) -> None:
@@ -66,7 +57,7 @@ class Terminal:
 
     @property
     def is_ours(self) -> bool:
-        """Whether the keys are told to us: there is a terminal, and we are in its foreground."""
+        """Whether keys arrive here: there is a terminal, and this program is in its foreground."""
         streams = (sys.stdin, sys.stdout)
         if not all(stream is not None and stream.isatty() for stream in streams):
             return False
@@ -83,7 +74,7 @@ class Terminal:
             self._give_back()
 
     def take(self) -> None:
-        """Hear keys from now on, if that is possible; again after a stop (SIGCONT)."""
+        """Read keys from now on, if that is possible; called again after a stop (SIGCONT)."""
         self._replayer.unwatch(0)
         if not self.is_ours:
             self._before = None
@@ -98,16 +89,16 @@ class Terminal:
             overwrite(self.line(terminal_width() or 80))
 
     def line(self, width: int) -> str:
-        told = self._replayer.replay()
-        share = min(1.0, told["time_s"] / told["duration_s"]) if told["duration_s"] else 1.0
+        state = self._replayer.replay()
+        share = min(1.0, state["time_s"] / state["duration_s"]) if state["duration_s"] else 1.0
         bar = "=" * round(share * _BAR)
         words = [
-            f"{clock(told['time_s'])} / {clock(told['duration_s'])}",
+            f"{clock(state['time_s'])} / {clock(state['duration_s'])}",
             f"[{bar:<{_BAR}}]",
-            f"x{told['speed']:g}",
-            *["paused"] * told["paused"],
-            *["loop"] * told["loop"],
-            *[f"{told['late']} late"] * bool(told["late"]),
+            f"x{state['speed']:g}",
+            *["paused"] * state["paused"],
+            *["loop"] * state["loop"],
+            *[f"{state['late']} late"] * bool(state["late"]),
         ]
         return "  ".join(words)[: max(0, width - 1)]
 
@@ -119,13 +110,13 @@ class Terminal:
 
     def _hear(self) -> None:
         try:
-            told = os.read(sys.stdin.fileno(), 256)
+            pressed = os.read(sys.stdin.fileno(), 256)
         except OSError:
-            told = b""
-        if not told:  # hung up
+            pressed = b""
+        if not pressed:  # hung up
             self._replayer.unwatch(sys.stdin.fileno())
             return
-        for key in _KEY.findall(told):
+        for key in _KEY.findall(pressed):
             self._calls.get(key.replace(b"\x1bO", b"\x1b["), lambda: None)()
         self.draw()
 
@@ -134,7 +125,7 @@ class Terminal:
 
 
 def clock(time_s: float) -> str:
-    """``1:02.3``, ``1:00:02.3``."""
+    """Return a time as ``1:02.3`` or ``1:00:02.3``."""
     tenths = round(time_s * 10)
     minutes, rest = divmod(tenths, 600)
     hours, of_hour = divmod(minutes, 60)
@@ -146,32 +137,32 @@ _DRAW_EVERY_S = 0.1
 
 
 def speed(text: str) -> float:
-    """A factor above 0; for ``click.option(type=...)``.
+    """Return a factor above 0; for ``click.option(type=...)``.
 
     Raises:
-        click.BadParameter: it is not one.
+        click.BadParameter: the text is no such number.
     """
-    factor = seconds(text)
+    factor = cli.seconds(text)
     if not factor:
-        raise click.BadParameter("a speed is above 0: 1 is that of the recording.")
+        raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
     return factor
 
 
 @click.command(
     "skin-replay",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-replay walk.mcap                         skin-top --namespace replay shows it",
         "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
         "skin-replay walk.mcap --start 10 --end 12 --loop",
         "skin-replay walk.mcap --paused                step through it with . and ,",
     ),
 )
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=cli.FILE)
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
-@click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
-@click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
+@click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
+@click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
 @click.option("--paused", is_flag=True, help="Wait for a key or a request first.")
 @click.option("--stay", is_flag=True, help="Pause at the end, instead of ending.")
@@ -180,15 +171,15 @@ def speed(text: str) -> float:
     type=click.Choice(["now", "recorded"]),
     default="now",
     show_default=True,
-    help="Times of frames: moved to now, so that ages are as they were; or those of then.",
+    help="Times of frames: moved to now, which keeps their ages, or as recorded.",
 )
 @click.option(
     "--namespace",
     metavar="NAME",
     help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{_NAMESPACE}', if nothing runs there]",
 )
-@json_option
-@version_option
+@cli.json_option
+@cli.version_option
 def command(
     file: Path,
     names: tuple[str, ...],
@@ -202,11 +193,11 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Publish the drivers and services of a recording again, or only NAME..., as if they ran now.
+    """Publish the drivers and services of a recording, or only NAME..., as if they ran now.
 
-    They have the same names, structures, states and counters, and restart where they restarted. In a terminal, keys
-    pause, step, seek and change the speed; other programs ask any of the services for the same (pause, resume, step,
-    seek, speed, loop, replay).
+    They have the recorded names, structures, states and counters, and restart where they restarted. In a terminal, keys
+    pause, step, seek and change the speed. Other programs call the same operations of any of the services: pause,
+    resume, step, seek, speed, loop, replay.
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
@@ -232,24 +223,24 @@ def command(
         terminal = Terminal(replayer)
         has_keys = not as_json and terminal.is_ours
         continued = {signal.SIGCONT: terminal.take} if has_keys else {}
-        with contextlib.closing(replayer), signals_end(replayer.stop, continued):
+        with contextlib.closing(replayer), cli.signals_end(replayer.stop, continued):
             _ready(recording, names, place.name, as_json)
             if has_keys:
                 echo(KEYS)
                 with terminal.keys():
                     replayer.run(terminal.draw, _DRAW_EVERY_S)
             else:
-                replayer.run(lambda: _tell("status", replayer, as_json))
+                replayer.run(lambda: _report("status", replayer, as_json))
         for problem in recording.problems:
-            warn(problem)
-    _tell("stopped", replayer, as_json)
+            cli.warn(problem)
+    _report("stopped", replayer, as_json)
 
 
 def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
-    """Keep recorded frames away from living ones; where the namespace was given on purpose, only warn of them.
+    """Keep recorded frames apart from living ones; only warn if the namespace was given as an option.
 
     Raises:
-        ConfigurationError: services run in the namespace that is the default.
+        ConfigurationError: services run in the default namespace.
     """
     from skinware.service import ServiceReader
 
@@ -260,7 +251,7 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
                 living += [name] if reader.alive else []
     run = f"{', '.join(living)} {'runs' if len(living) == 1 else 'run'}"
     if living and is_chosen:
-        warn(f"{run} in namespace {place.name!r} too: readers have living and recorded frames side by side")
+        cli.warn(f"{run} in namespace {place.name!r} too: readers see living and recorded frames side by side")
     elif living:
         raise ConfigurationError(
             f"{run} in namespace {place.name!r}: give another one with --namespace, or"
@@ -271,14 +262,14 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
 def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json: bool) -> None:
     published = list(names or recording.services)
     if as_json:
-        told = {"file": str(recording.path), "namespace": namespace, "names": published}
-        print_json({"event": "ready", **told, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
+        ready = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
+        print_json({**ready, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
     else:
         what = ", ".join(published) or "nothing"
         echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
 
 
-def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
+def _report(event: str, replayer: Replayer, as_json: bool) -> None:
     with contextlib.suppress(BrokenPipeError):
         if as_json:
             print_json({"event": event, **replayer.replay(), "frames": dict(replayer.frames)})
@@ -288,4 +279,4 @@ def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)

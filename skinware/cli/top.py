@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-    warn,
-)
-from skinware.cli._regions import regions_of, regions_option
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -33,13 +23,13 @@ if TYPE_CHECKING:
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
 _NEEDED = "textual>=8"
-"""What the extra ``top`` brings: installed alone, it is right however this package was installed."""
+"""The package of the extra ``top``; installing it alone works however this package was installed."""
 
 
 @click.command(
     "skin-top",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-top                    in the terminal",
         "skin-top --type proximity   draw another type of sensors",
         "skin-top --region palm      draw a region of regions.toml",
@@ -49,8 +39,8 @@ _NEEDED = "textual>=8"
 @click.option(
     "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
 )
-@click.option("-T", "duration_s", type=seconds, help="End after SECONDS.")
-@click.option("--type", "type_name", metavar="TYPE", help="Sensors to draw first.  [default: the driver's first type]")
+@cli.duration_option()
+@cli.type_option("Sensors to draw first.  [default: the driver's first type]")
 @click.option(
     "--scale",
     "scale_name",
@@ -60,10 +50,10 @@ _NEEDED = "textual>=8"
     help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
 @click.option("--region", metavar="NAME", help="Draw only sensors in this region at first.")
-@regions_option
-@namespace_option
-@json_option
-@version_option
+@cli.regions_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 @click.pass_context
 def command(
     context: click.Context,
@@ -76,15 +66,15 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels.
+    """Show all drivers live: states, rates, ages, losses, and a picture of the skin.
 
-    Where a service tells the contacts of a driver, as skin-calm does, they are shown too.
+    Contacts are shown too where a service publishes them, as skin-calm does.
     """
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
     names = () if region is None else (region,)
-    regions = regions_of(region_files, names) if names or region_files else None
+    regions = cli.regions_of(region_files, names) if names or region_files else None
     if not plain and not as_json and _on_terminal():
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
@@ -92,7 +82,7 @@ def command(
             app = SkinTop(place, type_name, duration_s, scale_name=scale_name, regions=regions, region=region)
             app.run()
             context.exit(app.return_code or 0)
-        warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
+        cli.warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
     show_lines(place, duration_s, as_json)
 
 
@@ -117,7 +107,7 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
 
 
 def _on_terminal() -> bool:
-    """Whether there are a keyboard and a screen (Textual draws on stderr)."""
+    """Return whether there are a keyboard and a screen (Textual draws on stderr)."""
     streams = (sys.stdin, sys.stdout, sys.stderr)
     return all(stream is not None and stream.isatty() for stream in streams)
 
@@ -143,4 +133,4 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -1,4 +1,4 @@
-"""``skin-view``: a skin in the browser."""
+"""``skin-view``: show a skin in the browser."""
 
 from __future__ import annotations
 
@@ -19,16 +19,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    EXIT_FAILED,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import MissingExtra
 
@@ -41,10 +32,10 @@ _TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
 
 
 def token_text(text: str) -> str:
-    """A token that can stand in an address as it is; for ``click.option(type=...)``.
+    """Return a token that needs no quoting in an address; for ``click.option(type=...)``.
 
     Raises:
-        click.BadParameter: it cannot.
+        click.BadParameter: it would need quoting.
     """
     if not _TOKEN.fullmatch(text):
         raise click.BadParameter("give letters, digits, '_', '.', '~' or '-'.")
@@ -53,12 +44,12 @@ def token_text(text: str) -> str:
 
 @click.command(
     "skin-view",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-view                       all drivers, in the browser",
         "skin-view torso --no-browser    one driver; prints the address to open",
         "skin-view --links robot.urdf    on the meshes of a robot",
-        "skin-view --host 0.0.0.0        for other machines too: the address has a token",
+        "skin-view --host 0.0.0.0        for other machines too; the address contains a token",
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
@@ -72,24 +63,24 @@ def token_text(text: str) -> str:
     "--token",
     metavar="TEXT",
     type=token_text,
-    help="That the address needs.  [default: a random one, if other machines can connect]",
+    help="Token that the address needs.  [default: a random one, if other machines can connect]",
 )
 @click.option(
     "--calm",
     "calm_name",
     metavar="NAMESPACE",
-    help="Where calmed drivers and their contacts are, if anywhere.  [default: where skin-calm publishes them]",
+    help="Namespace of calmed drivers and their contacts.  [default: that of skin-calm]",
 )
 @click.option(
     "--links",
     metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Links of the robot, which say where coordinate frames are and may have meshes: TOML, or a URDF.",
+    type=cli.FILE,
+    help="Links of the robot: places of coordinate frames, and meshes; TOML or URDF.",
 )
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 def command(
     names: tuple[str, ...],
     port: int | None,
@@ -101,7 +92,7 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Show drivers NAME..., or all there are and come, live in a browser.
+    """Show drivers NAME..., or all of them, live in a browser.
 
     Where skin-calm runs, changes from its baselines, contacts and regions are shown too.
 
@@ -123,7 +114,7 @@ def command(
         token = secrets.token_urlsafe(16)
     robot = None if links is None else read_robot(links)
     for what in () if robot is None else robot.left_out:
-        warn(f"left out of {links}: {what}")
+        cli.warn(f"left out of {links}: {what}")
     follower = Follower(place, names, calm, robot)
     access = Access(host, token)
 
@@ -142,7 +133,7 @@ def command(
     except OSError as error:
         where = f"{host}, port {DEFAULT_PORT if port is None else port}"
         echo(f"skin-view: {where}: {_why(error)}", err=True)
-        click.get_current_context().exit(EXIT_FAILED)
+        click.get_current_context().exit(cli.EXIT_FAILED)
     finally:
         follower.close()
 
@@ -154,7 +145,7 @@ async def _serve(follower: Follower, access: Access, host: str, port: int | None
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    program = (sys.executable, "-m", "skinware.cli._record_beside")
+    program = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
     server = ViewServer(follower, access, Recording(program, follower.namespace.name, follower.names))
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
@@ -176,9 +167,9 @@ def _address(host: str, port: int) -> str:
 
 
 def _has_screen() -> bool:
-    """Whether a browser with a window can be opened: not a text browser in this terminal."""
+    """Return whether a browser with a window can be opened, not a text browser in this terminal."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)

@@ -1,4 +1,4 @@
-"""``skin-wipe``: a hand goes over the whole skin; which sensors never answered?"""
+"""``skin-wipe``: find sensors that never answer while a hand goes over the whole skin."""
 
 from __future__ import annotations
 
@@ -9,19 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    EXIT_DONE,
-    EXIT_FAILED,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json
-from skinware.text import count_text, figure_text, plural
+from skinware.text import count_text, figure_text, plural, status_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,23 +22,23 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.driver_snapshot import DriverSnapshot
 
-_TELL_EVERY_S = 1.0
+_REPORT_EVERY_S = 1.0
 
 
 @click.command(
     "skin-wipe",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    context_settings=cli.CONTEXT_SETTINGS,
+    epilog=cli.examples(
         "skin-wipe left_hand              wipe over the whole hand; Ctrl-C when you have been everywhere",
         "skin-wipe left_hand -T 60 --json for programs",
     ),
 )
 @click.argument("name", required=False)
-@click.option("--type", "type_name", metavar="TYPE", help="Sensors to test.  [default: the driver's first type]")
-@click.option("-T", "duration_s", type=seconds, help="End after SECONDS.")
-@namespace_option
-@json_option
-@version_option
+@cli.type_option("Sensors to test.  [default: the driver's first type]")
+@cli.duration_option()
+@cli.namespace_option
+@cli.json_option
+@cli.version_option
 @click.pass_context
 def command(
     context: click.Context,
@@ -58,7 +48,7 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Wipe test of driver NAME, or of the only one: which sensors never answer?
+    """Find the sensors of driver NAME, or of the only one, that never answer.
 
     Leave the skin alone for the first second, then press your way over all of it. The test ends when every sensor has
     answered, with Ctrl-C, or after SECONDS, and lists those that never did. Sensors that are switched off do not count.
@@ -72,16 +62,16 @@ def command(
         wipe = _Wipe(reader, type_name, as_json)
         with contextlib.suppress(KeyboardInterrupt):
             wipe.go_on(duration_s)
-        context.exit(EXIT_DONE if wipe.tell_result() else EXIT_FAILED)
+        context.exit(cli.EXIT_DONE if wipe.report_result() else cli.EXIT_FAILED)
 
 
 class _Wipe:
-    """A wipe test and what is said of it.
+    """Run a wipe test and report it.
 
     Args:
         reader: of the driver.
-        type_name: which sensors; None: of its first type.
-        as_json: how to tell.
+        type_name: of the sensors; None: the driver's first type.
+        as_json: print JSON, not text.
     """
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
@@ -107,27 +97,27 @@ class _Wipe:
         if resting is not None:
             self._test.follow(*resting)  # the first press may be there before the next snapshot
         needed = threshold(self._rest.noise(self._type.name))
-        told = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit, "threshold": needed}
         if self._as_json:
-            print_json({"event": "ready", **told, "sensors": self._n_tested})
+            what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
+            print_json({"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())})
         else:
             more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
-            tested = plural(self._n_tested, f"{self._type.name} sensor")
+            tested = plural(len(self._tested()), f"{self._type.name} sensor")
             echo(f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
-        is_due = after(_TELL_EVERY_S)
+        is_due = after(_REPORT_EVERY_S)
         for frame, physical in self._frames(duration_s):
             self._test.follow(physical, frame.status == 0)
             is_complete = not len(self._never_answered())
             if is_complete or is_due():
-                is_due = after(_TELL_EVERY_S)
-                self._tell_progress()
+                is_due = after(_REPORT_EVERY_S)
+                self._report_progress()
             if is_complete:
                 return
 
-    def tell_result(self) -> bool:
-        """List what never answered; whether everything did."""
+    def report_result(self) -> bool:
+        """List the sensors that never answered, and return whether all did."""
         never = self._never_answered().tolist()
-        answered = self._n_tested - len(never)
+        answered = len(self._tested()) - len(never)
         named = [
             {
                 "name": self._structure.sensor_name(position),
@@ -138,16 +128,14 @@ class _Wipe:
             for position in never
         ]
         if self._as_json:
-            print_json({"event": "done", "answered": answered, "sensors": self._n_tested, "never": named})
+            print_json({"event": "done", "answered": answered, "sensors": len(self._tested()), "never": named})
         else:
             echo("\n" * self._is_redrawing + self._progress() + (", never:" if never else ""))
-            for one in named:
-                echo(f"  {one['name']}{self._why(one['status'])}")
+            for position in never:
+                status = int(self._status[position])
+                why = f" ({status_text(status)})" if status else ""
+                echo(f"  {self._structure.sensor_name(position)}{why}")
         return not never
-
-    @property
-    def _n_tested(self) -> int:
-        return len(self._tested())
 
     def _tested(self) -> npt.NDArray[np.int64]:
         import numpy as np
@@ -165,32 +153,27 @@ class _Wipe:
         return never[np.isin(never, self._tested())]
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
-        """Frames with their physical values, (n_sensors,); 0 for sensors of other types."""
-        from skinware.views.driver_snapshots import after, frames_until, physical_of
+        """Yield snapshots with their (n_sensors,) physical values."""
+        from skinware.views.driver_snapshots import after, frames_until
+        from skinware.views.quantities import physical_values
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):
             self._status = frame.status
-            yield frame, physical_of(frame, self._type.name)
+            yield frame, physical_values(frame)
 
     def _progress(self) -> str:
-        answered = self._n_tested - len(self._never_answered())
-        return f"{count_text(answered)} of {count_text(self._n_tested)} answered"
+        answered = len(self._tested()) - len(self._never_answered())
+        return f"{count_text(answered)} of {count_text(len(self._tested()))} answered"
 
-    def _tell_progress(self) -> None:
+    def _report_progress(self) -> None:
         if self._as_json:
-            answered = self._n_tested - len(self._never_answered())
-            print_json({"event": "wiping", "answered": answered, "sensors": self._n_tested})
+            answered = len(self._tested()) - len(self._never_answered())
+            print_json({"event": "wiping", "answered": answered, "sensors": len(self._tested())})
         elif self._is_redrawing:
             overwrite(self._progress())
         else:
             echo(self._progress())
 
-    def _why(self, status: int) -> str:
-        from skinware.status import Status
-
-        said = ", ".join(str(bit.name).lower().replace("_", " ") for bit in Status if status & bit)
-        return f" ({said})" if said else ""
-
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from skinware._columns import as_index
 from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
 from skinware.errors import ConfigurationError
-from skinware.tactile.choosing import SensorChoice, unknown
-from skinware.tactile.regions import Regions
+from skinware.tactile.regions import Regions, SensorChoice, unknown
 from skinware.transfer.generation import PER_SENSOR
 
 

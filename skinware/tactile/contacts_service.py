@@ -17,24 +17,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.source_service import (
-    Layout,
     ServiceOptions,
     SourceReader,
     SourceSample,
     SourceWriter,
     Static,
     ValueSource,
-    columns_of,
-    value_source,
-    value_static,
 )
 
 NAME = "contacts"
@@ -67,6 +64,24 @@ class ContactsSource(ValueSource):
     """
 
     uid: npt.NDArray[np.uint64]
+
+    @classmethod
+    def read(cls, static: Static) -> Self:
+        """See :class:`Source`."""
+        return cls(**cls.values(static), uid=static["sensor_uid"].astype(np.uint64))
+
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """See :class:`Source`."""
+        return {"sensor_uid": self.uid, **super().static()}
+
+    def columns(self) -> dict[str, Column]:
+        """See :class:`Source`."""
+        forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
+        forms |= {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
+        units = {name: unit for name, (unit, _) in _TEXTS.items()} | {"load": self.unit, "peak": self.unit}
+        return {
+            name: Column(np.dtype(dtype), shape, units[name], _TEXTS[name][1]) for name, (dtype, shape) in forms.items()
+        }
 
 
 class ContactsSample(SourceSample[ContactsSource]):
@@ -101,22 +116,15 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of contacts.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME
+    source_class = ContactsSource
     frame_class = ContactsSample
 
-    @staticmethod
-    def _source_of(static: Static) -> ContactsSource:
-        return ContactsSource(**value_source(static), uid=static["sensor_uid"].astype(np.uint64))
 
-    @staticmethod
-    def _layout_of(source: ContactsSource) -> Layout:
-        return _layout(len(source.uid))
-
-
-class ContactsWriter(SourceWriter):
+class ContactsWriter(SourceWriter[ContactsSource]):
     """Finds the contacts in a driver's values, and publishes them.
 
     Args:
@@ -146,15 +154,9 @@ class ContactsWriter(SourceWriter):
         name: str = NAME,
         **options: Unpack[ServiceOptions],
     ) -> None:
-        self._type_name, self._driver = type_name, driver
         self._contacts = Contacts.of(structure, type_name, neighbours)
-        description = f"contacts of {driver or 'a skin'}, {type_name}"
-        super().__init__(name, *self._form(structure), description, **options)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Names of the coordinate frames that contacts are in."""
-        return self._contacts.frames
+        source = _source(structure, type_name, driver, self._contacts)
+        super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
@@ -187,21 +189,12 @@ class ContactsWriter(SourceWriter):
             StructureError, ConfigurationError: as for a new writer; the old generation then goes on.
             NamespaceError: shared memory is full; the old generation then goes on, too.
         """
-        before, self._contacts = self._contacts, Contacts.of(structure, self._type_name, neighbours)
-        try:
-            self._service.restructure(*self._form(structure))
-        except BaseException:
-            self._contacts = before
-            raise
-
-    def _form(self, structure: Structure) -> tuple[dict[str, Any], Static]:
-        """Columns and static columns."""
-        sensor_type = structure.type(self._type_name)
-        uid = structure.sensor_uid[structure.index(self._type_name)]
-        columns = columns_of(_layout(len(uid)), _TEXTS, load=sensor_type.unit, peak=sensor_type.unit)
-        return columns, {"sensor_uid": uid, **value_static(self._driver, sensor_type, self._contacts.frames)}
+        type_name = self.source.type_name
+        contacts = Contacts.of(structure, type_name, neighbours)
+        self._restructure(_source(structure, type_name, self.source.driver, contacts))
+        self._contacts = contacts
 
 
-def _layout(n: int) -> Layout:
-    rows = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
-    return rows | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", (n,))}
+def _source(structure: Structure, type_name: str, driver: str, contacts: Contacts) -> ContactsSource:
+    unit, uid = structure.type(type_name).unit, structure.sensor_uid[structure.index(type_name)]
+    return ContactsSource(driver, type_name, unit, contacts.frames, uid)

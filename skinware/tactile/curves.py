@@ -1,4 +1,4 @@
-"""Force curves: what a value means in a unit of force or pressure, per type or per taxel, fitted and read from a file.
+"""Fit, read and apply force curves, which give values a unit of force or pressure, per type or per taxel.
 
 The file is TOML, keyed like a geometry::
 
@@ -7,18 +7,18 @@ The file is TOML, keyed like a geometry::
 
     [[curve]]
     type = "pressure"
-    uid = [0x70500, 0x70501]    # left out: all of the type that no other curve names
+    uid = [0x70500, 0x70501]    # default: all of the type that no other curve names
     from_unit = "counts"
     unit = "Pa"
     x = [0.0, 12.0, 40.0, 180.0]        # rising, at most 8
     y = [0.0, 900.0, 4500.0, 60000.0]   # not falling; beyond its ends a curve is level
-    hysteresis = 0.08                   # for people: see Fit
+    hysteresis = 0.08                   # for information: see Fit
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.toml_text import Keys, TomlText
+from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
 MOST_KNOTS = 8
@@ -40,14 +40,14 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """A monotone curve of straight pieces.
 
     Attributes:
-        type: of the sensors.
-        from_unit: of ``x``.
-        unit: of ``y``.
-        x: values, rising, 2 to 8.
-        y: what they mean, never falling.
-        uid: of the sensors; None: all of the type that no other curve names.
+        type: type of the sensors.
+        from_unit: unit of ``x``.
+        unit: unit of ``y``.
+        x: 2 to 8 values, rising.
+        y: their meaning, never falling.
+        uid: uids of the sensors; None: all of the type that no other curve names.
         hysteresis: how far rising and falling branch are apart, as a share of the range of ``y``; None: not known.
-        name: for people.
+        name: for information.
 
     Raises:
         ValueError: knots that are no such curve.
@@ -87,33 +87,29 @@ def read_curves(path: str | Path) -> tuple[Curve, ...]:
     """
     text = TomlText(Path(path))
     curves = text.of_format("file of curves", FORMAT, VERSION, _File).curve
-    _refuse_twice(curves, text.place)
-    return curves
-
-
-def _refuse_twice(curves: Sequence[Curve], place: Callable[[Keys], str]) -> None:
     seen: set[tuple[str, int | None]] = set()
     for number, curve in enumerate(curves):
         for uid in curve.uid if curve.uid is not None else (None,):
             if (curve.type, uid) in seen:
                 what = f"uid {uid:#x}" if uid is not None else "all"
-                raise ConfigurationError(f"{place(('curve', number))}: a second curve for {curve.type}, {what}")
+                raise ConfigurationError(f"{text.place(('curve', number))}: a second curve for {curve.type}, {what}")
             seen.add((curve.type, uid))
+    return curves
 
 
 class CurveTable:
     """The curves of n taxels of one type.
 
     Args:
-        curves: all there are; those of other types are left out.
-        type_name: of the taxels.
-        uid: (n,) of them.
+        curves: all curves; those of other types are ignored.
+        type_name: type of the taxels.
+        uid: (n,) uids of the taxels.
 
     Attributes:
-        unit: of what comes out.
-        from_unit: of what goes in.
-        minimum: (n,) float32, the least that each can show.
-        maximum: (n,) float32, and the most.
+        unit: unit of the results.
+        from_unit: unit of the values.
+        minimum: (n,) float32, least result of each.
+        maximum: (n,) float32, largest result of each.
 
     Raises:
         ConfigurationError: a taxel without a curve, or curves of several units.
@@ -131,7 +127,12 @@ class CurveTable:
             without = f"uid {int(uid[chosen.index(None)]):#x}" if own else "any"
             raise ConfigurationError(f"no curve for {type_name}, {without}")
         self.from_unit, self.unit = next(iter(units))
-        knots = np.array([_padded(curve) for curve in own], np.float32)[np.array(chosen, np.intp)]  # (n, 2, knots)
+        padding = [MOST_KNOTS - len(curve.x) for curve in own]
+        padded = [
+            (curve.x + curve.x[-1:] * more, curve.y + curve.y[-1:] * more)
+            for curve, more in zip(own, padding, strict=True)
+        ]
+        knots = np.array(padded, np.float32)[np.array(chosen, np.intp)]  # (n, 2, knots)
         self._x, y = np.ascontiguousarray(knots[:, 0].T), np.ascontiguousarray(knots[:, 1].T)
         self._width = np.diff(self._x, axis=0)
         rise = np.diff(y, axis=0)
@@ -140,27 +141,22 @@ class CurveTable:
         self.maximum: Floats = y[-1]
 
     def __call__(self, values: Floats) -> Floats:
-        """(n,) what (n,) values mean; NaN stays NaN."""
+        """Return (n,) the results for (n,) values; NaN stays NaN."""
         found = self.minimum.copy()
         for x, width, slope in zip(self._x, self._width, self._slope, strict=False):
             found += slope * np.clip(values - x, 0, width)
         return found
 
 
-def _padded(curve: Curve) -> tuple[list[float], list[float]]:
-    more = MOST_KNOTS - len(curve.x)
-    return [*curve.x, *[curve.x[-1]] * more], [*curve.y, *[curve.y[-1]] * more]
-
-
 @dataclass(frozen=True)
 class Fit:
-    """A curve that was fitted.
+    """A fitted curve.
 
     Attributes:
         x: knots, rising.
-        y: what they mean, never falling: the mean of both branches.
-        rising: at the same knots, while the load grows; NaN if no pair is.
-        falling: and while it goes.
+        y: the mean of both branches there, never falling.
+        rising: the branch while the load grows; NaN without such pairs.
+        falling: the branch while the load falls; NaN without such pairs.
         hysteresis: the largest distance of the branches, as a share of the range of ``y``; NaN without both.
     """
 
@@ -172,15 +168,15 @@ class Fit:
 
 
 def fit_curve(values: npt.ArrayLike, reference: npt.ArrayLike, knots: int = MOST_KNOTS) -> Fit:
-    """Fit a monotone curve to what a taxel and a reference showed together, in the order of time.
+    """Fit a monotone curve to values of a taxel and a reference, in the order of time.
 
     Each branch is the monotone function nearest to its pairs (pool adjacent violators), cut into pieces whose knots
     divide the values evenly by their number.
 
     Args:
         values: (m,) of the taxel.
-        reference: (m,) of the reference, in the unit that is wanted.
-        knots: at most, 2 to 8.
+        reference: (m,) of the reference, in the wanted unit.
+        knots: most knots, 2 to 8.
 
     Raises:
         ConfigurationError: too few pairs, or values that do not vary.
@@ -205,7 +201,6 @@ def fit_curve(values: npt.ArrayLike, reference: npt.ArrayLike, knots: int = MOST
 def _branch(
     values: npt.NDArray[np.float64], reference: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """(k,) the monotone function nearest to some pairs, at k knots."""
     if len(values) < 2:
         return np.full(len(x), np.nan)
     order = np.argsort(values, kind="stable")
@@ -213,7 +208,7 @@ def _branch(
 
 
 def monotone(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(m,) the sequence that never falls and is nearest to (m,) values, in the sum of squares."""
+    """Return (m,) the sequence that never falls and is nearest to (m,) values, in the sum of squares."""
     means: list[float] = []
     counts: list[int] = []
     for value in values.tolist():

@@ -31,7 +31,7 @@ from skinware.tactile.source_service import ServiceOptions, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
-WriterT = TypeVar("WriterT", bound=SourceWriter)
+WriterT = TypeVar("WriterT", bound=SourceWriter[Any])
 
 _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 
@@ -60,7 +60,7 @@ class DerivedService(ABC, Generic[WriterT]):
     """
 
     subject: str
-    """What it is about, for messages."""
+    """Its subject, for messages."""
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         self._name, self._driver = name, driver
@@ -216,7 +216,7 @@ class CalmMotion(DerivedService[MotionWriter]):
         self.close()
         if self.contacts is None:
             return
-        frames = self.contacts.frames
+        frames = self.contacts.source.frames
         options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
         self._open(
             lambda name: MotionWriter(

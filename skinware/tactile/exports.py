@@ -1,7 +1,7 @@
-"""Contacts in the forms in which other middlewares have them, as plain lists and dictionaries: no middleware is needed.
+"""Write contacts in the forms of other middlewares, as plain lists and dictionaries; no middleware is needed.
 
 Forces press on the skin, against its normal. They are in N where the values are pressures in Pa at known places;
-otherwise ``newtons_per_load`` makes them of the load, and without it they are NaN.
+elsewhere they are ``newtons_per_load`` times the load, or NaN without it.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from skinware.realtime import NS_PER_S
 from skinware.tactile.contacts import Contact, ContactSet
 
 ICUB_NEWTONS_PER_COUNT = 0.05
-"""What the skin manager of the iCub takes for the force of a taxel and count."""
+"""Force of a taxel and count in the skin manager of the iCub."""
 
 Vector = npt.NDArray[np.float64]
 
 
 class IcubPart(NamedTuple):
-    """Which part of the robot contacts are on, in the numbers of the iCub's own enumerations.
+    """The part of a robot that contacts are on, in the numbers of the iCub's own enumerations.
 
     Attributes:
-        body_part: number of the body part.
-        link: number of the link in it.
-        skin_part: number of the skin part.
+        body_part: body part.
+        link: link of the body part.
+        skin_part: skin part.
     """
 
     body_part: int
@@ -43,16 +43,16 @@ def icub_contacts(
     *,
     newtons_per_load: float | None = ICUB_NEWTONS_PER_COUNT,
 ) -> list[list[Any]]:
-    """Contacts as the skin manager of the iCub sends them, each a list of eight.
+    """Return contacts as the skin manager of the iCub sends them, each a list of eight.
 
     ``[[id, body part, link, skin part], centre of pressure, force, moment, geometric centre, normal, taxels,
     pressure]``: vectors of three, in m and N; the moment is 0; pressure is the mean value of the taxels. Unlike there,
     normals are of length 1, and an id lasts as long as its contact.
 
     Args:
-        contacts: of one frame.
+        contacts: contacts of one frame.
         geometry: places of the n taxels.
-        part: on which they are.
+        part: their part of the robot.
         newtons_per_load: force per load where it is not known; None: NaN.
 
     Raises:
@@ -78,13 +78,13 @@ def icub_contacts(
 def tactile_msgs_contacts(
     contacts: ContactSet, stamp_ns: int, *, newtons_per_load: float | None = None
 ) -> list[dict[str, Any]]:
-    """Contacts with the fields of ``tactile_msgs/TactileContact`` of ROS 2.
+    """Return contacts with the fields of ``tactile_msgs/TactileContact`` of ROS 2.
 
     The name is the identity; the torque is that of the force about the origin of the frame.
 
     Args:
-        contacts: of one frame.
-        stamp_ns: its time on the clock of ROS, ns.
+        contacts: contacts of one frame.
+        stamp_ns: time of the frame on the clock of ROS, ns.
         newtons_per_load: force per load where it is not known; None: NaN.
     """
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
@@ -104,7 +104,6 @@ def tactile_msgs_contacts(
 
 
 def _force_n(contact: Contact, newtons_per_load: float | None) -> Vector:
-    """(3,) N."""
     size_n = contact.force_n
     if np.isnan(size_n) and newtons_per_load is not None:
         size_n = newtons_per_load * contact.load

@@ -27,7 +27,7 @@ _MODULE_APART_S = 5.0
 _KEPT = 0.95
 """Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
 _MOST_AT_ONCE = 2048
-"""Touched taxels that are compared in one frame. Of more, each frame takes another part."""
+"""Touched taxels that are compared in one frame; if there are more, each frame takes another part."""
 _NEAR_PITCHES = 1.3
 """Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
 _OPPOSITE_COSINE = -0.9

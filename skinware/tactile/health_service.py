@@ -16,23 +16,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
+from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.health import COLUMNS, HealthReport
-from skinware.tactile.source_service import (
-    Layout,
-    ServiceOptions,
-    SourceReader,
-    SourceSample,
-    SourceWriter,
-    Static,
-    columns_of,
-)
+from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
 
 NAME = "health"
 RATE_HZ = 1.0
@@ -50,11 +43,10 @@ _TEXTS = {
     "shown": ("", "share of its due that it showed in them"),
     "shown_around": ("", "share that its neighbours showed; only where that is much more"),
 }
-_SLOTS = 4
 
 
 @dataclass(frozen=True)
-class HealthSource:
+class HealthSource(Source):
     """The sensors whose health is reported.
 
     Attributes:
@@ -66,6 +58,23 @@ class HealthSource:
     driver: str
     uid: npt.NDArray[np.uint64]
     type_id: npt.NDArray[np.uint32]
+
+    @classmethod
+    def read(cls, static: Static) -> Self:
+        """See :class:`Source`."""
+        uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
+        if uid.shape != type_id.shape:
+            raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
+        return cls(texts(static["driver"])[0], uid, type_id)
+
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """See :class:`Source`."""
+        driver = np.array([self.driver.encode()], "S64")
+        return {"sensor_uid": self.uid, "sensor_type": self.type_id, "driver": driver}
+
+    def columns(self) -> dict[str, Column]:
+        """See :class:`Source`."""
+        return {name: Column(np.dtype(dtype), self.uid.shape, *_TEXTS[name]) for name, (dtype, _) in COLUMNS.items()}
 
 
 class HealthSample(SourceSample[HealthSource]):
@@ -87,25 +96,15 @@ class HealthReader(SourceReader[HealthSource, HealthSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of health.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME
+    source_class = HealthSource
     frame_class = HealthSample
 
-    @staticmethod
-    def _source_of(static: Static) -> HealthSource:
-        uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
-        if uid.shape != type_id.shape:
-            raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
-        return HealthSource(texts(static["driver"])[0], uid, type_id)
 
-    @staticmethod
-    def _layout_of(source: HealthSource) -> Layout:
-        return _layout(len(source.uid))
-
-
-class HealthWriter(SourceWriter):
+class HealthWriter(SourceWriter[HealthSource]):
     """Publishes the health of the sensors of a driver.
 
     Args:
@@ -120,9 +119,10 @@ class HealthWriter(SourceWriter):
     def __init__(
         self, structure: Structure, driver: str, *, name: str = NAME, **options: Unpack[ServiceOptions]
     ) -> None:
-        self._structure, self._driver = structure, driver
-        given: ServiceOptions = {"slots": _SLOTS, "rate_hz": RATE_HZ, **options}
-        super().__init__(name, *self._form(structure), f"health of the sensors of {driver}", **given)
+        self._structure = structure
+        source = HealthSource(driver, structure.sensor_uid, structure.sensor_type)
+        given: ServiceOptions = {"slots": 4, "rate_hz": RATE_HZ, **options}
+        super().__init__(source, name, f"health of the sensors of {driver}", **given)
 
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
         """Publish the present reports.
@@ -148,18 +148,5 @@ class HealthWriter(SourceWriter):
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        self._service.restructure(*self._form(structure))
+        self._restructure(HealthSource(self.source.driver, structure.sensor_uid, structure.sensor_type))
         self._structure = structure
-
-    def _form(self, structure: Structure) -> tuple[dict[str, Any], Static]:
-        """Columns and static columns."""
-        static: dict[str, npt.NDArray[Any]] = {
-            "sensor_uid": structure.sensor_uid,
-            "sensor_type": structure.sensor_type,
-            "driver": np.array([self._driver.encode()], "S64"),
-        }
-        return columns_of(_layout(structure.n_sensors), _TEXTS), static
-
-
-def _layout(n: int) -> Layout:
-    return {name: (dtype, (n,)) for name, (dtype, _) in COLUMNS.items()}

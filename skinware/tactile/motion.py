@@ -1,7 +1,7 @@
-"""Motion of regions: where to and how fast what touches each of them goes.
+"""Compute the motion of regions from the velocities of their contacts.
 
-A contact has a velocity of its own (:mod:`skinware.tactile.contacts`). That of a region is the mean of those of its
-contacts, each weighted by the load that it has there: a finger that comes or goes moves nothing, as it would move the
+A contact has a velocity of its own (:mod:`skinware.tactile.contacts`). The velocity of a region is the mean over its
+contacts, each weighted by its load in the region. So a finger that comes or goes moves nothing, while it would move the
 centre of all load.
 """
 
@@ -20,14 +20,14 @@ from skinware.tactile.contacts import ContactSet
 
 @dataclass(frozen=True, eq=False)
 class RegionMotion:
-    """What moves over one region.
+    """The motion over one region.
 
     Attributes:
-        name: of the region.
+        name: name of the region.
         load: sum of the values of its touched taxels, in the unit of the values.
         contacts: number of contacts that reach into it.
         velocity_m_s: (3,) m/s; NaN where nothing touches it, or no places are known.
-        speed_m_s: length of it, m/s.
+        speed_m_s: length of the velocity, m/s.
         frame: name of the coordinate frame, empty if it is not known.
     """
 
@@ -47,10 +47,10 @@ class RegionMotion:
 
 @dataclass(frozen=True, eq=False)
 class MotionSet:
-    """Motion of all r regions in one frame; a sequence of :class:`RegionMotion`.
+    """The motion of all r regions in one frame; a sequence of :class:`RegionMotion`.
 
     Attributes:
-        names: of the regions.
+        names: names of the regions.
         load: (r,) float32.
         contacts: (r,) uint32.
         velocity_m_s: (r, 3) float32.
@@ -93,17 +93,17 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "speed_m_s": ("<f4", ()),
     "frame": ("<i2", ()),
 }
-"""Per region: dtype and shape of each array of a :class:`MotionSet`."""
+"""Dtype and shape, per region, of each array of a :class:`MotionSet`."""
 
 
 def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
-    """The motion of regions, from the contacts of a frame.
+    """Return the motion of regions, from the contacts of a frame.
 
-    Contacts in another coordinate frame than that with most of the region's load are left out of its velocity.
+    The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load.
 
     Args:
         regions: by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
-        contacts: of the frame.
+        contacts: contacts of the frame.
         value: (n,) calmed values, as for :meth:`.Contacts.update`.
     """
     found: dict[str, npt.NDArray[Any]] = {

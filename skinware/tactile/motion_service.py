@@ -15,29 +15,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
 from skinware.errors import ConfigurationError
+from skinware.service import Column
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
 from skinware.tactile.source_service import (
-    Layout,
     ServiceOptions,
     SourceReader,
     SourceSample,
     SourceWriter,
     Static,
     ValueSource,
-    columns_of,
-    value_source,
-    value_static,
 )
 
 NAME = "motion"
@@ -60,6 +57,23 @@ class MotionSource(ValueSource):
     """
 
     regions: tuple[str, ...]
+
+    @classmethod
+    def read(cls, static: Static) -> Self:
+        """See :class:`Source`."""
+        return cls(**cls.values(static), regions=tuple(texts(static["region_name"])))
+
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """See :class:`Source`."""
+        return {"region_name": np.array([name.encode() for name in self.regions]), **super().static()}
+
+    def columns(self) -> dict[str, Column]:
+        """See :class:`Source`."""
+        units = {name: unit for name, (unit, _) in _TEXTS.items()} | {"load": self.unit}
+        return {
+            name: Column(np.dtype(dtype), (len(self.regions), *shape), units[name], _TEXTS[name][1])
+            for name, (dtype, shape) in COLUMNS.items()
+        }
 
 
 class MotionSample(SourceSample[MotionSource]):
@@ -85,22 +99,15 @@ class MotionReader(SourceReader[MotionSource, MotionSample]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Raises:
-        BadServiceFile: the service is none of motion.
+        BadServiceFile: the service is of another kind.
     """
 
     kind = NAME
+    source_class = MotionSource
     frame_class = MotionSample
 
-    @staticmethod
-    def _source_of(static: Static) -> MotionSource:
-        return MotionSource(**value_source(static), regions=tuple(texts(static["region_name"])))
 
-    @staticmethod
-    def _layout_of(source: MotionSource) -> Layout:
-        return _layout(len(source.regions))
-
-
-class MotionWriter(SourceWriter):
+class MotionWriter(SourceWriter[MotionSource]):
     """Publishes the motion of a driver's regions.
 
     Args:
@@ -134,12 +141,8 @@ class MotionWriter(SourceWriter):
         self._index = regions.of(SkinLayout((driver,), (structure,)), type_name)
         if not self._index:
             raise ConfigurationError(f"no region is of {type_name} sensors")
-        sensor_type = structure.type(type_name)
-        names = np.array([name.encode() for name in self._index])
-        columns = columns_of(_layout(len(names)), _TEXTS, load=sensor_type.unit)
-        static = {"region_name": names, **value_static(driver, sensor_type, frames)}
-        description = f"motion over regions of {driver or 'a skin'}, {type_name}"
-        super().__init__(name, columns, static, description, **options)
+        source = MotionSource(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
+        super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
         """Publish the motion of the next frame.
@@ -158,7 +161,3 @@ class MotionWriter(SourceWriter):
             columns[name][:] = getattr(found, name)
         self._service.commit(acquired_ns)
         return found
-
-
-def _layout(n_regions: int) -> Layout:
-    return {name: (dtype, (n_regions, *shape)) for name, (dtype, shape) in COLUMNS.items()}

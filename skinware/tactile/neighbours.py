@@ -11,14 +11,14 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 
 NONE = -1
-"""Fills the rows of a table."""
+"""Fills up the rows of a table."""
 
 _REACH = 1.8
-"""Of neighbours, in pitches: two rings of a lattice of squares or triangles."""
+"""Pitches within which taxels are neighbours: two rings of a lattice of squares or triangles."""
 _OPPOSITE = -0.2
-"""Taxels whose normals' scalar product is below this lie on different sides of a thin part."""
+"""Scalar product of two normals below which their taxels lie on different sides of a thin part."""
 _MOST_AT_ONE_PLACE = 32
-"""A place with more taxels is one that a file gives to those whose places it does not know."""
+"""Taxels at one place: files give a place to more of them only where their places are not known."""
 _MOST_CANDIDATES = 10_000_000
 _MOST_CELLS = 1 << 62
 _PITCH_SAMPLE = 128
@@ -27,10 +27,10 @@ Table = npt.NDArray[np.int32]
 
 
 def neighbours(geometry: Geometry, radius_m: float | None = None) -> Table:
-    """(n, k) int32: the taxels within a radius of each other, of one frame, and not on opposite sides of a part.
+    """Find (n, k) int32 the taxels within a radius of each other, in one frame, and not on opposite sides of a part.
 
-    Taxels at one place are neighbours. One whose place is not known has none, nor has one of more than 32 that share
-    a place: no skin has that, but files do where nobody knew better.
+    Taxels at one place are neighbours. A taxel without a known place has none, nor has one of more than 32 that share
+    a place: files have such places for taxels whose real ones are not known.
 
     Args:
         geometry: places of the n taxels, in their order.
@@ -54,7 +54,7 @@ def neighbours(geometry: Geometry, radius_m: float | None = None) -> Table:
 
 
 def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:
-    """(n, k) int32: a table of neighbours from a topology.
+    """Make (n, k) int32, a table of neighbours, from a topology.
 
     Args:
         pairs: (m, 2) integers, taxels that lie beside each other, in any order and any number of times.
@@ -77,7 +77,7 @@ def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:
 
 
 def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
-    """(n,) m: the pitch of each taxel's frame, the median distance from a place to the nearest other on its side.
+    """Return (n,) m the pitch of each taxel's frame, the median distance from a place to the nearest other on its side.
 
     NaN where the place is not known, or is the only one of its frame.
     """
@@ -91,10 +91,10 @@ def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
 
 
 def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
-    """(n,) m2: the area of skin that each taxel stands for, an estimate from the pitch of its frame.
+    """Return (n,) m2 the area of skin that each taxel stands for, an estimate from the pitch of its frame.
 
-    A frame is taken for a lattice of triangles where enough places have five or more others at the pitch, else for one
-    of squares. Taxels at one place share its area. NaN where :func:`pitch_m` is.
+    A frame counts as a lattice of triangles if enough places have five or more others at the pitch, else as one of
+    squares. Taxels at one place share its area. NaN where :func:`pitch_m` is.
     """
     area = np.full(len(geometry), np.nan)
     rows, frame = _placed(geometry)
@@ -134,13 +134,13 @@ def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.i
 def _on_one_side(
     normal: npt.NDArray[np.float64], one: npt.NDArray[np.int64], other: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The pairs that do not lie on opposite sides of a part; where a normal is not known, nobody can tell."""
+    """The pairs that do not lie on opposite sides of a part, as far as their normals are known."""
     opposite = np.einsum("ij,ij->i", normal[one], normal[other]) < _OPPOSITE
     return one[~opposite], other[~opposite]
 
 
 def _median_distance(places: npt.NDArray[np.float64], normal: npt.NDArray[np.float64]) -> float:
-    """From a place to the nearest other one on its side, m, judged by a sample; NaN if there is none."""
+    """The median distance from a place to the nearest other on its side, m, of a sample; NaN if there is none."""
     sample = np.unique(np.linspace(0, len(places) - 1, _PITCH_SAMPLE).astype(np.int64))
     squares = np.zeros((len(sample), len(places)))
     for axis in range(3):
@@ -156,8 +156,8 @@ def _pairs_within_1(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """All pairs of rows of one frame whose places are at most 1 apart, each pair once.
 
-    The places are sorted into cells of side 1; the cells of a column along z follow each other in the order of their
-    keys, so that one search finds three of them.
+    Places are sorted into cells of side 1. The keys of the cells along z follow each other, so that one search finds
+    three cells.
     """
     nothing = np.zeros(0, np.int64)
     if not len(places):
@@ -190,17 +190,22 @@ def _table(one: npt.NDArray[np.int64], other: npt.NDArray[np.int64], n: int) -> 
     pairs = np.sort(np.concatenate([one * n + other, other * n + one]))  # np.unique sorts ten times as long
     pairs = pairs[np.diff(pairs, prepend=-1) > 0]
     row, neighbour = pairs // max(n, 1), pairs % max(n, 1)
+    return _filled(row, neighbour, n)
+
+
+def _filled(row: npt.NDArray[np.int64], number: npt.NDArray[np.integer], n: int) -> Table:
+    """A table with numbers in n rows, given row by row."""
     count = np.bincount(row, minlength=n)
     table = np.full((n, int(count.max(initial=0))), NONE, np.int32)
-    table[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = neighbour
+    table[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = number
     return table
 
 
 def checked(table: npt.NDArray[Any], n: int) -> Table:
-    """A table of neighbours of n taxels, made symmetric.
+    """Return a table of neighbours of n taxels, made symmetric.
 
     Raises:
-        ConfigurationError: it is none: another number of rows, or numbers outside -1 to n - 1.
+        ConfigurationError: another number of rows, or numbers outside -1 to n - 1.
     """
     if table.ndim != 2 or len(table) != n or table.dtype.kind not in "iu":
         raise ConfigurationError(
@@ -214,27 +219,28 @@ Rows = npt.NDArray[np.int64]
 
 
 class Components:
-    """The components of any touched taxels of a skin.
+    """Finds the components of touched taxels.
 
     Args:
         n: number of taxels.
-        neighbours: (n, k) int, -1 fills its rows; None: nothing is known of them.
+        neighbours: (n, k) int, -1 fills its rows; None: not known.
         module: (n,) int, the module of each taxel: touched taxels of one module that have no neighbours at all hang
             together. None: each is alone.
 
     Raises:
-        ConfigurationError: the table is none of n taxels.
+        ConfigurationError: the table is not one of n taxels.
     """
 
     def __init__(self, n: int, neighbours: npt.NDArray[Any] | None, module: npt.NDArray[Any] | None = None) -> None:
         table = np.zeros((n, 0), np.int32) if neighbours is None else checked(neighbours, n)
-        self._forward = _forward(table)
+        row, column = np.nonzero(table > np.arange(n)[:, None])
+        self._forward = _filled(row, table[row, column], n)  # each pair once, in the row of the lower number
         self._is_lonely = (table == NONE).all(axis=1)
         self._module = module if self._is_lonely.any() else None
         self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
 
     def of(self, touched: Rows) -> tuple[Rows, int]:
-        """(m,) int64, the component of each of m touched taxels, counted from 0 in their order; and how many.
+        """Return (m,) int64 the component of each of m touched taxels, counted from 0 in their order; and their number.
 
         Args:
             touched: (m,) int64, taxels in ascending order.
@@ -268,10 +274,24 @@ def _roots(count: int, low: Rows, high: Rows) -> Rows:
     return root
 
 
-def _forward(table: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """The same table with each pair once, in the row of the lower number."""
-    row, column = np.nonzero(table > np.arange(len(table))[:, None])
-    count = np.bincount(row, minlength=len(table))
-    forward = np.full((len(table), int(count.max(initial=0))), NONE, np.int32)
-    forward[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = table[row, column]
-    return forward
+def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return (n,) bool the touched taxels and their holes: taxels most of whose neighbours are among them.
+
+    At the edge of a skin taxels have few neighbours. There, the number of such neighbours must be more than half of the
+    usual number, or the result would grow along the edge.
+
+    Args:
+        touched: (n,) bool.
+        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows.
+    """
+    is_neighbour = neighbours != NONE
+    count = is_neighbour.sum(axis=1)
+    usual = np.percentile(count, 90) if len(count) else 0
+    enough = np.maximum(count, usual) / 2
+    found = touched.astype(bool)
+    while True:
+        inside = (found[neighbours] & is_neighbour).sum(axis=1)
+        holes = ~found & (inside > enough)
+        if not holes.any():
+            return found
+        found |= holes

@@ -1,15 +1,15 @@
-"""Define regions, named sets of taxels, and read and write their files."""
+"""Define regions, named sets of taxels; choose sensors by them; read and write their files."""
 
 from __future__ import annotations
 
 import graphlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import msgspec.structs
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +18,6 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Triple
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
-from skinware.tactile.neighbours import NONE
 from skinware.toml_text import TomlText, line_of
 
 _SELECTORS = ("uid", "patch", "module", "frame", "box", "regions")
@@ -30,8 +29,8 @@ class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         frame: name of the coordinate frame.
-        centre_m: of the box, m.
-        size_m: from side to side along each axis, m.
+        centre_m: centre of the box, m.
+        size_m: length of each side, m.
     """
 
     frame: str
@@ -46,17 +45,17 @@ class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is in one region: what any of the selectors says, but for what is in ``without``.
+    """One region: the sensors that any of its selectors names, except for those in ``without``.
 
     Attributes:
-        name: of the region.
-        type: name of the type of its sensors; empty: of all.
-        driver: names of drivers that it is limited to; empty: all.
-        uid: of sensors.
+        name: name of the region.
+        type: name of the type of its sensors; empty: all types.
+        driver: names of the drivers that it is limited to; empty: all.
+        uid: uids of sensors.
         patch: names of patches.
         module: names of modules, each after that of its patch.
         frame: names of coordinate frames.
-        box: boxes, in which sensors lie.
+        box: boxes around sensors.
         regions: names of other regions.
         without: names of regions whose sensors are not in this one.
     """
@@ -74,13 +73,13 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not any(getattr(self, selector) for selector in _SELECTORS):
-            raise ValueError(f"region {self.name!r} says nothing of what is in it: give any of {', '.join(_SELECTORS)}")
+            raise ValueError(f"region {self.name!r} selects nothing: give any of {', '.join(_SELECTORS)}")
         if self.uid and max(self.uid) >= 1 << 64:
             raise ValueError(f"region {self.name!r}: uid {max(self.uid):#x} has more than 64 bits")
 
 
 class RegionIndex(dict[str, Index]):
-    """By name of a region: where its m sensors are, a slice or (m,) int64, ascending. An unknown name is an error."""
+    """The positions of the sensors of each region, by its name: a slice or (m,) int64, ascending."""
 
     def __missing__(self, name: str) -> Index:
         raise ConfigurationError(f"no region {name!r}; there are: {', '.join(self) or 'none'}")
@@ -90,11 +89,11 @@ class Regions:
     """Regions that may refer to each other.
 
     Args:
-        regions: in any order.
-        places: of each, where it stands, for messages.
+        regions: the regions, in any order.
+        places: file and line of each, for messages.
 
     Raises:
-        ConfigurationError: two of one name, a name that none has, one of another type, or a region that is in itself.
+        ConfigurationError: a name twice, an unknown name, a region of another type, or a region in itself.
     """
 
     def __init__(self, regions: Iterable[Region], places: Sequence[str] = ()) -> None:
@@ -109,14 +108,14 @@ class Regions:
         return len(self._regions)
 
     def of(self, skin: SkinLayout | Structure, type_name: str) -> RegionIndex:
-        """Where the sensors of a type are, of every region that may have such sensors.
+        """Return the positions of the sensors of a type, for every region that may have such sensors.
 
-        It is computed once for a layout or structure, and given again as long as it is the same object.
+        The result is computed once for each layout or structure.
 
         Args:
             skin: the layout of a whole skin (``snapshot.layout``), or the structure of one driver, for which limits to
                 drivers do not count.
-            type_name: type of sensors. Positions count in the order of ``snapshot.physical(type_name)``, or of
+            type_name: type of the sensors. Positions count in the order of ``snapshot.physical(type_name)``, or of
                 ``structure.index(type_name)``.
 
         Raises:
@@ -124,9 +123,7 @@ class Regions:
         """
         skin_then, found = self._known.get(type_name, (None, RegionIndex()))
         if skin_then is not skin:
-            sensors, flags = _Sensors(skin, type_name), dict[str, Flags]()
-            for region in self._in_turn:
-                flags[region.name] = sensors.of(region, flags)
+            flags = _members(skin, type_name, self._in_turn)
             of_type = [region.name for region in self._regions if region.type in ("", type_name)]
             found = RegionIndex({name: as_index(np.flatnonzero(flags[name])) for name in of_type})
             self._known[type_name] = skin, found
@@ -158,53 +155,101 @@ def _in_turn(regions: Sequence[Region], places: Sequence[str]) -> list[Region]:
         raise ConfigurationError(f"{place_of[circle[-1]]}a region that is in itself: {names}") from None
 
 
-class _Sensors:
-    """The n sensors of one type of a skin, by all that regions may ask for.
-
-    Args:
-        skin: whose.
-        type_name: which.
-    """
-
-    def __init__(self, skin: SkinLayout | Structure, type_name: str) -> None:
-        self.layout = SkinLayout(("",), (skin,)) if isinstance(skin, Structure) else skin
-        self.has_drivers = skin is self.layout
-        self.type_name = type_name
-        self.driver = self.layout.driver_of(type_name)
-        self.uid = self.layout.uids(type_name)
-        self.patch = self.layout.patch_of(type_name)
-        self.module = self.layout.module_of(type_name)
-        self.geometry = self.layout.geometry(type_name)
-        structures = self.layout.structures
-        own = [name for each in structures for name in zip(texts(each.patch_name), each.patch_names, strict=True)]
-        self._patch_names = [{*names, name} for names, name in zip(own, self.layout.patches, strict=True)]
-        own_modules = [name for each in structures for name in each.module_names]
-        self._module_names = [set(names) for names in zip(own_modules, self.layout.modules, strict=True)]
-
-    def of(self, region: Region, known: Mapping[str, Flags]) -> Flags:
-        """(n,) bool: which are in a region, by what is known of those that it refers to."""
-        layout, geometry = self.layout, self.geometry
-        if region.type not in ("", self.type_name):
-            return np.zeros(len(self.uid), bool)
-        found = np.isin(self.uid, np.array(region.uid, np.uint64))
-        found |= _named(self._patch_names, region.patch)[self.patch]
-        found |= _named(self._module_names, region.module)[self.module]
+def _members(skin: SkinLayout | Structure, type_name: str, regions: Iterable[Region]) -> dict[str, Flags]:
+    """By name, (n,) bool: the sensors of a type in each region, after the regions that it refers to."""
+    layout = SkinLayout(("",), (skin,)) if isinstance(skin, Structure) else skin
+    driver, uid, geometry = layout.driver_of(type_name), layout.uids(type_name), layout.geometry(type_name)
+    patch, module = layout.patch_of(type_name), layout.module_of(type_name)
+    own = [name for each in layout.structures for name in zip(texts(each.patch_name), each.patch_names, strict=True)]
+    patch_names = [{*names, name} for names, name in zip(own, layout.patches, strict=True)]
+    own_modules = [name for each in layout.structures for name in each.module_names]
+    module_names = [set(names) for names in zip(own_modules, layout.modules, strict=True)]
+    members: dict[str, Flags] = {}
+    for region in regions:
+        if region.type not in ("", type_name):
+            members[region.name] = np.zeros(len(uid), bool)
+            continue
+        found = np.isin(uid, np.array(region.uid, np.uint64))
+        found |= _named(patch_names, region.patch)[patch]
+        found |= _named(module_names, region.module)[module]
         found |= np.isin(geometry.frame.astype(str), np.array(region.frame, str)) & geometry.known
         for box in region.box:
             inside = abs(geometry.position_m - box.centre_m) <= np.array(box.size_m) / 2
             found |= inside.all(axis=1) & (geometry.frame == box.frame)
         for name in region.regions:
-            found |= known[name]
-        if region.driver and self.has_drivers:
-            found &= np.isin(np.array(layout.drivers, str), region.driver)[self.driver]
+            found |= members[name]
+        if region.driver and skin is layout:
+            found &= np.isin(np.array(layout.drivers, str), region.driver)[driver]
         for name in region.without:
-            found &= ~known[name]
-        return found
+            found &= ~members[name]
+        members[region.name] = found
+    return members
 
 
 def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:
-    """Which patches or modules have one of the wanted names: that in the skin, or that of their driver alone."""
     return np.array([not each.isdisjoint(wanted) for each in names], bool)
+
+
+@dataclass(frozen=True)
+class SensorChoice:
+    """A choice of sensors: those to which all conditions apply.
+
+    Attributes:
+        types: names of sensor types; empty: all.
+        patches: names of patches; empty: all.
+        regions: the regions that ``in_regions`` refers to.
+        in_regions: names of regions; a sensor is in any of them; empty: all.
+    """
+
+    types: Collection[str] = ()
+    patches: Collection[str] = ()
+    regions: Regions = field(default_factory=lambda: Regions(()))
+    in_regions: Collection[str] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.types or self.patches or self.in_regions)
+
+    def unknown(self, structures: Sequence[Structure]) -> Iterator[str]:
+        """Yield a line for each name that does not exist.
+
+        Args:
+            structures: structures of all drivers.
+        """
+        yield from unknown("sensor type", self.types, [each.name for one in structures for each in one.types])
+        yield from unknown("patch", self.patches, [name for one in structures for name in one.patch_names])
+        yield from unknown("region", self.in_regions, [region.name for region in self.regions])
+
+    def of(self, driver: str, structure: Structure) -> Flags:
+        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames.
+
+        Args:
+            driver: name of the driver.
+            structure: structure of the driver.
+        """
+        wanted = np.zeros(structure.n_sensors, bool)
+        for sensor_type in structure.types:
+            if not self.types or sensor_type.name in self.types:
+                wanted[structure.index(sensor_type.name)] = self._in_regions(driver, structure, sensor_type.name)
+        if self.patches:
+            numbers = [row for row, name in enumerate(structure.patch_names) if name in self.patches]
+            wanted &= np.isin(structure.sensor_patch, numbers)
+        return wanted
+
+    def _in_regions(self, driver: str, structure: Structure, type_name: str) -> Flags:
+        inside = np.full(len(structure.module_of(type_name)), not self.in_regions)
+        if self.in_regions and len(inside):
+            found = self.regions.of(SkinLayout((driver,), (structure,)), type_name)
+            for name in self.in_regions:
+                if name in found:  # others are of sensors of other types
+                    inside[found[name]] = True
+        return inside
+
+
+def unknown(what: str, wanted: Collection[str], there_are: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each name that does not exist: ``no patch 'palm'; there are: board 7, board 8``."""
+    for name in wanted:
+        if name not in there_are:
+            yield f"no {what} {name!r}; there are: {', '.join(dict.fromkeys(there_are)) or 'none'}"
 
 
 FORMAT, VERSION = "skinware-regions", 1
@@ -222,8 +267,8 @@ def read_regions(*paths: str | Path) -> Regions:
     """Read files of regions, which together are one set.
 
     Raises:
-        ConfigurationError: not there, not TOML, not of this format, a value that is wrong, or as for :class:`Regions`;
-            the message says where.
+        ConfigurationError: not there, not TOML, not of this format, a wrong value, or as for :class:`Regions`; the
+            message says where.
     """
     regions: list[Region] = []
     places: list[str] = []
@@ -236,10 +281,10 @@ def read_regions(*paths: str | Path) -> Regions:
 
 
 def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
-    """The text of a file of regions.
+    """Return the text of a file of regions.
 
     Args:
-        regions: what is in it.
+        regions: the regions.
         comment: lines for its head.
     """
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
@@ -247,15 +292,15 @@ def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
 
 
 def put_region(path: str | Path, region: Region, *, replace: bool = False) -> None:
-    """Write a region into a file, which is made if it is not there; all else in it stays as it is.
+    """Write a region into a file, which is created if necessary; everything else in it stays.
 
     Args:
-        path: of the file.
-        region: to be written.
-        replace: where the file has a region of this name, this one takes its place.
+        path: path of the file.
+        region: the region.
+        replace: replace a region of this name.
 
     Raises:
-        ConfigurationError: the file is none of regions, has a region of this name, or would be wrong with this one.
+        ConfigurationError: it is no file of regions, has a region of this name, or would be wrong with this one.
         OSError: it cannot be written.
     """
     path = Path(path)
@@ -282,12 +327,12 @@ def put_region(path: str | Path, region: Region, *, replace: bool = False) -> No
 
 
 def _replaced(path: Path, text: str, number: int, region: Region) -> str:
-    """A file's text with another region in the place of one of its regions; comments between regions stay."""
+    """The text of a file with another region in the place of one of its regions; comments between regions stay."""
     lines = text.splitlines(keepends=True)
     begin, end = (line_of(text, ("region", each)) - 1 for each in (number, number + 1))
     if not lines[begin].lstrip().startswith("["):
         raise ConfigurationError(f"{path}:{begin + 1}: regions in one value: replace {region.name!r} by hand")
-    if end <= begin:  # there is none after it
+    if end <= begin:  # it is the last one
         end = len(lines)
     while lines[end - 1].strip() == "" or lines[end - 1].lstrip().startswith("#"):
         end -= 1
@@ -295,12 +340,8 @@ def _replaced(path: Path, text: str, number: int, region: Region) -> str:
 
 
 def _region_text(region: Region) -> str:
-    lines = ["[[region]]"]
-    for field in msgspec.structs.fields(region):
-        value = getattr(region, field.name)
-        if value:
-            lines.append(f"{field.name} = {_value(value, field.name)}")
-    return "\n".join(lines) + "\n"
+    given = {name: value for name in region.__struct_fields__ if (value := getattr(region, name))}
+    return "[[region]]\n" + "".join(f"{name} = {_value(value, name)}\n" for name, value in given.items())
 
 
 def _value(value: Any, name: str) -> str:
@@ -316,26 +357,3 @@ def _value(value: Any, name: str) -> str:
     if isinstance(value, int | float):
         return f"{value:#x}" if name == "uid" else repr(float(value))
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
-
-
-def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """(n,) bool: the touched taxels, and those most of whose neighbours are among them, until there are no more.
-
-    At the edge of a skin, where taxels have few neighbours, more than half of what others have must be; otherwise a
-    region would grow along the edge.
-
-    Args:
-        touched: (n,) bool.
-        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows.
-    """
-    is_neighbour = neighbours != NONE
-    count = is_neighbour.sum(axis=1)
-    usual = np.percentile(count, 90) if len(count) else 0
-    enough = np.maximum(count, usual) / 2
-    found = touched.astype(bool)
-    while True:
-        inside = (found[neighbours] & is_neighbour).sum(axis=1)
-        holes = ~found & (inside > enough)
-        if not holes.any():
-            return found
-        found |= holes

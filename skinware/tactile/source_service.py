@@ -1,12 +1,12 @@
-"""Share what the services of contacts, motion and health have in common: a table of columns, a writer and a reader.
+"""Share what the services of contacts, motion and health have in common: a source, a writer and a reader.
 
-Each of them describes itself in static columns: its *source*. A reader knows the form of every column from the source,
-and refuses a service of another form.
+A service describes itself by its *source*, which stands in its static columns and determines all others. A reader
+refuses a service of another form.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Self, TypedDict, TypeVar, Unpack, cast
@@ -19,15 +19,10 @@ from skinware.errors import BadServiceFile
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
-from skinware.sensor_types import SensorType
 from skinware.service import Column, ServiceReader, ServiceWriter
 
-SourceT = TypeVar("SourceT")
-Layout = Mapping[str, tuple[str, tuple[int, ...]]]
-"""Dtype and shape of each column."""
-Texts = Mapping[str, tuple[str, str]]
-"""Unit and description of each column."""
 Static = Mapping[str, npt.NDArray[Any]]
+SourceT = TypeVar("SourceT", bound="Source")
 
 
 class ServiceOptions(TypedDict, total=False):
@@ -39,8 +34,25 @@ class ServiceOptions(TypedDict, total=False):
     group: str | None
 
 
+class Source(ABC):
+    """The description of a service."""
+
+    @classmethod
+    @abstractmethod
+    def read(cls, static: Static) -> Self:
+        """Read it from static columns; raises LookupError, ValueError or TypeError if they are of another form."""
+
+    @abstractmethod
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the static columns."""
+
+    @abstractmethod
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of a sample."""
+
+
 @dataclass(frozen=True)
-class ValueSource:
+class ValueSource(Source):
     """The values that a service is computed from.
 
     Attributes:
@@ -55,60 +67,50 @@ class ValueSource:
     unit: str
     frames: tuple[str, ...]
 
+    @staticmethod
+    def values(static: Static) -> dict[str, Any]:
+        """Return the attributes above from static columns."""
+        return {
+            "driver": texts(static["driver"])[0],
+            "type_name": texts(static["type_name"])[0],
+            "unit": texts(static["type_unit"])[0],
+            "frames": tuple(texts(static["frame_name"])),
+        }
 
-def value_static(driver: str, sensor_type: SensorType, frames: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
-    """Return the static columns of a :class:`ValueSource`."""
-    return {
-        "frame_name": np.array([name.encode() for name in frames], "S64"),
-        "driver": np.array([driver.encode()], "S64"),
-        "type_name": np.array([sensor_type.name.encode()], "S32"),
-        "type_unit": np.array([sensor_type.unit.encode()], "S16"),
-    }
-
-
-def value_source(static: Static) -> dict[str, Any]:
-    """Return the arguments of a :class:`ValueSource`."""
-    return {
-        "driver": texts(static["driver"])[0],
-        "type_name": texts(static["type_name"])[0],
-        "unit": texts(static["type_unit"])[0],
-        "frames": tuple(texts(static["frame_name"])),
-    }
-
-
-def columns_of(layout: Layout, described: Texts, **units: str) -> dict[str, Column]:
-    """Return the columns of a service; ``units`` are those that depend on the values."""
-    return {
-        name: Column(np.dtype(dtype), shape, units.get(name, described[name][0]), described[name][1])
-        for name, (dtype, shape) in layout.items()
-    }
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the static columns of the attributes above."""
+        return {
+            "frame_name": np.array([name.encode() for name in self.frames], "S64"),
+            "driver": np.array([self.driver.encode()], "S64"),
+            "type_name": np.array([self.type_name.encode()], "S32"),
+            "type_unit": np.array([self.unit.encode()], "S16"),
+        }
 
 
-class SourceWriter:
+class SourceWriter(Generic[SourceT]):
     """Publishes a service of one kind.
 
     Attributes:
-        kind: kind of the service, and its default name.
+        kind: kind of the service.
+        source: the present source of the service.
     """
 
     kind: ClassVar[str]
 
-    def __init__(
-        self,
-        name: str | None,
-        columns: Mapping[str, Column],
-        static: Static,
-        description: str,
-        **options: Unpack[ServiceOptions],
-    ) -> None:
+    def __init__(self, source: SourceT, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
+        self.source: SourceT = source
         self._service = ServiceWriter(
-            name or self.kind, columns, static, kind=self.kind, description=description, **options
+            name, source.columns(), source.static(), kind=self.kind, description=description, **options
         )
 
     @property
     def name(self) -> str:
         """Name of the service."""
         return self._service.name
+
+    def _restructure(self, source: SourceT) -> None:
+        self._service.restructure(source.columns(), source.static())
+        self.source = source
 
     def close(self) -> None:
         """Withdraw the service. Idempotent."""
@@ -133,7 +135,7 @@ class SourceSample(Sample, Generic[SourceT]):
 
 
 class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
-    """Reads a service of one kind, whose static columns describe its source.
+    """Reads a service of one kind.
 
     Args:
         name: of the service; default: that of its kind.
@@ -141,12 +143,14 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
 
     Attributes:
         kind: kind of the service.
+        source_class: class of its source.
 
     Raises:
         BadServiceFile: the service is of another kind, or its columns are others.
     """
 
     kind: ClassVar[str]
+    source_class: ClassVar[type[Source]]
 
     def __init__(
         self,
@@ -163,25 +167,15 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
         """The source of the service."""
         return cast(SourceT, self._ring.context)
 
-    def _describe(self, attached: segments.Segment) -> SourceT:
+    def _describe(self, attached: segments.Segment) -> Source:
         if bytes(attached.header["kind"]) != self.kind.encode():
-            raise BadServiceFile(f"service {self.name!r} is none of {self.kind}")
-        columns = attached.schema.columns
+            raise BadServiceFile(f"service {self.name!r} is not of kind {self.kind!r}")
+        found = attached.schema.columns
         try:
-            source = self._source_of(attached.static_columns())
-            for name, (dtype, shape) in self._layout_of(source).items():
-                if columns[name].dtype != np.dtype(dtype) or columns[name].shape != shape:
-                    raise ValueError(f"column {name!r} is not {shape} of {dtype}")
+            source = self.source_class.read(attached.static_columns())
+            for name, column in source.columns().items():
+                if found[name].dtype != column.dtype or found[name].shape != column.shape:
+                    raise ValueError(f"column {name!r} is not {column.shape} of {column.dtype}")
         except (LookupError, ValueError, TypeError, AttributeError) as error:
             raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
         return source
-
-    @staticmethod
-    @abstractmethod
-    def _source_of(static: Static) -> SourceT:
-        """Read the source from the static columns."""
-
-    @staticmethod
-    @abstractmethod
-    def _layout_of(source: SourceT) -> Layout:
-        """Return the dtype and shape of every column."""

@@ -1,4 +1,4 @@
-"""Stages of a chain: each takes the values of n taxels of one type, frame by frame, and changes them.
+"""Filter, scale and amplify the values of n taxels of one type, frame by frame: the stages of a chain.
 
 Each can be used alone::
 
@@ -7,7 +7,7 @@ Each can be used alone::
     stage.step(signal)
     signal.values
 
-What a stage is told stands in its settings, which are also what a chain's file says of it.
+The settings of a stage are also its entry in the file of a chain.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
+from skinware.tactile.rule import resolution_of
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
 NO_UNIT = "1"
-"""Of what is no quantity any more."""
+"""Unit of values that are no quantity any more."""
 
 
 @dataclass(eq=False)
@@ -38,12 +39,12 @@ class Signal:
     """One frame of n taxels on its way through stages, which change it in place.
 
     Attributes:
-        time_ns: of the frame.
+        time_ns: time of the frame.
         values: (n,) float32.
         usable: (n,) bool, which values are of this frame.
         jumped: (n,) bool, where the hardware moved its own baseline just before it.
         forced: (n,) bool, where a stage moved a baseline by force.
-        unknown: (n,) bool, where a stage cannot tell yet what the value is; it is 0.
+        unknown: (n,) bool, where a stage has no result yet; the value is 0.
     """
 
     time_ns: int
@@ -55,7 +56,7 @@ class Signal:
 
     @classmethod
     def of(cls, time_ns: int, values: npt.ArrayLike, usable: npt.ArrayLike | None = None) -> Self:
-        """A frame: (n,) values, and which of them are usable; default: all that are finite."""
+        """Make a signal of (n,) values; default of ``usable``: all finite ones."""
         taken = np.array(values, np.float32)
         known = np.isfinite(taken) if usable is None else np.isfinite(taken) & usable
         none = np.zeros(len(taken), bool)
@@ -67,10 +68,10 @@ class Taxels:
     """The n taxels of one type that a stage is made for.
 
     Attributes:
-        type: as the stage gets it: its unit, and what its values can be.
-        uid: (n,) of them.
-        module: (n,) of them.
-        patch: (n,) of them.
+        type: the type as the stage gets it: unit and range of its values.
+        uid: (n,) uids.
+        module: (n,) their modules.
+        patch: (n,) their patches.
         resolution: step of the values; 0 if they have none.
     """
 
@@ -82,7 +83,7 @@ class Taxels:
 
     @classmethod
     def of(cls, structure: Structure, type_name: str) -> Taxels:
-        """Those of a driver.
+        """Return the taxels of a type of a driver.
 
         Raises:
             StructureError: no such type here.
@@ -93,7 +94,7 @@ class Taxels:
             structure.sensor_uid[structure.index(type_name)],
             structure.module_of(type_name),
             structure.patch_of(type_name),
-            0.0 if structure.dtype.kind == "f" else abs(sensor_type.scale),
+            resolution_of(structure, type_name),
         )
 
     def __len__(self) -> int:
@@ -101,11 +102,11 @@ class Taxels:
 
 
 class Stage(ABC):
-    """What a signal goes through.
+    """A step that changes signals.
 
     Attributes:
-        name: as a file calls it.
-        taxels: of what comes out.
+        name: its name in files.
+        taxels: the taxels as they come out.
     """
 
     name: ClassVar[str]
@@ -113,11 +114,11 @@ class Stage(ABC):
 
     @abstractmethod
     def step(self, signal: Signal) -> None:
-        """Change one frame in place; frames come in the order of time."""
+        """Change one frame in place; frames come in the order of their times."""
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):
-    """What is said of a stage. Each has a method ``stage`` that makes it.
+    """Settings of a stage. Each has a method ``stage`` that makes it.
 
     Attributes:
         types: the sensor types that it is for; None: all for which it can be made.
@@ -130,12 +131,12 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
-    """Smooths each taxel over time; the unit stays.
+    """Settings of a filter that smooths each taxel over time; the unit stays.
 
     Attributes:
         method: ``lowpass`` of first order, ``mean`` or ``median`` of the last frames.
         tau_s: time constant of ``lowpass``, s.
-        frames: of ``mean`` and ``median``, 2 to 99.
+        frames: number of frames for ``mean`` and ``median``, 2 to 99.
     """
 
     method: Literal["lowpass", "mean", "median"] = "lowpass"
@@ -143,12 +144,12 @@ class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
     frames: Annotated[int, msgspec.Meta(ge=2, le=99)] = 3
 
     def stage(self, taxels: Taxels) -> Stage:
-        """The stage for some taxels."""
+        """Make the stage for some taxels."""
         return Lowpass(taxels, self.tau_s) if self.method == "lowpass" else LastFrames(taxels, self.frames, self.method)
 
 
 class Lowpass(Stage):
-    """A first-order low-pass of n taxels, by the time that passes."""
+    """Smooths n taxels by a low-pass of first order, by the time that passes."""
 
     name = "filter"
 
@@ -159,7 +160,6 @@ class Lowpass(Stage):
         self._smooth: Floats = np.full(len(taxels), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         passed_s = 0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
         self._time_ns = signal.time_ns
         share = np.float32(-math.expm1(-passed_s / self._tau_s))
@@ -169,7 +169,7 @@ class Lowpass(Stage):
 
 
 class LastFrames(Stage):
-    """Mean or median of the last usable values of n taxels, one row of a ring after the other."""
+    """Replaces the values of n taxels by the mean or median of their last usable ones."""
 
     name = "filter"
 
@@ -179,7 +179,6 @@ class LastFrames(Stage):
         self._last: Floats = np.full((frames, len(taxels)), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         new = signal.usable & np.isnan(self._last[0])
         self._last[:, new] = signal.values[new]
         self._last = np.roll(self._last, -1, axis=0)
@@ -194,12 +193,12 @@ class LastFrames(Stage):
 
 
 class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
-    """Brings each taxel to the same range; the result has no unit.
+    """Settings of a scaler that gives each taxel the same range; the result has no unit.
 
     Attributes:
-        source: ``range``: the range that the type says; ``seen``: what each taxel has shown so far.
-        low: of what comes out.
-        high: of what comes out.
+        source: ``range``: the range of the type; ``seen``: the range that each taxel has shown so far.
+        low: least value of the result.
+        high: largest value of the result.
         shrink_s: the seen range shrinks towards the present value with this time constant, s; None: never.
     """
 
@@ -213,7 +212,7 @@ class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
             raise ConfigurationError(f"low = {self.low}, high = {self.high}: give a range")
 
     def stage(self, taxels: Taxels) -> Stage:
-        """The stage for some taxels.
+        """Make the stage for some taxels.
 
         Raises:
             ConfigurationError: the type has no range; the message says what to do.
@@ -241,7 +240,6 @@ class Scaler(Stage):
         self._most: Floats = np.full(len(taxels), before.maximum if is_range else np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         settings = self._settings
         if settings.source == "seen":
             seen = np.where(signal.usable, signal.values, np.float32(np.nan))
@@ -258,13 +256,13 @@ class Scaler(Stage):
 
 
 class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier"):
-    """gain * value ** exponent + offset, with the sign of the value; the result has no unit, unless one is given.
+    """Settings of an amplifier: gain * value ** exponent + offset, with the sign of the value.
 
     Attributes:
         gain: factor.
-        exponent: below 1, weak touches are amplified more than strong ones.
+        exponent: below 1, weak touches grow more than strong ones.
         offset: added at the end.
-        unit: of the result, at most 16 bytes.
+        unit: unit of the result, at most 16 bytes; default: none.
     """
 
     gain: float = 1.0
@@ -279,7 +277,7 @@ class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier
             )
 
     def stage(self, taxels: Taxels) -> Stage:
-        """The stage for some taxels."""
+        """Make the stage for some taxels."""
         return Amplifier(taxels, self)
 
 
@@ -296,7 +294,6 @@ class Amplifier(Stage):
         self.taxels = replace(taxels, type=amplified, resolution=step)
 
     def step(self, signal: Signal) -> None:
-        """See :class:`Stage`."""
         signal.values = self._of(signal.values).astype(np.float32)
 
     def _of(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:

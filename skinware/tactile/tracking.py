@@ -217,9 +217,13 @@ class Tracker:
         """Return the identities of the contacts of the next frame, and how they move."""
         self._forget(time_ns)
         tracks, size = self._tracks, np.bincount(places.contact, minlength=len(places.load))
-        shared = self._shared(places)
+        track = self._track_of[places.taxels]
+        is_known = track >= 0
+        pair = track[is_known] * len(size) + places.contact[is_known]
+        shared = np.bincount(pair, minlength=len(tracks.id) * len(size)).reshape(len(tracks.id), len(size))
         overlap = shared / np.maximum(np.minimum(tracks.size[:, None], size), 1)
-        expected_m = self._expected_m(time_ns)
+        passed_s = np.minimum((time_ns - tracks.seen_ns) / NS_PER_S, _LONGEST_GUESS_S)
+        expected_m = tracks.velocity_m_s * passed_s[:, None]
         known, found = assign(self._gains(overlap, expected_m, places))
         now = _Tracks(
             id=np.zeros(len(size), np.int64),
@@ -257,19 +261,6 @@ class Tracker:
         if not keep.all():
             number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
             self._tracks, self._track_of = tracks[keep], number[self._track_of]
-
-    def _shared(self, places: Places) -> Whole:
-        """(tracks, m): number of taxels that each track and contact share."""
-        count = len(places.load)
-        track = self._track_of[places.taxels]
-        is_known = track >= 0
-        pair = track[is_known] * count + places.contact[is_known]
-        return np.bincount(pair, minlength=len(self._tracks.id) * count).reshape(len(self._tracks.id), count)
-
-    def _expected_m(self, time_ns: int) -> Floats:
-        """(tracks, 3) m: how far each track has moved since it was seen, at its last velocity."""
-        passed_s = np.minimum((time_ns - self._tracks.seen_ns) / NS_PER_S, _LONGEST_GUESS_S)
-        return self._tracks.velocity_m_s * passed_s[:, None]
 
     def _gains(self, overlap: Floats, expected_m: Floats, places: Places) -> Gains:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""

@@ -1,4 +1,4 @@
-"""How bridges are, in words and as JSON has it."""
+"""Write the state of bridges as JSON and in words."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from skinware.bridge_state import BridgeState, ServiceState
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.text import age_text, count_text, plural, rate_text, table
+from skinware.text import age_text_ms, count_text, plural, rate_text, table
 
 _TITLES = ("service", "state", "mode", "rate", "age 50 %", "age 99 %", "not come")
 
@@ -33,47 +33,43 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
     }
 
 
-def summary(robot: str, told: dict[str, Any]) -> str:
-    state = "heard" if told["connected"] else "not heard"
-    host = f" on {told['host']}" if told["host"] else ""
-    line, clock = f"robot {robot}{host} {state} for {age_text(told['since_s'] * 1e9)}", told["clock"]
+def summary(robot: str, state: dict[str, Any]) -> str:
+    heard = "heard" if state["connected"] else "not heard"
+    host = f" on {state['host']}" if state["host"] else ""
+    line, clock = f"robot {robot}{host} {heard} for {age_text_ms(state['since_s'] * 1e3)}", state["clock"]
     if clock is None:
         return f"{line}, its clock is not known"
-    error, round_trip = age_text(clock["error_ms"] * 1e6), age_text(clock["round_trip_ms"] * 1e6)
+    error, round_trip = age_text_ms(clock["error_ms"]), age_text_ms(clock["round_trip_ms"])
     return f"{line}, its clock known to {error}, round trip {round_trip}"
 
 
-def trouble(told: dict[str, Any]) -> list[str]:
-    """Lines on messages that could not be read, and on robots of one name; of what ``as_data`` returns."""
+def trouble(state: dict[str, Any]) -> list[str]:
+    """Return lines about unreadable messages and about robots with one name, from the data of :func:`as_data`."""
     lines = []
-    if told["refused"]:
-        lines.append(f"{plural(told['refused'], 'message')} could not be read; the last: {told['last_refused']}")
-    if told["namesakes"]:
+    if state["refused"]:
+        lines.append(f"{plural(state['refused'], 'message')} could not be read; the last: {state['last_refused']}")
+    if state["namesakes"]:
         lines.append(
-            f"{plural(told['namesakes'], 'other bridge')} of this name; bridge {told['instance'][:8]} is followed"
+            f"{plural(state['namesakes'], 'other bridge')} of this name; bridge {state['instance'][:8]} is followed"
         )
-    if told["switches"]:
-        lines.append(f"another robot of this name took its place {plural(told['switches'], 'time')}")
+    if state["switches"]:
+        lines.append(f"another robot of this name took its place {plural(state['switches'], 'time')}")
     return lines
 
 
-def as_lines(robot: str, told: dict[str, Any]) -> list[str]:
+def as_lines(robot: str, state: dict[str, Any]) -> list[str]:
     rows = [
         (
             name,
             service["state"],
             service["mode"],
             rate_text(service["rate_hz"]),
-            *(_age_text(service["age_ms"][share]) for share in ("p50", "p99")),
+            *(age_text_ms(service["age_ms"][share]) for share in ("p50", "p99")),
             count_text(service["lost"]),
         )
-        for name, service in told["services"].items()
+        for name, service in state["services"].items()
     ]
-    return [summary(robot, told), *trouble(told), *(["", *table(_TITLES, rows, left=3)] if rows else [])]
-
-
-def _age_text(age_ms: float | None) -> str:
-    return age_text(None if age_ms is None else age_ms * 1e6)
+    return [summary(robot, state), *trouble(state), *(["", *table(_TITLES, rows, left=3)] if rows else [])]
 
 
 def _service_data(service: ServiceState) -> dict[str, Any]:

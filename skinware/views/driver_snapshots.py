@@ -1,4 +1,4 @@
-"""The driver that a command is about, and its frames for as long as somebody does something with the skin."""
+"""Read the driver of a command, for as long as a person does something with the skin."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import select
 import sys
 import time
 from collections.abc import Callable, Iterator
-
-import numpy as np
-import numpy.typing as npt
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
@@ -21,16 +18,16 @@ _SILENT_S = 5.0
 
 
 def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReader:
-    """A reader of a driver, or of the only one that runs.
+    """Return a reader of a driver, or of the only one that runs.
 
     Args:
         namespace: of the driver.
         driver: its name; None: the only one.
-        how: how to choose one, for the message.
+        how: the way to choose one, for the message.
 
     Raises:
         ServiceNotFound: it does not run, or none does.
-        ConfigurationError: several do.
+        ConfigurationError: several run.
     """
     if driver is None:
         with Skin(namespace) as skin:
@@ -44,14 +41,14 @@ def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReade
 
 
 def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverSnapshot]:
-    """The driver's newest frames, each once.
+    """Yield the driver's newest snapshots, each once.
 
     Args:
         reader: of the driver.
-        is_over: asked before each frame, and ten times a second where none comes.
+        is_over: called before each snapshot, and ten times a second while none arrives; True ends it.
 
     Raises:
-        ServiceTimeout: no frame came for 5 s.
+        ServiceTimeout: no snapshot arrived for 5 s.
         StructureChanged: the driver has other sensors now.
     """
     newest: DriverSnapshot | None = None
@@ -67,21 +64,14 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
         yield newest
 
 
-def physical_of(frame: DriverSnapshot, type_name: str) -> npt.NDArray[np.float32]:
-    """(n_sensors,) float32: the physical values of the sensors of a type; 0 for those of other types."""
-    physical = np.zeros(frame.structure.n_sensors, np.float32)
-    physical[frame.structure.index(type_name)] = frame.physical(type_name)
-    return physical
-
-
 def after(seconds: float) -> Callable[[], bool]:
-    """Whether so much time has passed since this call."""
+    """Return a function that returns whether this time has passed since now."""
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() >= end_s
 
 
 def enter_pressed() -> bool:
-    """Whether somebody has pressed Enter at the terminal; takes the line. Never without a terminal."""
+    """Return whether Enter was pressed at the terminal, and read the line; False without a terminal."""
     if sys.stdin is None or not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
     sys.stdin.readline()

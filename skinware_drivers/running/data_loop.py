@@ -7,7 +7,6 @@ import logging
 import select
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,18 +28,6 @@ _HELD_UP_NS = NS_PER_S // 10
 _WORTH_A_LINE_NS = NS_PER_S
 
 
-class HoldUp(NamedTuple):
-    """A time in which this process did nothing.
-
-    Attributes:
-        since_ns: when it last ran, CLOCK_MONOTONIC ns.
-        asleep_ns: how long the machine was suspended, which CLOCK_MONOTONIC does not count.
-    """
-
-    since_ns: int
-    asleep_ns: int
-
-
 class Attention:
     """Notices when this process was stopped, had no processor time, or slept with its machine.
 
@@ -51,14 +38,15 @@ class Attention:
         self._looked_ns = now_ns()
         self._slept_ns = _slept_ns()
 
-    def look(self, due_ns: int | None) -> HoldUp | None:
+    def look(self, due_ns: int | None) -> tuple[int, int] | None:
         """Look at the clocks.
 
         Args:
             due_ns: when the event loop should have looked at the latest, CLOCK_MONOTONIC ns; None: at no certain time.
 
         Returns:
-            The hold-up since the last look; None: there was none worth mentioning.
+            When this process last ran, CLOCK_MONOTONIC ns, and how long the machine was suspended since, which that
+            clock does not count; None: it was not held up.
         """
         time_ns, slept_ns, since_ns = now_ns(), _slept_ns(), self._looked_ns
         late_ns = 0 if due_ns is None else time_ns - max(due_ns, since_ns)
@@ -74,7 +62,7 @@ class Attention:
                 " now on",
                 late_ns / NS_PER_S,
             )
-        return HoldUp(since_ns, max(0, asleep_ns))
+        return since_ns, max(0, asleep_ns)
 
 
 def _slept_ns() -> int:
@@ -163,7 +151,7 @@ class DataLoop:
         if hold_up is not None:
             generation.publisher.excuse(*hold_up)
             for line in self._lines:
-                line.condition.excuse(hold_up.since_ns, generation.publisher.pace.silence_ns)
+                line.condition.excuse(hold_up[0], generation.publisher.pace.silence_ns)
 
     def _publish_when_due(self) -> None:
         generation = self._generation

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import now_ns
@@ -90,11 +90,11 @@ class RequestDesk:
         bus, patch = arguments.pop("bus", None), arguments.pop("patch", None)
         try:
             does = {line: job for line in self._lines if (job := _job(line, request.operation)) is not None}
-            if self._listen_only and any(job.doer is line.adapter for line, job in does.items()):
+            if self._listen_only and any(doer is line.adapter for line, (doer, _) in does.items()):
                 raise ConfigurationError("this driver only listens (--listen-only)")
             meant = self._meant(list(does), bus, patch)
             for line, _ in meant:
-                check_arguments(does[line].operation.method, arguments)
+                check_arguments(does[line][1].method, arguments)
         except (ConfigurationError, TypeError) as error:
             request.fail(f"{request.operation}: {error}", "refused")
             return
@@ -113,8 +113,14 @@ class RequestDesk:
             request.reply({line.name: result for (line, _), result in zip(meant, results, strict=True)})
 
     async def _on_bus(
-        self, line: BusLine, patches: Sequence[Patch], request: Request, job: _Job, arguments: dict[str, Any]
+        self,
+        line: BusLine,
+        patches: Sequence[Patch],
+        request: Request,
+        job: tuple[object, Operation],
+        arguments: dict[str, Any],
     ) -> object:
+        doer, operation = job
         async with line.busy:
             if request.cancelled:
                 return None
@@ -122,13 +128,13 @@ class RequestDesk:
                 raise ConfigurationError("the bus is away")
             try:
                 with hook(request.operation, line.name):
-                    result = await job.operation.method(job.doer, line.link, patches, **arguments)
+                    result = await operation.method(doer, line.link, patches, **arguments)
             except DriverError as error:
                 if not isinstance(error.__cause__, ValueError):  # raised for arguments that make no sense
                     log.warning("%s", str(error))
                 raise error.__cause__ if isinstance(error.__cause__, Exception) else error from None
         try:
-            self._changed(line, patches, job.operation.sets_up)
+            self._changed(line, patches, operation.sets_up)
         except Exception as error:
             self._ending.fail(error)
             raise
@@ -148,21 +154,17 @@ class RequestDesk:
         return [(line, patches) for line, patches in meant if patches]
 
 
-class _Job(NamedTuple):
-    """An operation on one bus, done by the driver's object or by the bus itself."""
-
-    doer: object
-    operation: Operation
-
-
+_Job = tuple[object, Operation]
+"""An operation on one bus, and the object that does it."""
 _declared = cache(operations_of)
 
 
 def _job(line: BusLine, operation: str) -> _Job | None:
+    """Return an operation on one bus, and the object that does it: the driver's, or the bus itself."""
     for doer in (line.adapter, line.bus):
         found = _declared(type(doer)).get(operation)
         if found is not None:
-            return _Job(doer, found)
+            return doer, found
     return None
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
 
 import numpy as np
 
+import skinware.native
 from skinware.errors import PlatformError
 from skinware.realtime import now_ns
 from skinware.status import PatchState, Status
@@ -25,40 +25,19 @@ _real_now_ns = now_ns
 _SKIPPED = OWN_BUS_COUNTERS.index("updates_skipped")
 
 
-class _Calls(NamedTuple):
-    """Functions of ``path.c`` and ``flow.c``."""
-
-    new: Any
-    free: Any
-    count_strangers: Any
-    deadline_ns: Any
-    digest: Any
-    publish_if_due: Any
-    run: Any
-
-
 @cache
-def _calls() -> _Calls:
+def _library() -> skinware.native.Library:
     library = native.library()
-    size = library.quick.skinware_path_size
+    quick, waiting = library.quick, library.waiting
+    size = quick.skinware_path_size
     size.argtypes, size.restype = [ctypes.c_int64], ctypes.c_int64
     found = tuple(size(number) for number in range(len(structs.SIZES)))
     if found != structs.SIZES:
         raise PlatformError(f"the data path in C has structures of {found} bytes, not {structs.SIZES}")
-    quick, waiting = library.quick, library.waiting
-    calls = _Calls(
-        quick.skinware_path_new,
-        quick.skinware_path_free,
-        quick.skinware_path_count_strangers,
-        quick.skinware_path_deadline_ns,
-        waiting.skinware_path_digest,
-        waiting.skinware_path_publish_if_due,
-        waiting.skinware_flow_run,
-    )
-    calls.new.restype = ctypes.c_void_p
-    for call in (calls.deadline_ns, calls.digest, calls.run):
+    quick.skinware_path_new.restype = ctypes.c_void_p
+    for call in (quick.skinware_path_deadline_ns, waiting.skinware_path_digest, waiting.skinware_flow_run):
         call.restype = ctypes.c_int64
-    return calls
+    return library
 
 
 class NativePath:
@@ -80,17 +59,20 @@ class NativePath:
         self._plan.hooks = self._hooks.table()
         self._words.on_request = publisher.on_request
         self._words.last_published_ns = now_ns()
-        self._calls = _calls()
-        made = self._calls.new(ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words))
+        library = _library()
+        self._quick, self._waiting = library.quick, library.waiting
+        made = self._quick.skinware_path_new(
+            ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words)
+        )
         if not made:
             raise MemoryError("no memory for the data path of a driver")
         self._path = path = ctypes.c_void_p(made)
-        count = self._calls.count_strangers
+        count = self._quick.skinware_path_count_strangers
         self._hooks.count_strangers = lambda rows, n: count(path, ctypes.c_void_p(rows), ctypes.c_int64(n))
 
     def __del__(self) -> None:
         if hasattr(self, "_path"):
-            self._calls.free(self._path)
+            self._quick.skinware_path_free(self._path)
 
     @property
     def listeners(self) -> Listeners:
@@ -123,7 +105,7 @@ class NativePath:
         self.interrupt(interrupted)
         self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
         self._enter()
-        result = self._calls.digest(self._path)
+        result = self._waiting.skinware_path_digest(self._path)
         self._leave()
         if result < 0:
             raise MemoryError("no memory for the updates of a driver")
@@ -140,7 +122,7 @@ class NativePath:
         """
         self._words.read_ns = max(self._words.read_ns, read_ns)
         self._enter()
-        self._calls.publish_if_due(self._path)
+        self._waiting.skinware_path_publish_if_due(self._path)
         self._leave()
 
     def run(self, flow: structs.Flow) -> int:
@@ -150,7 +132,7 @@ class NativePath:
             The reason, as a number of ``flow.c``.
         """
         self._enter()
-        result = int(self._calls.run(self._path, ctypes.byref(flow)))
+        result = int(self._waiting.skinware_flow_run(self._path, ctypes.byref(flow)))
         self._leave()
         return result
 
@@ -161,7 +143,7 @@ class NativePath:
     @property
     def deadline_ns(self) -> int:
         """The latest time of the next call of ``publish_if_due``, CLOCK_MONOTONIC ns."""
-        return int(self._calls.deadline_ns(self._path))
+        return int(self._quick.skinware_path_deadline_ns(self._path))
 
     def _enter(self) -> None:
         counts = self._publisher.count_buses()

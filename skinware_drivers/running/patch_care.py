@@ -113,18 +113,15 @@ class _SetUps:
     def __init__(self) -> None:
         self.begun = 0
         self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-        self._not_before_ns = 0
+        self.not_before_ns = 0
 
     @property
     def are_due(self) -> bool:
-        return now_ns() >= self._not_before_ns
+        return now_ns() >= self.not_before_ns
 
     def begin(self) -> None:
         self.begun += 1
-        self._not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
-
-    def put_off(self) -> None:
-        self._not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
+        self.not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
 
 
 class PatchCare:
@@ -220,7 +217,7 @@ class PatchCare:
         if set_ups is None:
             set_ups = self._set_ups[patch.key] = _SetUps()
             if line.condition.limits.is_full:
-                set_ups.put_off()
+                set_ups.not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
                 log.warning(
                     "%s: %s answers, but its data finds no room: the bus is full; fewer boards, or a longer period"
                     " (%s)",

@@ -86,7 +86,10 @@ class Poller:
             is_away: returns whether the bus is lost: nothing is sent, and nothing missed.
         """
         while True:
-            await self._until_first_deadline()
+            await asyncio.sleep(0)  # if this is late, others have their turn all the same
+            first_ns = min((place.timer.deadline_ns for place in self._places), default=0)
+            while (left_ns := first_ns - now_ns()) > 0:  # noqa: ASYNC110 - the loop's timers may come a little early
+                await asyncio.sleep(left_ns / NS_PER_S)
             asked = polls()
             times = [(poll.period_s, poll.patience_s) for poll in asked]
             if asked and times != self._checked:
@@ -97,12 +100,6 @@ class Poller:
                 await self._ask_first(asked, is_away())
             else:
                 await asyncio.sleep(_LOOK_AGAIN_S)
-
-    async def _until_first_deadline(self) -> None:
-        await asyncio.sleep(0)  # if it is late, others have their turn all the same
-        first_ns = min((place.timer.deadline_ns for place in self._places), default=0)
-        while (left_ns := first_ns - now_ns()) > 0:  # noqa: ASYNC110 - the loop's timers may come a little early
-            await asyncio.sleep(left_ns / NS_PER_S)
 
     def _keep_time(self, asked: Sequence[Poll]) -> None:
         """Keep a timer for every poll; one whose period changed continues from its last deadline."""

@@ -64,7 +64,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "npz", "--start", "2", "--end", "1"], 2, "--end 1 is not after --start 2"),
         (["walk.mcap", "leg", "--to", "npz"], 2, "no service 'leg'; there are: torso"),
         (["walk.mcap", "--to", "npz", "--region", "palm"], 2, "regions.toml"),
-        (["walk.mcap", "--to", "npz", "--regions", "r.toml"], 2, "say which with --region"),
+        (["walk.mcap", "--to", "npz", "--regions", "r.toml"], 2, "choose regions with --region"),
         (["walk.mcap", "--to", "npz", "--start", "9"], 2, "no sample of the selection was recorded in that time"),
         (["walk.mcap", "--to", "npz", "--fps", "30"], 2, "--fps is for --to lerobot"),
         (["walk.mcap", "--to", "npz", "--each-structure"], 2, "--each-structure is for --to lerobot"),

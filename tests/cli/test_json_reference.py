@@ -77,10 +77,10 @@ def sections() -> dict[str, Rows]:
         if line.startswith("#"):
             rows = found.setdefault(line.strip("# "), {})
         elif line.startswith("| `"):
-            keys, kind, _unit, _meaning = (cell.strip() for cell in line.strip("|").split("|"))
+            keys, kind, _meaning = (cell.strip() for cell in line.strip("|").split("|"))
             for key in re.findall(r"`([^`]+)`", keys):
                 assert key not in rows, f"{key} stands there twice"
-                rows[key] = kind
+                rows[key] = kind.partition(",")[0]  # a unit follows
     return {heading: rows for heading, rows in found.items() if rows}
 
 

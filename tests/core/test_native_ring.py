@@ -173,7 +173,7 @@ def test_a_writer_counts_its_publications() -> None:
         assert (told.published, told.before_boot, told.ahead) == (6, 2, 1)
         assert told.wall.count == told.cpu.count == told.age.total == 6
         assert told.age.counts[0] >= 1  # what is newer than its publication
-        assert told.age.counts[22] + told.age.counts[23] >= 1  # 3 ms, if the machine did not stand still
+        assert sum(told.age.counts[22:]) >= 1  # 3 ms, and what the machine stood still
         assert 0 < told.wall.best_ns <= told.wall.mean_ns <= told.wall.worst_ns
         assert 0 <= told.cpu.best_ns <= told.cpu.worst_ns <= told.cpu.total_ns
         words = reader._ring._slot_words[6 % 3]

@@ -8,7 +8,7 @@ import pytest
 from skinware import PatchState
 from skinware.realtime import NS_PER_S
 from skinware_drivers.running import data_loop
-from skinware_drivers.running.data_loop import Attention, HoldUp
+from skinware_drivers.running.data_loop import Attention
 from tests.sdk.test_publisher import Desk
 
 MS = 1_000_000
@@ -29,7 +29,7 @@ def test_being_late_is_being_held_up(monkeypatch: pytest.MonkeyPatch, caplog: py
     assert process.look(clocks.now_ns - 90 * MS) is None
     since_ns, due_ns = clocks.now_ns, clocks.now_ns + 500 * MS
     clocks.now_ns += 5500 * MS
-    assert process.look(due_ns) == HoldUp(since_ns, 0)
+    assert process.look(due_ns) == (since_ns, 0)
     assert process.look(due_ns) is None  # it was looked at
     assert "held up for 5.0 s" in caplog.text
     assert begun_ns < since_ns
@@ -41,7 +41,7 @@ def test_a_suspended_machine_is_noticed_though_its_clock_stood(
     clocks = Clocks(monkeypatch)
     process = Attention()
     clocks.slept_ns += 60 * NS_PER_S
-    assert process.look(clocks.now_ns) == HoldUp(clocks.now_ns, 60 * NS_PER_S)
+    assert process.look(clocks.now_ns) == (clocks.now_ns, 60 * NS_PER_S)
     assert process.look(clocks.now_ns) is None
     assert "suspended for 60.0 s" in caplog.text
 

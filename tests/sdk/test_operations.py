@@ -34,7 +34,7 @@ def test_a_driver_tells_what_it_can_do() -> None:
             "enable": "Make",
             "rate": "Change",
             "rebaseline": "Make",
-            "versions": "Type,",
+            "versions": "Return",
         }
 
 

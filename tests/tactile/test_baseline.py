@@ -414,6 +414,20 @@ def test_a_drivers_frames_with_their_status() -> None:
     assert not calm.touched[30:40].any(), "a jump that the hardware tells of"
 
 
+def test_a_restored_baseline_begins_with_a_suspect_frame() -> None:
+    with FakeSkin() as skin:
+        first, second = (Baseline.of(skin.structure, "pressure") for _ in range(2))
+        skin.values = np.full(skin.structure.n_sensors, 200.0)
+        with DriverReader("fake") as reader:
+            skin.publish()
+            first.take(reader.read())
+            first.tare()
+            second.restore(first.state(), np.arange(640))
+            skin.status[:] = Status.SUSPECT
+            skin.publish()
+            assert np.isfinite(second.take(reader.read()).baseline).all()
+
+
 @pytest.mark.thorough
 @settings(max_examples=40)
 @given(st.data())

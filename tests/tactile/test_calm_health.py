@@ -216,7 +216,7 @@ def test_services_of_another_kind_or_form_are_refused(into: Namespace) -> None:
     columns = {name: (dtype, (n,)) for name, (dtype, _) in COLUMNS.items()}
     with (
         HealthWriter(fake_structure(), "fake", namespace=into),
-        pytest.raises(BadServiceFile, match="none of contacts"),
+        pytest.raises(BadServiceFile, match="not of kind 'contacts'"),
     ):
         ContactsReader("health", namespace=into)
     for wrong in (

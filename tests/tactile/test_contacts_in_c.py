@@ -1,8 +1,7 @@
-"""The C program of docs/tactile/contacts.md, compiled and run as it stands there."""
+"""The example of a C program that reads contacts, compiled and run."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +15,14 @@ from tests.core.test_c_how_to import lines_of
 from tests.tactile.skins import triangles
 from tests.tactile.test_contacts_service import structure
 
-PAGE = Path(__file__).parents[2] / "docs" / "tactile" / "contacts.md"
+SOURCE = Path(__file__).parents[2] / "examples" / "contacts.c"
 
 
 @pytest.mark.parametrize("language", ["c99", "c++11"])
 def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
-    language: str, namespace: Namespace, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    (text,) = re.findall(r"^```c\n(.*?)^```", PAGE.read_text(), flags=re.M | re.S)
-    source = tmp_path / "contacts.c"
-    source.write_text(text)
-    program = compiled(source, language, tmp_path_factory)
+    program = compiled(SOURCE, language, tmp_path_factory)
 
     def publish(writer: ContactsWriter, n: int, **loads: float) -> None:
         value = [loads.get(f"t{taxel}", 0.0) for taxel in range(n)]

@@ -157,7 +157,7 @@ def test_a_new_writer_is_read_without_a_word(namespace: Namespace) -> None:
 
 def test_what_is_no_service_of_contacts_is_refused(namespace: Namespace) -> None:
     with ServiceWriter("contacts", {"id": ("<u4", 64)}, namespace=namespace):
-        with pytest.raises(BadServiceFile, match="none of contacts"):
+        with pytest.raises(BadServiceFile, match="not of kind 'contacts'"):
             ContactsReader(namespace=namespace)
     columns = {"id": Column(np.dtype("<u4"), (63,))}
     with ServiceWriter("contacts", columns, namespace=namespace, kind="contacts"):

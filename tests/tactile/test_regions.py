@@ -16,8 +16,8 @@ from skinware import SkinLayout, Structure
 from skinware.errors import ConfigurationError, StructureError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, TEMPERATURE
-from skinware.tactile.neighbours import neighbours
-from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions, regions_to_toml, without_holes
+from skinware.tactile.neighbours import neighbours, without_holes
+from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions, regions_to_toml
 from tests.tactile.skins import placed, pressed, triangles
 
 HEAD = 'format = "skinware-regions"\nversion = 1\n'
@@ -184,7 +184,7 @@ def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, regi
 BROKEN = [
     ("", 1, "no file of regions"),
     ('format = "skinware-regions"\nversion = 2\n', 2, "version 2, this Skinware reads version 1"),
-    (HEAD + '\n[[region]]\nname = "a"\n', 4, "says nothing of what is in it"),
+    (HEAD + '\n[[region]]\nname = "a"\n', 4, "selects nothing"),
     (HEAD + "\n[[region]]\nuid = [1]\n", 4, "missing required field name"),
     (HEAD + '\n[[region]]\nname = "a"\nuid = 1\n', 6, "Expected array, got int"),
     (HEAD + '\n[[region]]\nname = "a"\nuid = [-1]\n', 6, ">= 0"),

@@ -45,7 +45,7 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
         *,
         token: str | None = None,
         robot: Robot | None = None,
-        program: tuple[str, ...] = (sys.executable, "-m", "skinware.cli._record_beside"),
+        program: tuple[str, ...] = (sys.executable, "-m", "skinware.cli.record", "--until-eof"),
     ) -> Iterator[str]:
         follower = Follower(namespace, names, calm, robot)
         found: list[Any] = []

@@ -1,7 +1,7 @@
-"""What is wrong with a geometry: read from itself, and from strokes over the skin that it is for.
+"""Find the errors of a geometry, by itself and by strokes over its skin.
 
-Strokes tell how far taxels are from each other. A module that is where the file says agrees with what lies round it.
-If it does not, it may agree at the place of another one (connectors were exchanged), or as its mirror image, or turned.
+Strokes give the distances between taxels. A module at its right place agrees with its surroundings. A module that does
+not may agree at the place of another one (exchanged connectors), as its mirror image, or turned.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ _SAME_PLACE_M = 1e-5
 _OFF_M = 0.010
 _CAP_M = 0.015
 _NEAR_M = 0.009
-"""Taxels that a file puts so near to each other must be felt together."""
+"""Taxels that a file puts nearer to each other than this must be felt together."""
 _BAD_M = 0.0025
-"""On average, of the distances of a module to what lies round it."""
+"""Mean disagreement of a module with its surroundings from which it is wrong."""
 _BETTER = 0.6
-"""Another explanation must leave at most this part of the disagreement."""
+"""Share of the disagreement that another explanation may leave."""
 _LEAST_DISTANCES = 6
 _MOST_BAD = 64
-"""So many groups are tried at each other's places, those that are farthest off."""
+"""Groups that are tried at each other's places, those that are farthest off."""
 _TURNS = 24
 _NEAREST = 6
-"""So many measured neighbours say where a taxel is."""
+"""Measured neighbours that determine the place of a taxel."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong.
+    """An error of a geometry.
 
     Attributes:
         kind: ``shared``: taxels at one place; ``unknown``: without a place; ``swapped``: modules or patches at each
             other's places; ``mirrored``, ``turned``: a module; ``off``: a taxel that is more than 10 mm away.
-        patches: their numbers, where whole patches are meant.
-        modules: their numbers.
-        taxels: (k,) those that are meant.
-        off_m: how far the file is from what was measured, on average; NaN where that was not needed.
+        taxels: (k,) the wrong taxels.
+        modules: numbers of the wrong modules.
+        patches: numbers of the wrong patches, if whole patches are wrong.
+        off_m: mean distance of the file from the measurement; NaN where it was not measured.
         degrees: by how much a module is turned; NaN otherwise.
     """
 
@@ -62,11 +62,11 @@ class Finding:
 
 
 def check_file(geometry: Geometry, module: npt.NDArray[np.integer]) -> list[Finding]:
-    """What a geometry tells against itself: places that taxels share, taxels without a place.
+    """Return the errors that a geometry shows by itself: shared places, taxels without a place.
 
     Args:
-        geometry: of n taxels.
-        module: (n,) of each.
+        geometry: geometry of n taxels.
+        module: (n,) module of each.
     """
     found: list[Finding] = []
     known = np.flatnonzero(geometry.known)
@@ -91,13 +91,13 @@ def check_strokes(
     patch: npt.NDArray[np.integer],
     topology: Topology,
 ) -> list[Finding]:
-    """What strokes tell against a geometry.
+    """Return the errors of a geometry by strokes.
 
     Args:
-        geometry: of n taxels.
-        module: (n,) of each.
-        patch: (n,) of each.
-        topology: of the same taxels.
+        geometry: geometry of n taxels.
+        module: (n,) module of each.
+        patch: (n,) patch of each.
+        topology: topology of the same taxels.
     """
     check = _Check(geometry, topology)
     named = np.zeros(len(geometry), bool)
@@ -124,15 +124,15 @@ class _Check:
     def _disagreement_m(
         self, taxels: ArrayI, group: Groups, place: ArrayF | None = None, frame: ArrayI | None = None
     ) -> float:
-        """How far measured distances from taxels to those of other groups are from what places say, on average.
+        """The mean difference between measured and given distances from taxels to those of other groups.
 
-        Taxels that are said to be near each other and were never felt together disagree, too.
+        Taxels that are near each other in the file and were never felt together disagree, too.
 
         Args:
             taxels: (k,).
             group: (n,) of all taxels.
-            place: (n, 3) where they are; None: where the file says.
-            frame: (n,) of the places.
+            place: (n, 3) their places; None: those of the file.
+            frame: (n,) frames of the places.
 
         Returns:
             NaN if there are too few.
@@ -149,12 +149,12 @@ class _Check:
         return float(np.minimum(abs(measured[tells] - said[tells]), _CAP_M).mean())
 
     def swapped(self, group: Groups, named: npt.NDArray[np.bool_]) -> Iterator[tuple[ArrayI, tuple[int, int], float]]:
-        """Groups of as many taxels that agree at each other's places, and do not at their own, the clearest pair first.
+        """Yield pairs of groups that agree at each other's places and not at their own, the clearest first.
 
-        From then on they are taken to be there: an exchange disturbs its neighbours.
+        Each pair is exchanged before the search goes on, as an exchange disturbs its neighbours.
 
         Yields:
-            Of each pair of groups: their taxels, their numbers, and how far they are off where the file says.
+            The taxels of a pair, its numbers, and how far it is off at the places of the file.
         """
         while found := self._clearest_swap(group, named):
             _, both, there, pair, own = found
@@ -165,7 +165,7 @@ class _Check:
     def _clearest_swap(
         self, group: Groups, named: npt.NDArray[np.bool_]
     ) -> tuple[float, ArrayI, ArrayI, tuple[int, int], float] | None:
-        """Of the best pair: how much of the disagreement is left, their taxels, where those belong, numbers, off."""
+        """The best pair: share of the disagreement that is left, its taxels, their right places, numbers, distance."""
         taxels_of = {number: np.flatnonzero(group == number) for number in np.unique(group[~named]).tolist()}
         off = {number: self._disagreement_m(taxels, group) for number, taxels in taxels_of.items()}
         bad = sorted((number for number in off if off[number] > _BAD_M), key=lambda number: -off[number])[:_MOST_BAD]
@@ -183,7 +183,7 @@ class _Check:
         return min(candidates, key=lambda candidate: candidate[0], default=None)
 
     def turned(self, module: Groups, named: npt.NDArray[np.bool_]) -> Iterator[Finding]:
-        """Modules that agree as their mirror image, or turned about their normal, and not as they are."""
+        """Yield modules that agree as their mirror image, or turned about their normal, and not as they are."""
         for number in np.unique(module[~named]).tolist():
             taxels = np.flatnonzero((module == number) & self._known & ~named)
             if len(taxels) < _LEAST_DISTANCES or len(np.unique(self._frame[taxels])) > 1:
@@ -202,7 +202,7 @@ class _Check:
                 yield Finding(kind, taxels, (number,), off_m=as_is, degrees=float("nan") if mirrored else degrees)
 
     def off(self, module: Groups, named: npt.NDArray[np.bool_]) -> Iterator[Finding]:
-        """Taxels that are more than 10 mm from where the nearest ones say."""
+        """Yield taxels more than 10 mm away from their nearest ones."""
         trusted = np.flatnonzero(self._known & ~named)
         nearest = np.argsort(self._distance[np.ix_(trusted, trusted)], axis=1, kind="stable")[:, :_NEAREST]
         for row, taxel in enumerate(trusted.tolist()):
@@ -219,7 +219,7 @@ class _Check:
 
 
 def _turns(places: ArrayF) -> Iterator[tuple[bool, float, ArrayF]]:
-    """Places of a module turned about their middle in their plane, and the same of their mirror image."""
+    """Places of a module, and of its mirror image, turned about their middle in their plane."""
     middle = places.mean(axis=0)
     axes = np.linalg.svd(places - middle, full_matrices=False)[2]
     flat = (places - middle) @ axes.T

@@ -1,8 +1,8 @@
-"""Where taxels are, from presses with a finger whose length nobody knows: poses of what carries it are enough.
+"""Place taxels from presses with a finger of unknown length, by the poses of its carrier.
 
-The tip of the finger is at one place in the frame of its carrier, each module is rigid: what is unknown is the tip (3
-numbers) and the pose of each module (6). They are found by least squares, in which a press that fits badly counts less
-(soft L1): each press wants the tip to be at the centre of what felt it.
+The tip of the finger is at one place in the frame of its carrier, and each module is rigid. The unknowns are the tip (3
+numbers) and the pose of each module (6). They follow from least squares over the distance of the tip from the centre of
+the taxels that felt a press; soft L1 lowers the weight of bad presses.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ _ROUNDS = 60
 _LEAST_PRESSES = 8
 _WRONG_M = 0.02
 _PROGRESS = 1e-6
-"""Of the cost: a round that gains less is the last."""
+"""Share of the cost: a round that gains less is the last."""
 _LEAST_DAMPING, _MOST_DAMPING, _TINY = 1e-9, 1e6, 1e-12
 
 
 @dataclass(frozen=True)
 class FingerPlacement:
-    """What presses with a finger tell.
+    """The result of presses with a finger.
 
     Attributes:
-        tip_m: (3,) of the finger, in the frame of its carrier.
-        placement: of the taxels.
-        rounds: of the search.
+        tip_m: (3,) tip of the finger, in the frame of its carrier.
+        placement: places of the taxels.
+        rounds: rounds of the search.
     """
 
     tip_m: ArrayF
@@ -46,18 +46,18 @@ class FingerPlacement:
 
 
 def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.ArrayLike = (0, 0, 0)) -> FingerPlacement:
-    """Where the tip and the modules are.
+    """Find the places of the tip and the modules.
 
     Args:
         presses: with (4, 4) poses of the finger's carrier, in the frame of the skin.
-        shapes: of modules, by number; taxels of others are left out.
-        tip_m: a guess.
+        shapes: shapes of modules, by number; taxels of others are left out.
+        tip_m: first guess of the tip.
 
     Raises:
         ConfigurationError: presses without poses, too few of them, or no module that enough of them touched.
     """
     if presses.pose.ndim != 3:
-        raise ConfigurationError("presses with points tell no finger: give (4, 4) poses of what carries it")
+        raise ConfigurationError("presses with points do not determine a finger: give (4, 4) poses of its carrier")
     if len(presses) < _LEAST_PRESSES:
         raise ConfigurationError(f"{len(presses)} presses: a finger needs at least {_LEAST_PRESSES}")
     problem = _Problem.of(presses, shapes, np.asarray(tip_m, np.float64))
@@ -66,7 +66,6 @@ def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.Array
 
 
 def _points_m(presses: Presses, tip_m: ArrayF) -> ArrayF:
-    """(m, 3) where the tip was."""
     points: ArrayF = presses.pose[:, :3, :3] @ tip_m + presses.pose[:, :3, 3]
     return points
 
@@ -80,7 +79,7 @@ class _Problem:
     tip_m: ArrayF
     poses: dict[int, Pose]
     shares: dict[int, ArrayF]
-    """By module, (m, k): which part of each press its taxels felt."""
+    """By module, (m, k): the share of each press that its taxels felt."""
     counting: npt.NDArray[np.bool_]
     """(m,) presses that only modules with poses felt."""
 
@@ -111,19 +110,18 @@ class _Problem:
         return cls(presses, used, tip_m.copy(), poses, shares, counting)
 
     def residuals(self) -> ArrayF:
-        """(m, 3) from the centre of what felt each press to the tip, m."""
+        """(m, 3) from the centre of the taxels that felt each press to the tip, m."""
         centre = np.zeros((len(self.presses), 3))
         for number, share in self.shares.items():
             centre += share @ self.poses[number].places_m(self.shapes[number])
         return _points_m(self.presses, self.tip_m) - centre
 
     def cost(self) -> float:
-        """The sum that is made small, of the presses that count."""
         squares = (self.residuals()[self.counting] ** 2).sum(axis=1)
         return float((np.sqrt(1 + squares / _SOFT_M**2) - 1).sum())
 
     def solve(self) -> int:
-        """Levenberg and Marquardt's steps until nothing gets better; how many."""
+        """Take steps of Levenberg and Marquardt until nothing improves; return their number."""
         damping, cost = 1e-3, self.cost()
         for number in range(_ROUNDS):
             matrix, right = self._normal_equations()
@@ -131,7 +129,7 @@ class _Problem:
             before, gained = (self.tip_m, dict(self.poses)), 0.0
             while gained <= 0 and damping < _MOST_DAMPING:
                 self.tip_m, self.poses = before[0], dict(before[1])
-                self._go(np.linalg.solve(matrix + damping * diagonal, right))
+                self._move(np.linalg.solve(matrix + damping * diagonal, right))
                 gained = cost - self.cost()
                 damping = damping * 4 if gained <= 0 else max(damping / 5, _LEAST_DAMPING)
             if gained <= 0:
@@ -157,7 +155,7 @@ class _Problem:
         flat = jacobian.reshape(-1, jacobian.shape[2])
         return flat.T @ flat, -flat.T @ (residual * root).reshape(-1)
 
-    def _go(self, step: npt.NDArray[Any]) -> None:
+    def _move(self, step: npt.NDArray[Any]) -> None:
         self.tip_m = self.tip_m + step[:3]
         for number, (turn, shift) in zip(self.poses, step[3:].reshape(-1, 2, 3), strict=True):
             pose = self.poses[number]
@@ -179,7 +177,7 @@ class _Problem:
 
 
 def _crossing(arm: ArrayF) -> ArrayF:
-    """(m, 3, 3): how the centre of a press moves less when its module turns: the cross product with each arm."""
+    """(m, 3, 3): the matrix of the cross product with each arm."""
     x, y, z = arm.T
     nothing = np.zeros_like(x)
     rows = [[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]

@@ -1,4 +1,4 @@
-"""Place taxels from presses at known points: each is where its presses are, weighted by its load."""
+"""Place taxels from presses at known points: each at the mean of its presses, weighted by its load."""
 
 from __future__ import annotations
 
@@ -18,30 +18,29 @@ ArrayI = npt.NDArray[np.int64]
 
 _ROUNDS = 5
 _WRONG = 4.0
-"""A press this many typical residuals away has no weight."""
+"""Typical residuals from which a press has no weight."""
 _LEAST_SPREAD_M = 0.0005
 _TYPICAL = 1.1774
-"""Of residuals in a plane: their median in standard deviations."""
+"""Median of residuals in a plane, in standard deviations."""
 _PRECISE_M = 0.0035
-"""Of presses: where points are that good, loads count squared, which looks at the nearest alone."""
+"""Spread of the points below which loads count squared, which prefers the nearest taxel."""
 _LEAST_PRESSES = 2
 _PARTS = 10
-"""Into which the presses are parted, to see how much depends on each."""
+"""Parts of the presses that are left out in turn, for the expected error."""
 _BIAS_M, _PRECISE_BIAS_M = 0.001, 0.0003
-"""Of places, however many presses there are: skins end, gains differ."""
+"""Bias of places that more presses do not lower: skins end, gains differ."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where n taxels are.
+    """The places of n taxels.
 
     Attributes:
-        position_m: (n, 3), NaN where nothing tells.
-        normal: (n, 3) outwards, of length 1; NaN where no shape tells.
-        error_m: (n,) how far each may be off along the skin: an estimate of the root of the mean square; NaN where
-            nothing tells.
-        pressed: (n,) how many presses it has felt.
-        residual_m: (m,) how far the point of each press is from where its taxels say.
+        position_m: (n, 3), NaN: not known.
+        normal: (n, 3) outwards, of length 1; NaN: not known.
+        error_m: (n,) expected error along the skin, root of the mean square; NaN: not known.
+        pressed: (n,) number of presses that each has felt.
+        residual_m: (m,) distance of the point of each press from the centre of its taxels.
         wrong: (m,) bool, presses that were left out.
     """
 
@@ -54,24 +53,24 @@ class Placement:
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool: the place is known."""
+        """(n,) bool: which places are known."""
         known: npt.NDArray[np.bool_] = np.isfinite(self.position_m[:, 0])
         return known
 
     @property
     def spread_m(self) -> float:
-        """The median residual of the presses that count; NaN if there is none."""
+        """Median residual of the presses that count; NaN if there is none."""
         counting = self.residual_m[~self.wrong]
         return float(np.median(counting)) if len(counting) else float("nan")
 
 
 def place(presses: Presses, shapes: Mapping[int, Shape] | None = None, *, offset_m: float = 0.0) -> Placement:
-    """Where the taxels are.
+    """Find the places of the taxels.
 
     Args:
-        presses: with their points.
-        shapes: of modules, by number; None: nothing is known of them.
-        offset_m: from the taxels outwards to the points: the probe's radius and the cover. Needs shapes with normals.
+        presses: presses with points.
+        shapes: shapes of modules, by number; None: not known.
+        offset_m: from the taxels outwards to the points: the probe's radius and the cover. It needs normals.
 
     Raises:
         ConfigurationError: the presses have no points; an offset without normals.
@@ -97,13 +96,14 @@ def place(presses: Presses, shapes: Mapping[int, Shape] | None = None, *, offset
 
 
 def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool) -> tuple[ArrayF, ArrayF]:
-    """(n, 3) places, and (n, 3) normals: weighted means, and where rigid modules bind them."""
+    """(n, 3) places, and (n, 3) normals: weighted means, and fitted shapes."""
     weight = trust[presses.press] * (presses.load**2 if is_precise else presses.load)
     position = _means(presses, weight)
     if is_precise:
         position = _unbiased(presses, trust, weight, position)
     normal = np.full_like(position, np.nan)
-    presses_each = _presses_each(presses, weight)
+    total, squares = (np.bincount(presses.taxel, of, presses.n) for of in (weight, weight**2))
+    presses_each = total**2 / np.where(squares > 0, squares, 1)  # of equal weight, that would count as much
     for shape in shapes.values():
         pose = fitted(shape, position[shape.taxel], presses_each[shape.taxel])
         if pose is not None:
@@ -112,7 +112,7 @@ def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_pre
 
 
 def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF, position: ArrayF) -> ArrayF:
-    """(n, 3) places, with what the mean of a bell would be off because its presses lie more to one side.
+    """(n, 3) places without the bias of the mean of a bell whose presses lie more to one side.
 
     The bell is as wide as the presses of a taxel typically spread; its gain does not matter.
     """
@@ -124,14 +124,6 @@ def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF, position: ArrayF)
         return position
     bell = trust[presses.press] * np.exp(-squares / max(float(np.median(width)), _LEAST_SPREAD_M**2))
     return 2 * position - _means(presses, bell)
-
-
-def _presses_each(presses: Presses, weight: ArrayF) -> ArrayF:
-    """(n,) how many presses of equal weight would be worth as much."""
-    total = np.bincount(presses.taxel, weight, presses.n)
-    squares = np.bincount(presses.taxel, weight**2, presses.n)
-    each: ArrayF = total**2 / np.where(squares > 0, squares, 1)
-    return each
 
 
 def _medians(presses: Presses) -> ArrayF:
@@ -153,7 +145,7 @@ def _medians(presses: Presses) -> ArrayF:
 
 
 def _residuals(presses: Presses, position: ArrayF) -> ArrayF:
-    """(m,) how far the point of each press is from the centre of what felt it; inf where nothing did."""
+    """(m,) distance of the point of each press from the centre of the taxels that felt it; inf without any."""
     known = np.isfinite(position[presses.taxel]).all(axis=1)
     press, taxel, load = presses.press[known], presses.taxel[known], presses.load[known]
     m = len(presses)
@@ -183,7 +175,7 @@ def _trust(residual: ArrayF) -> ArrayF:
 
 
 def _means(presses: Presses, weight: ArrayF) -> ArrayF:
-    """(n, 3) the weighted means of the points; NaN without enough presses that count, or felt from the side alone."""
+    """(n, 3) the weighted means of the points; NaN with too few presses, or felt from the side alone."""
     total = np.bincount(presses.taxel, weight, presses.n)
     count = np.bincount(presses.taxel, weight > 0, presses.n)
     points = presses.pose[presses.press]
@@ -193,17 +185,17 @@ def _means(presses: Presses, weight: ArrayF) -> ArrayF:
 
 
 def _errors(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool, position: ArrayF) -> ArrayF:
-    """(n,) the error to expect: how much the places change without some of the presses (jackknife), and the bias."""
+    """(n,) the expected error: the change of the places without some of the presses (jackknife), and the bias."""
     squares = []
     for left_out in range(_PARTS):
         kept = np.arange(len(presses)) % _PARTS != left_out
         without, _ = _places(presses, trust * kept, shapes, is_precise)
         squares.append(((without - position) ** 2).sum(axis=1))
     changes = np.array(squares)
-    told = np.isfinite(changes).sum(axis=0)
-    mean = np.nansum(changes, axis=0) / np.maximum(told, 1)
+    known = np.isfinite(changes).sum(axis=0)
+    mean = np.nansum(changes, axis=0) / np.maximum(known, 1)
     error = np.sqrt((_PARTS - 1) * mean + (_PRECISE_BIAS_M if is_precise else _BIAS_M) ** 2)
-    return np.where(np.isfinite(position).all(axis=1) & (told > 0), error, np.nan)
+    return np.where(np.isfinite(position).all(axis=1) & (known > 0), error, np.nan)
 
 
 @dataclass(frozen=True)
@@ -211,7 +203,7 @@ class Press:
     """One steady press.
 
     Attributes:
-        pose: (3,) the point that touches, m; or (4, 4) of what carries the finger, homogeneous, m.
+        pose: (3,) its point, m; or (4, 4) pose of the carrier of the finger, homogeneous, m.
         taxel: (k,) the taxels that feel it.
         load: (k,) their loads, above 0.
     """
@@ -255,13 +247,13 @@ class Presses:
 
     @classmethod
     def none(cls, n: int, pose_shape: tuple[int, ...] = (3,)) -> Self:
-        """No press on n taxels yet; ``pose_shape`` is that of their poses."""
+        """Make an empty set of presses on n taxels; ``pose_shape`` is the shape of a pose."""
         nothing = np.zeros(0, np.int64)
         return cls(n, np.zeros((0, *pose_shape)), nothing, nothing, np.zeros(0))
 
     @classmethod
     def of_arrays(cls, pose: npt.ArrayLike, load: npt.ArrayLike) -> Self:
-        """Those of whole arrays.
+        """Make presses from whole arrays.
 
         Args:
             pose: (m, 3) or (m, 4, 4).
@@ -274,7 +266,7 @@ class Presses:
         return cls(loads.shape[1], np.asarray(pose, np.float64), press, taxel, loads[press, taxel])
 
     def with_press(self, press: Press) -> Self:
-        """These, and one more."""
+        """Return these presses and one more."""
         return type(self)(
             self.n,
             np.concatenate([self.pose, press.pose[None]]),
@@ -288,7 +280,7 @@ class Presses:
 
     @property
     def times_pressed(self) -> ArrayI:
-        """(n,) how many presses each taxel has felt at least half as much as the one that felt most of it."""
+        """(n,) number of presses that each taxel has felt at least half as much as the taxel that felt most."""
         most = np.zeros(len(self))
         np.maximum.at(most, self.press, self.load)
         return np.bincount(self.taxel[self.load >= most[self.press] / 2], minlength=self.n)
@@ -296,12 +288,12 @@ class Presses:
 
 @dataclass(frozen=True, kw_only=True)
 class PressSettings:
-    """When something presses steadily.
+    """The conditions of a steady press.
 
     Attributes:
-        hold_s: for so long.
-        steady: meanwhile its load changes by at most this part.
-        still_m: and its point moves by at most so much, m.
+        hold_s: how long it lasts.
+        steady: share by which its load may change meanwhile.
+        still_m: how far its point may move meanwhile, m.
     """
 
     hold_s: float = 0.2
@@ -311,11 +303,11 @@ class PressSettings:
 
 @dataclass
 class PressFinder:
-    """Finds presses in frames: one for each time that something comes to rest on the skin.
+    """Finds presses in frames: one each time that something comes to rest on the skin.
 
     Attributes:
-        settings: when it presses steadily.
-        held: whether something has been found pressing that has not gone or moved on yet.
+        settings: the conditions of a press.
+        held: whether the last press that was found still goes on.
     """
 
     settings: PressSettings = field(default_factory=PressSettings)
@@ -324,12 +316,12 @@ class PressFinder:
     _found_at_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
 
     def update(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> Press | None:
-        """Take a frame; the press that is complete with it.
+        """Take a frame, and return the press that is complete with it.
 
         Args:
             time_ns: of the frame.
             load: (n,) 0 where nothing touches, NaN where it is not known.
-            pose: (3,) or (4, 4), at that time; None or not finite: it is not known.
+            pose: (3,) or (4, 4), at that time; None or not finite: not known.
         """
         loads = np.nan_to_num(np.asarray(load, np.float64), posinf=0.0)
         total = float(loads.sum())
@@ -342,9 +334,9 @@ class PressFinder:
             _, first_load, first_pose = self._window[0]
             first = float(first_load.sum())
             is_steady = abs(total - first) <= settings.steady * max(total, first)
-            if not is_steady or _moved_m(first_pose, pose) > settings.still_m:
+            if not is_steady or np.linalg.norm(_point(pose) - _point(first_pose)) > settings.still_m:
                 self._window.clear()
-        if self.held and _moved_m(self._found_at_m, pose) > 2 * settings.still_m:
+        if self.held and np.linalg.norm(_point(pose) - _point(self._found_at_m)) > 2 * settings.still_m:
             self.held = False
         self._window.append((time_ns, loads, np.array(pose, np.float64)))
         if self.held or time_ns - self._window[0][0] < settings.hold_s * NS_PER_S:
@@ -353,18 +345,14 @@ class PressFinder:
             return None
         mean = np.mean([each for _, each, _ in self._window], axis=0)
         at = np.mean([each for _, _, each in self._window], axis=0)
-        at = self._window[-1][2] if at.ndim == 2 else at  # the mean of rotations is none
+        at = self._window[-1][2] if at.ndim == 2 else at  # rotations have no mean
         self._window.clear()
         self.held, self._found_at_m = True, at
         taxel = np.flatnonzero(mean > 0)
         return Press(at, taxel, mean[taxel])
 
 
-def _moved_m(one: ArrayF, other: ArrayF) -> float:
-    return float(np.linalg.norm(_origin(other) - _origin(one)))
-
-
-def _origin(pose: ArrayF) -> ArrayF:
-    """(3,) the point, or the origin of a frame."""
-    origin: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
-    return origin
+def _point(pose: ArrayF) -> ArrayF:
+    """(3,) the point, or the origin of the pose."""
+    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
+    return point

@@ -1,11 +1,11 @@
-"""A calibration as a geometry file: a group for each module, with how sure it is; what was measured in the head."""
+"""Write a calibration as a geometry file: a group with a confidence for each module, and a head with the residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.geometry import GeometryGroup, Triple
+from skinware.geometry import GeometryGroup
 from skinware.structure import Structure
 from skinware.tactile.calibration.placing import Placement
 from skinware.tactile.calibration.topology import Topology, unrolled_m
@@ -16,10 +16,10 @@ _DIGITS = 6
 
 
 def confidence_of(error_m: ArrayF, pitch_m: float) -> float:
-    """The part of sensors that is within half a pitch of its place, if errors along the skin are normal.
+    """Return the share of sensors within half a pitch of their places, if errors along the skin are normal.
 
     Args:
-        error_m: (k,) root of the mean square error that each is expected to have, m.
+        error_m: (k,) expected error of each, root of the mean square, m.
         pitch_m: distance between neighbours, m.
     """
     within = 1 - np.exp(-((pitch_m / 2 / np.maximum(error_m, 1e-9)) ** 2))
@@ -29,13 +29,13 @@ def confidence_of(error_m: ArrayF, pitch_m: float) -> float:
 def placed_groups(
     structure: Structure, type_name: str, placement: Placement, frame: str, pitch_m: float
 ) -> list[GeometryGroup]:
-    """The groups of a geometry file, one for each module that has any place.
+    """Return the groups of a geometry file, one for each module that has any place.
 
     Args:
-        structure: of the skin.
-        type_name: of the sensors that were placed.
-        placement: of them, in the order of the structure.
-        frame: in which the poses were.
+        structure: structure of the skin.
+        type_name: type of the sensors.
+        placement: their places, in the order of the structure.
+        frame: coordinate frame of the poses.
         pitch_m: distance between neighbours, for confidences.
     """
     return [
@@ -54,12 +54,12 @@ def placed_groups(
 
 
 def unrolled_groups(structure: Structure, type_name: str, topology: Topology) -> list[GeometryGroup]:
-    """The groups of a geometry file in which each piece of skin is a flat map of its own.
+    """Return the groups of a geometry file in which each piece of skin is a flat map of its own.
 
     Args:
-        structure: of the skin.
-        type_name: of the sensors that were stroked.
-        topology: of them, in the order of the structure.
+        structure: structure of the skin.
+        type_name: type of the sensors.
+        topology: their topology, in the order of the structure.
     """
     groups: list[GeometryGroup] = []
     for piece in range(topology.n_pieces):
@@ -75,7 +75,7 @@ def unrolled_groups(structure: Structure, type_name: str, topology: Topology) ->
 
 
 def placed_comment(structure: Structure, type_name: str, placement: Placement) -> str:
-    """What a file says of its own quality: of the presses, and of each patch."""
+    """Return the quality of a placement in words: of the presses, and of each patch."""
     index = structure.patch_of(type_name)
     wrong = int(placement.wrong.sum())
     presses, residual = f"{len(placement.residual_m)} presses, {wrong} of them left out", 1e3 * placement.spread_m
@@ -92,7 +92,7 @@ def placed_comment(structure: Structure, type_name: str, placement: Placement) -
 
 
 def unrolled_comment(topology: Topology) -> str:
-    """What a file of maps says of itself."""
+    """Return the contents of a file of maps in words."""
     sizes = ", ".join(str(int((topology.piece == piece).sum())) for piece in range(topology.n_pieces))
     lost = int((topology.piece < 0).sum())
     return (
@@ -125,12 +125,8 @@ def _group(
         type=type_name,
         frame=frame,
         uid=tuple(uid.tolist()),
-        position_m=_triples(position_m[rows]),
-        normal=_triples(normal[rows]) if known else None,
+        position_m=tuple((x, y, z) for x, y, z in np.round(position_m[rows], _DIGITS).tolist()),
+        normal=tuple((x, y, z) for x, y, z in np.round(normal[rows], _DIGITS).tolist()) if known else None,
         confidence=confidence,
         name=structure.module_names[module],
     )
-
-
-def _triples(rows: ArrayF) -> tuple[Triple, ...]:
-    return tuple((x, y, z) for x, y, z in np.round(rows, _DIGITS).tolist())

@@ -1,4 +1,4 @@
-"""Modules are rigid: their shapes, from places in any frame, and the poses that bring a shape onto measured places."""
+"""Find the shapes of rigid modules, and the poses that bring a shape onto measured places."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ ArrayF = npt.NDArray[np.float64]
 ArrayI = npt.NDArray[np.int64]
 
 LEAST_TAXELS = 4
-"""With fewer measured places than that, a module cannot be brought onto them."""
+"""Measured places that the pose of a module needs."""
 _OUTLIER_M = 0.002
 _ROUNDS = 5
 _FLAT = 0.02
-"""A shape whose second extent is below this part of its first is a line: it does not say which way is up."""
+"""Share of the first extent of a shape below which its second makes it a line, which has no side up."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Of a module, in axes of its own.
+    """The shape of a module, in axes of its own.
 
     Attributes:
         taxel: (k,) its taxels.
@@ -40,16 +40,15 @@ def shapes_of(
     position_m: ArrayF,
     normal: ArrayF,
 ) -> dict[int, Shape]:
-    """By module, its shape, wherever places are known for all of its taxels.
+    """Return the shapes of modules, by number, where the places of all of their taxels are known.
 
-    A module without places of its own has the shape of one of the same kind with as many taxels: their order is that
-    of their kind.
+    A module without places has the shape of one of the same kind with as many taxels, in the same order.
 
     Args:
-        module: (n,) of each taxel.
-        kind: of each module, by its number; empty: like no other.
+        module: (n,) module of each taxel.
+        kind: kind of each module, by its number; empty: like no other.
         position_m: (n, 3), NaN where it is not known.
-        normal: (n, 3) likewise.
+        normal: (n, 3), NaN where it is not known.
     """
     shapes: dict[int, Shape] = {}
     like: dict[tuple[str, int], Shape] = {}
@@ -70,7 +69,7 @@ def shapes_of(
 
 
 def _has_extent(places: ArrayF) -> bool:
-    """Whether places tell how a module lies: they are not on a line, nor at one point."""
+    """Whether places determine a pose: they are neither on a line nor at one point."""
     if len(places) < LEAST_TAXELS:
         return False
     extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
@@ -79,7 +78,7 @@ def _has_extent(places: ArrayF) -> bool:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a module is.
+    """The pose of a module.
 
     Attributes:
         rotation: (3, 3).
@@ -90,25 +89,25 @@ class Pose:
     origin_m: ArrayF
 
     def places_m(self, shape: Shape) -> ArrayF:
-        """(k, 3) where the taxels of a shape are."""
+        """Return (k, 3) the places of the taxels of a shape."""
         places: ArrayF = shape.place_m @ self.rotation.T + self.origin_m
         return places
 
     def normals(self, shape: Shape) -> ArrayF:
-        """(k, 3) their normals."""
+        """Return (k, 3) their normals."""
         normals: ArrayF = shape.normal @ self.rotation.T
         return normals
 
 
 def fitted(shape: Shape, measured_m: ArrayF, weight: ArrayF) -> Pose | None:
-    """The pose that brings a shape onto measured places; None: they are too few, or on a line.
+    """Return the pose that brings a shape onto measured places; None if they are too few, or on a line.
 
     Places far from where the shape says lose their weight: 1 / (1 + (distance / 2 mm)^2), in 5 rounds.
 
     Args:
-        shape: of the module.
-        measured_m: (k, 3) of its taxels, NaN where there is none.
-        weight: (k,) of each.
+        shape: shape of the module.
+        measured_m: (k, 3) places of its taxels, NaN where there is none.
+        weight: (k,) weight of each.
     """
     known = np.isfinite(measured_m).all(axis=1) & (weight > 0)
     if known.sum() < LEAST_TAXELS or not _has_extent(shape.place_m[known]):
@@ -123,7 +122,7 @@ def fitted(shape: Shape, measured_m: ArrayF, weight: ArrayF) -> Pose | None:
 
 
 def rigid(source: ArrayF, target: ArrayF, weight: ArrayF) -> Pose:
-    """The rotation and shift that bring (k, 3) places onto others, by weighted least squares (Procrustes)."""
+    """Return the pose that brings (k, 3) places onto others, by weighted least squares (Procrustes)."""
     share = weight / weight.sum()
     from_m, to_m = share @ source, share @ target
     u, _, vt = np.linalg.svd((target - to_m).T @ ((source - from_m) * share[:, None]))

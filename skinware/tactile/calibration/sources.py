@@ -1,4 +1,4 @@
-"""Where frames come from: the loads of a driver, calmed or not, and the poses of a service."""
+"""Read the loads of a driver, calmed or not, and the poses of a service."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skinware.tactile.rule import UNUSABLE
 ArrayF = npt.NDArray[np.float64]
 
 POINT, POSE = "point_m", "pose"
-"""Columns of a service of poses: (3,) or (k, 3) points in m; (4, 4) of what carries a finger, homogeneous, in m."""
+"""Columns of a service of poses: (3,) or (k, 3) points, m; (4, 4) pose of the carrier of a finger, homogeneous, m."""
 
 _COUNT = "count"
 _OLDEST_NS = NS_PER_S // 5
@@ -29,15 +29,15 @@ _PREFERRED = "pressure"
 class LoadSource:
     """The loads of the sensors of one type of a driver: 0 where nothing touches.
 
-    What ``skin-calm`` publishes is taken as it is, values of any other driver go through a baseline here.
+    Values of a calmed driver pass unchanged, those of any other driver go through a baseline.
 
     Args:
-        structure: of the driver.
-        driver_type: as it tells.
+        structure: structure of the driver.
+        driver_type: type of the driver.
         type_name: which sensors; None: pressure, or else the driver's first type.
 
     Attributes:
-        structure: of the driver.
+        structure: structure of the driver.
         type_name: which sensors.
 
     Raises:
@@ -60,16 +60,16 @@ class LoadSource:
 
     @property
     def ready(self) -> bool:
-        """Whether what the sensors read at rest is known, of most of them."""
+        """Whether most of the sensors have a baseline."""
         return self._chain is None or bool(self._chain.baselines[self.type_name].ready.mean() > 0.5)
 
     @property
     def refused_share(self) -> float:
-        """The part of the sensors that have no baseline yet because they move; 0: none."""
+        """Share of the sensors that have no baseline yet because they move."""
         return 0.0 if self._chain is None else self._chain.baselines[self.type_name].refused_share
 
     def loads(self, frame: DriverSnapshot) -> ArrayF:
-        """(n,) the loads in a frame; NaN where they are not known."""
+        """Return (n,) the loads in a frame; NaN where they are not known."""
         if self._chain is None:
             values, status = frame.physical(self.type_name), frame.status_of(self.type_name)
         else:
@@ -81,13 +81,13 @@ class LoadSource:
 
 
 class PoseSource:
-    """The newest pose of a service that publishes poses.
+    """Reads the newest pose of a service.
 
-    A service may have several points and a column ``count`` of those that press: it tells a pose while that is one.
+    A service may have several points and a column ``count`` of those that press: it has a pose while that is one.
 
     Args:
-        reader: of the service.
-        column: with the poses.
+        reader: reader of the service.
+        column: column with the poses.
         shape: (3,) for points, (4, 4) for poses.
 
     Raises:
@@ -106,7 +106,7 @@ class PoseSource:
         self._reader, self._column, self._shape = reader, column, shape
 
     def newest(self) -> ArrayF | None:
-        """The pose of now; None if it is older than 0.2 s, or there is none."""
+        """Return the present pose; None if it is older than 0.2 s, or there is none."""
         try:
             frame = self._reader.read(timeout_s=0)
         except (ServiceTimeout, Overrun):

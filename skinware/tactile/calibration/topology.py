@@ -1,4 +1,4 @@
-"""Map a skin from strokes alone: which taxels are near, how far apart, and a flat map of them."""
+"""Map a skin from strokes alone: neighbours, distances, and a flat map."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from skinware.tactile.neighbours import Components, neighbours_of_pairs
 ArrayF = npt.NDArray[np.float64]
 
 MOST_TAXELS = 6000
-"""Every taxel is compared with every other one: so many need 290 MB."""
+"""Every taxel is compared with every other one: this many need 290 MB."""
 ENOUGH_FRAMES = 20
-"""A taxel that felt something in so many frames is covered."""
+"""Frames with a touch after which a taxel is covered."""
 _LEAST_FRAMES = 8
-"""With fewer, what a taxel felt may be noise, and tells nothing."""
+"""Frames with a touch from which a taxel counts: in fewer it may be noise."""
 
 
 @dataclass
 class StrokeSums:
-    """The sums over all frames that a topology is found from.
+    """The sums over all frames from which a topology is computed.
 
     Attributes:
         products: (n, n) float64, sum of the products of the loads of each pair of taxels.
-        active: (n,) int64, frames in which each felt something.
-        frames: number of frames in which any of them did.
+        active: (n,) int64, frames in which each was touched.
+        frames: number of frames in which any was touched.
     """
 
     products: ArrayF
@@ -37,7 +37,7 @@ class StrokeSums:
 
     @classmethod
     def empty(cls, n: int) -> Self:
-        """Of n taxels, before the first frame.
+        """Make the sums of n taxels before the first frame.
 
         Raises:
             ConfigurationError: there are too many.
@@ -50,7 +50,7 @@ class StrokeSums:
         return len(self.active)
 
     def add(self, load: npt.NDArray[Any]) -> None:
-        """Take one frame, or many.
+        """Take one frame or many.
 
         Args:
             load: (n,) or (m, n): 0 where nothing touches, NaN where it is not known.
@@ -68,16 +68,16 @@ class StrokeSums:
 
     @property
     def covered(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool: felt something in at least 20 frames."""
+        """(n,) bool: touched in at least 20 frames."""
         return self.active >= ENOUGH_FRAMES
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool: felt something in enough frames to be compared with others."""
+        """(n,) bool: touched in enough frames to be compared with others."""
         return self.active >= _LEAST_FRAMES
 
     def similarity(self) -> ArrayF:
-        """(n, n), 0 to 1: the cosine between what two taxels felt over time; 0 with one that is not known."""
+        """Return (n, n), 0 to 1: the cosine between the loads of two taxels over time; 0 if one is not known."""
         length = np.sqrt(np.diag(self.products))
         known = self.known & (length > 0)
         scale = np.where(known, 1 / np.where(known, length, 1), 0)
@@ -88,25 +88,25 @@ class StrokeSums:
 ArrayI = npt.NDArray[np.int64]
 
 PITCH_M = 0.0065
-"""Of ROBOSKIN."""
+"""Pitch of ROBOSKIN, m."""
 _LEAST_SIMILAR = 0.05
-"""Below this the tail of a bell is noise."""
+"""Similarity below which the tail of a bell is noise."""
 _BESIDE = 1.6
-"""Neighbours, in pitches: between the first and the second ring of a lattice of triangles."""
+"""Pitches within which taxels are neighbours: between two rings of a lattice of triangles."""
 _TOGETHER = 0.012
-"""Taxels so similar are of one piece: a strip that was hardly stroked is more, noise between pieces less."""
+"""Similarity of taxels of one piece: more even on a strip that was hardly stroked, while noise makes less."""
 _NEAREST = 3
-"""So many of each taxel's nearest are typically a pitch away: in a lattice of triangles six are, at its edge three."""
+"""Nearest taxels that are typically a pitch away: six in a lattice of triangles, three at its edge."""
 
 
 @dataclass(frozen=True)
 class Topology:
-    """What strokes tell of n taxels.
+    """The topology of n taxels.
 
     Attributes:
-        pairs: (k, 2) int64, those that lie beside each other, the lower number first.
-        distance_m: (n, n), m, straight distances of pairs that are near enough to be measured; inf of all others.
-        piece: (n,) int64, the piece of skin that each is in, from the largest, 0; -1: felt too little.
+        pairs: (k, 2) int64, neighbours, the lower number first.
+        distance_m: (n, n), m, straight distances of pairs that are near enough; inf of all others.
+        piece: (n,) int64, the piece of skin of each, from the largest, 0; -1: touched too little.
     """
 
     pairs: ArrayI
@@ -119,17 +119,17 @@ class Topology:
         return int(self.piece.max(initial=-1)) + 1
 
     def geodesics_m(self, taxels: ArrayI) -> ArrayF:
-        """(k, k) the shortest ways between k taxels over measured distances, m; inf where there is none."""
+        """Return (k, k) the shortest ways between k taxels over measured distances, m; inf where there is none."""
         ways: ArrayF = self.distance_m[np.ix_(taxels, taxels)].copy()
         np.fill_diagonal(ways, 0)
         return shortest_m(ways)
 
 
 def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
-    """The topology of a skin that was stroked.
+    """Compute the topology of a skin from strokes.
 
     Args:
-        sums: of the strokes.
+        sums: sums of the strokes.
         pitch_m: distance between the nearest taxels, m.
     """
     similarity = sums.similarity()
@@ -149,7 +149,7 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
 
 
 def _scale(far: ArrayF, pitch_m: float) -> float:
-    """Metres to one unit of sqrt(-ln S): the nearest taxels are a pitch away."""
+    """Metres per unit of sqrt(-ln S): the nearest taxels are a pitch away."""
     if len(far) <= _NEAREST:
         return pitch_m
     nearest = np.sort(far, axis=1)[:, :_NEAREST]
@@ -159,7 +159,7 @@ def _scale(far: ArrayF, pitch_m: float) -> float:
 
 
 def shortest_m(distance_m: ArrayF) -> ArrayF:
-    """(k, k) the shortest ways over a (k, k) table of distances, whose diagonal is 0, inf where there is none."""
+    """Return (k, k) the shortest ways over a (k, k) table of distances with a diagonal of 0; inf: there is none."""
     ways = distance_m.copy()
     for between in range(len(ways)):
         np.minimum(ways, ways[:, between, None] + ways[None, between], out=ways)
@@ -168,20 +168,20 @@ def shortest_m(distance_m: ArrayF) -> ArrayF:
 
 _ROUNDS = 200
 _ENOUGH = 1e-5
-"""Of the stress, by which a round must still lower it."""
+"""Share of the stress by which a round must lower it."""
 _FAR_WEIGHT = 0.002
-"""Of a way over several taxels, beside that of a measured distance of the same length."""
+"""Weight of a way over several taxels, relative to a measured distance of the same length."""
 
 
 def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
-    """(k, 2) places of k taxels of one piece on a map, m, with their mean at 0. It may be the mirror image.
+    """Return (k, 2) places of k taxels of one piece on a map, m, with their mean at 0. It may be the mirror image.
 
     Classical multidimensional scaling of the ways along the skin, then majorisation of the stress, in which measured
     distances count most.
 
     Args:
-        topology: with their distances.
-        taxels: (k,) of one piece.
+        topology: their topology.
+        taxels: (k,) taxels of one piece.
     """
     ways = topology.geodesics_m(taxels)
     if len(taxels) == 1:
@@ -197,7 +197,6 @@ def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
 
 
 def _scaled(ways: ArrayF) -> ArrayF:
-    """(k, 2) classical scaling: the two strongest directions of the table of squared distances."""
     squares = ways**2
     rows = squares.mean(axis=0)
     value, vector = np.linalg.eigh(-0.5 * (squares - rows - rows[:, None] + squares.mean()))

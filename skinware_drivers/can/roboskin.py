@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
-from skinware_drivers import Link, Module, Patch, operation
+from skinware_drivers import Link, Module, Patch, Watch, operation
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin_boards import BOARD_TYPES, MTB3_TYPE, BoardOperations, discover, read_version
 from skinware_drivers.can.roboskin_layout import (
@@ -53,6 +53,7 @@ from skinware_drivers.can.roboskin_setup import (
     warn_of_full_bus,
     warn_of_uneven_triangles,
 )
+from skinware_drivers.description import SkinTables
 from skinware_drivers.link import Heard
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -72,7 +73,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     types: Sequence[SensorType] = SKIN_TYPES
     dtype: npt.DTypeLike = np.uint8
-    watch = BaselineWatch
 
     def __init__(self, options: RoboskinOptions) -> None:
         super().__init__(options)
@@ -88,6 +88,10 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             raise ConfigurationError(
                 f"boards {', '.join(map(str, options.boards))}: the configuration leaves all triangles switched off"
             )
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        return BaselineWatch(tables)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the boards that were named, or all that answer; a listener learns them from their data.

@@ -70,9 +70,9 @@ class ServiceState:
     Attributes:
         state: one of ``STATES``.
         mode: one of ``MODES``.
-        rate_hz, lost_hz: frames of the last second that were published here, and that the robot published and that did
+        rate_hz, lost_hz: samples of the last second that were published here, and that the robot published and that did
             not come.
-        lost: frames that the robot published and that did not come, since the first one.
+        lost: samples that the robot published and that did not come, since the first one.
         bytes_per_s: of messages, in the last second.
         age_p50_ns, age_p99_ns: from the publication there to the one here, in the last second; None: there was none.
     """

@@ -1,6 +1,6 @@
-"""A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
+"""A driver's end and a user's end of one skin: a service whose snapshots are sensor values, with their structure.
 
-Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``module_untouched``, ``patch_state``, ``bus_state``,
+Columns of a snapshot: ``values``, ``status``, ``module_time_ns``, ``module_untouched``, ``patch_state``, ``bus_state``,
 ``bus_reason``, ``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``,
 ``patch_interval_counts``, ``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``; and
 ``group_time_ns`` where a module has several update groups.
@@ -118,11 +118,11 @@ class DriverReader(ServiceReader[DriverSnapshot]):
         return "".join(_names(self.static(), "driver_type")[:1])
 
     def bus_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
-        """Return the counters of every bus in a frame, by name."""
+        """Return the counters of every bus in a snapshot, by name."""
         return self._counters(frame, "bus", len(self.structure.buses))
 
     def patch_counters(self, frame: DriverSnapshot) -> list[dict[str, int]]:
-        """Return the counters of every patch in a frame, by name."""
+        """Return the counters of every patch in a snapshot, by name."""
         return self._counters(frame, "patch", self.structure.n_patches)
 
     def _counters(self, frame: DriverSnapshot, what: str, count: int) -> list[dict[str, int]]:
@@ -138,10 +138,10 @@ class DriverReader(ServiceReader[DriverSnapshot]):
 def counters_of(
     frame: DriverSnapshot, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
 ) -> tuple[list[str], npt.NDArray[np.uint64]]:
-    """Return counters in a frame: their names, and (count, names) numbers; no names where the driver publishes none.
+    """Return counters in a snapshot: their names, and (count, names) numbers; no names if the driver has none.
 
     Args:
-        frame: of the driver.
+        frame: a snapshot of the driver.
         tables: its static columns.
         what: ``bus`` or ``patch``.
         count: how many of those the driver has.

@@ -1,4 +1,4 @@
-"""One frame of a driver: its columns, and what of them belongs to the sensors of a type."""
+"""One snapshot of a driver: its columns, and what of them belongs to the sensors of a type."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from skinware.structure import Structure
 
 
 class DriverSnapshot(Sample):
-    """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
+    """One snapshot of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
 
     All arrays are coherent: they were published together. Properties are whole columns of the
-    frame; methods take a sensor type and return the part of its sensors, as those of a snapshot do.
+    snapshot; methods take a sensor type and return the part of its sensors, as those of a skin's snapshot do.
     """
 
     __slots__ = ()
 
     @property
     def structure(self) -> Structure:
-        """The structure that this frame belongs to."""
+        """The structure that this snapshot belongs to."""
         return cast(Structure, self.context)
 
     @property
@@ -36,7 +36,7 @@ class DriverSnapshot(Sample):
 
     @property
     def status(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8, bits of :class:`skinware.status.Status`; 0 = good as of the frame (see ``fresh``)."""
+        """(n_sensors,) uint8, bits of :class:`skinware.status.Status`; 0 = good as of the snapshot (see ``fresh``)."""
         return self.column("status")
 
     @property
@@ -159,7 +159,7 @@ class DriverSnapshot(Sample):
     ) -> npt.NDArray[np.bool_]:
         """Return (n,) bool: which sensors of a type can be trusted now.
 
-        Those have the status 0, their driver lived when the frame was taken, and their data is not too old.
+        Those have the status 0, their driver lived when the snapshot was taken, and their data is not too old.
 
         Args:
             type_name: which sensors.

@@ -38,7 +38,7 @@ class ServiceNotFound(ServiceError):
 
 
 class ServiceTimeout(ServiceError, TimeoutError):
-    """No newer frame arrived before the deadline. The message says whether the writer is running."""
+    """No newer sample arrived before the deadline. The message says whether the writer is running."""
 
 
 class NameInUse(ServiceError):

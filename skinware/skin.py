@@ -127,13 +127,13 @@ class Skin:
         align: bool = False,
         timeout_s: float | None = 5.0,
     ) -> Snapshot:
-        """Return the newest frame of every living driver.
+        """Return the newest snapshot of every living driver.
 
         Args:
             newer_than: wait until a driver has published something newer, came or went. Default: take what is
                 there, and wait only if there is no driver.
             max_age_s: wait until the newest data of every driver is at most this old; default: of any age.
-            align: take from every driver the frame nearest to one moment, among those that its ring still holds: the
+            align: take from every driver the snapshot nearest to one moment, among those that its ring still holds: the
                 newest moment that all drivers have reached. A silent driver does not hold the moment back.
                 ``Snapshot.spread_s`` is the remaining difference.
             timeout_s: longest wait; None for no limit.

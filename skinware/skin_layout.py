@@ -51,7 +51,7 @@ class SkinLayout:
         }
 
     def parts(self, type_name: str) -> list[tuple[int, Index]]:
-        """Return where the sensors of a type are: (driver, positions in that driver's frame), in order.
+        """Return where the sensors of a type are: (driver, positions in that driver's snapshot), in order.
 
         Raises:
             StructureError: no driver has such sensors; the message lists the types there are.

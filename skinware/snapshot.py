@@ -1,4 +1,4 @@
-"""The newest frame of every driver, read as one skin."""
+"""The newest snapshot of every driver, read as one skin."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from skinware.skin_layout import SkinLayout
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The newest frame of every driver. Each frame is coherent; for the time between them, see ``spread_s``.
+    """The newest snapshot of every driver. Each snapshot is coherent; for the time between them, see ``spread_s``.
 
     Attributes:
         layout: which drivers; the same object as long as no driver joins, leaves or changes.
-        frames: one per driver of ``layout``.
+        frames: the snapshot of each driver of ``layout``.
     """
 
     layout: SkinLayout
     frames: tuple[DriverSnapshot, ...]
 
     def of(self, driver: str) -> DriverSnapshot:
-        """Return the frame of one driver.
+        """Return the snapshot of one driver.
 
         Raises:
             StructureError: no such driver in this snapshot; the message lists those there are.
@@ -79,7 +79,7 @@ class Snapshot:
     ) -> npt.NDArray[np.bool_]:
         """Return (n,) bool: which sensors of a type can be trusted now.
 
-        Those have the status 0, their driver lived when its frame was taken, and their data is not too old.
+        Those have the status 0, their driver lived when its snapshot was taken, and their data is not too old.
 
         Args:
             type_name: which sensors.
@@ -112,9 +112,9 @@ class Snapshot:
 
 
 class Window:
-    """The last frames of one sensor type, for filters and other computations that need past values.
+    """The last snapshots of one sensor type, for filters and other computations that need past values.
 
-    Add frames of one driver (``in_order`` returns every one) or snapshots of a skin::
+    Add snapshots of one driver (``in_order`` returns every one) or of a skin::
 
         window = Window("pressure", 100)
         for frame in reader.in_order():
@@ -123,7 +123,7 @@ class Window:
 
     Args:
         type_name: which sensors.
-        length: how many frames to keep, N.
+        length: how many snapshots to keep, N.
 
     Raises:
         ConfigurationError: a length below 1.
@@ -141,9 +141,9 @@ class Window:
         self._fresh = np.zeros((length, 0), bool)
 
     def add(self, frame: DriverSnapshot | Snapshot) -> None:
-        """Take a frame in; the oldest gives way.
+        """Take a snapshot in; the oldest gives way.
 
-        A frame of another structure, or a snapshot of another layout, empties the window first: its sensors are others.
+        A snapshot of another structure or layout empties the window first: its sensors are others.
 
         Raises:
             StructureError: it has no sensors of the type, or has them in different units.
@@ -160,22 +160,22 @@ class Window:
         self._added += 1
 
     def __len__(self) -> int:
-        """Frames in it: N as soon as so many were added."""
+        """Snapshots in it: N as soon as so many were added."""
         return min(self._added, self.length)
 
     @property
     def physical(self) -> npt.NDArray[np.floating[Any]]:
-        """(len, n) physical values, the oldest frame first; a copy."""
+        """(len, n) physical values, the oldest snapshot first; a copy."""
         return self._in_order(self._physical)
 
     @property
     def fresh(self) -> npt.NDArray[np.bool_]:
-        """(len, n) bool: which could be trusted when their frame was added; a copy."""
+        """(len, n) bool: which could be trusted when their snapshot was added; a copy."""
         return self._in_order(self._fresh)
 
     @property
     def time_ns(self) -> npt.NDArray[np.int64]:
-        """(len,) int64: time of the newest data of each frame, CLOCK_MONOTONIC ns; a copy."""
+        """(len,) int64: time of the newest data of each snapshot, CLOCK_MONOTONIC ns; a copy."""
         return self._in_order(self._time_ns)
 
     def _in_order(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -9,7 +9,7 @@
         ...  # do something else
 
 The thread owns what it was given, and closes it at its end. Its callback must not be slow for long: a reader then loses
-frames, a writer misses periods; no other program is held up.
+samples, a writer misses periods; no other program is held up.
 """
 
 from __future__ import annotations
@@ -134,16 +134,16 @@ def start_reader(
     in_order: bool = False,
     profile: Profile | None = None,
 ) -> Worker[F]:
-    """Start a thread that calls a function with the frames of a service.
+    """Start a thread that calls a function with the samples of a service.
 
-    When the service comes back with another structure, its frames of that structure follow. A frame that the writer
+    When the service comes back with another structure, its samples of that structure follow. A sample that the writer
     overwrites too fast for a copy is left out (``reader.statistics.overruns``).
 
     Args:
         reader: belongs to the thread from now on.
-        function: called with each frame, a private copy.
+        function: called with each sample, a private copy.
         rate_hz: None: each time the writer publishes; otherwise at this rate with what is newest.
-        in_order: every frame instead of the newest.
+        in_order: every sample instead of the newest.
         profile: how the thread is scheduled.
     """
 
@@ -168,13 +168,13 @@ def start_writer(
     from_last: bool = False,
     profile: Profile | None = None,
 ) -> Worker[dict[str, npt.NDArray[Any]]]:
-    """Start a thread that calls a function to fill each frame of a service.
+    """Start a thread that calls a function to fill each sample of a service.
 
     Args:
         writer: belongs to the thread from now on.
-        function: called with the arrays of the next frame, to be filled in place.
-        rate_hz: at this rate; None: whenever a program asks for a frame.
-        from_last: the arrays hold the newest frame first.
+        function: called with the arrays of the next sample, to be filled in place.
+        rate_hz: at this rate; None: whenever a program asks for a sample.
+        from_last: the arrays hold the newest sample first.
         profile: how the thread is scheduled.
     """
 
@@ -190,7 +190,7 @@ def start_writer(
 class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
     """A paused worker pauses its writer, so that readers and requesters notice it.
 
-    The writer itself yields nothing then; a frame that was begun before is filled, and not published.
+    The writer itself yields nothing then; a sample that was begun before is filled, and not published.
     """
 
     _owned: Writer
@@ -209,7 +209,7 @@ class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
 class SkinReplica(Worker[Snapshot]):
     """The whole skin, kept up to date by a thread; any number of other threads can look at it.
 
-    A snapshot never changes: it has one published frame of each driver.
+    A snapshot never changes: it has one published sample of each driver.
 
     Args:
         skin: used only by the thread from now on.

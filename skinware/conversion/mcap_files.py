@@ -16,10 +16,9 @@ from skinware.conversion.showing import Message, Showing, Viewers, in_topic
 from skinware.conversion.tables import COLUMNS, TIME, Source, Table
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.limits import LIMITS
 from skinware.memory.file_layout import SLOT
 from skinware.realtime import NS_PER_S
-from skinware.recording.files import Head, RecordingFile
+from skinware.recording.files import Head, PendingChunk, RecordingFile
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
 from skinware.structure import Structure
@@ -67,7 +66,6 @@ def _of_table(table: Table) -> Iterator[TimedFrame]:
 
 
 _CHUNK_NS = NS_PER_S // 4
-_CHUNK_BYTES = 8 << 20
 
 
 class _TimedJson(NamedTuple):
@@ -136,19 +134,14 @@ class _RecordingWriter:
         self._file = file
         self._channels = Channels()
         self._streams: dict[str, _Stream] = {}
-        self._chunk, self._heads, self._begun_ns = OpenChunk(), set[Head](), 0
-        self._frames_size = 0  # of the chunk, decoded
+        self._chunk, self._begun_ns = PendingChunk(), 0
 
     def add_frame(self, timed: TimedFrame) -> None:
         stream = self._streams.get(timed.service)
         if stream is None or stream.generation is not timed.generation:
             stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
         channel, schema = self._channels.of_service(timed.service, FRAME)
-        if not self._chunk.has(channel):
-            stream.encoder.next_is_key()
-        self._heads.add(stream.head)
-        self._frames_size += len(timed.frame.slot)
-        self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
+        self._chunk.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
 
     def add_json(self, item: _TimedJson) -> None:
         channel, schema = self._channels.of_all(item.topic)
@@ -156,15 +149,12 @@ class _RecordingWriter:
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
-        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
-        if is_large or time_ns >= self._begun_ns + _CHUNK_NS:
+        if self._chunk.is_large or time_ns >= self._begun_ns + _CHUNK_NS:
             self.close_chunk()
             self._begun_ns = time_ns
 
     def close_chunk(self) -> None:
-        if not self._chunk.is_empty:
-            self._file.add(self._chunk.close(), self._heads)
-            self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
+        self._chunk.move_to(self._file)
 
     def _stream(self, service: str, generation: Generation, before: _Stream | None) -> _Stream:
         number = 1 if before is None else before.head.sequence + 1

@@ -108,7 +108,7 @@ typedef enum skinware_result {
 #define SKINWARE_STATUS_SUSPECT 64u       /* something happened that makes the value doubtful */
 #define SKINWARE_STATUS_UNHEALTHY 128u    /* stuck, noisy, dead ... for minutes: the value is doubtful */
 
-/* What a bus is doing (column "bus_state" of a driver). Treat an unknown state as "not live". */
+/* State of a bus (column "bus_state" of a driver). Treat an unknown state as "not live". */
 #define SKINWARE_BUS_CONNECTING 0u
 #define SKINWARE_BUS_LIVE 1u
 #define SKINWARE_BUS_SILENT 2u
@@ -209,8 +209,8 @@ void skinware_detach(skinware_reader *reader);
  * Wait for a frame that is newer than a given one (NULL, or a frame that was never filled: for any frame).
  *
  * OK: there is one; read it. RESTARTED: the service came back; reattach.
- * GONE, PAUSED: told at once (a killed writer within 50 ms), but only once: the next call waits until its deadline for
- * the writer to come back, so that a loop around this function never spins.
+ * GONE, PAUSED: returned at once (a killed writer within 50 ms), but only once: the next call waits until its deadline
+ * for the writer to come back, so that a loop around this function never spins.
  * TIMEOUT, and GONE or PAUSED once more: the deadline came. If it has passed already, this function does not wait.
  * INTERRUPTED: a signal handler ran. A signal that comes just before the wait does not end it: keep deadlines short
  * where handlers set a flag.
@@ -235,7 +235,7 @@ skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame);
  */
 skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame);
 
-/* Whether a frame is whole so far: always 1 for a copy, 1 for a view until the writer begins to overwrite it. */
+/* Returns whether a frame is whole: always 1 for a copy, 1 for a view until the writer begins to overwrite it. */
 int skinware_valid(const skinware_frame *frame);
 
 /* The elements of a column in a frame, aligned to 64 bytes in views and to 16 in copies; NULL if there are none. */
@@ -264,7 +264,7 @@ double skinware_number(const skinware_column *column, const void *data, size_t i
 
 /* -- drivers: sensors by type ------------------------------------------------------------------------------------- */
 
-/* Whether the service is a driver: a skin with sensors. Its tables were then checked, and agree with each other. */
+/* Returns whether the service is a driver: a skin with sensors. Its tables were then checked. */
 int skinware_is_driver(const skinware_reader *reader);
 
 /* The sensor types of a driver; 0 if the service is no driver. */
@@ -304,7 +304,7 @@ size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame
 
 /* -- the state of things ------------------------------------------------------------------------------------------ */
 
-/* Whether the writer of this generation is running (it may still publish nothing). One system call. */
+/* Returns whether the writer of this generation is running (it may still publish nothing). One system call. */
 int skinware_is_alive(const skinware_reader *reader);
 
 /* SKINWARE_STATE_* bits of this generation. */
@@ -469,7 +469,7 @@ static inline uint64_t skinware__copy_newest(const skinware__ring *ring, unsigne
     return UINT64_MAX;
 }
 
-/* Whether the writer of a file still holds its lock. */
+/* Returns whether the writer of a file still holds its lock. */
 static inline int skinware__is_locked(int fd) {
     struct flock lock;
     memset(&lock, 0, sizeof lock);
@@ -482,8 +482,8 @@ static inline int skinware__is_locked(int fd) {
 enum { SKINWARE__UNKNOWN = -1, SKINWARE__ENDED = -2 };
 
 /*
- * Whether the writer of a file lives: its lock is held, and the process that made the file has not ended. A child that C
- * code forked keeps the lock of a dead parent.
+ * Returns whether the writer of a file lives: its lock is held, and the process that made the file has not ended. A
+ * child that C code forked keeps the lock of a dead parent.
  */
 static inline int skinware__lives(int fd, int process) {
     struct pollfd ended;
@@ -753,7 +753,7 @@ static uint64_t skinware__rows(const skinware_reader *reader, const char *name) 
     return table == NULL ? 0 : table->count;
 }
 
-/* Whether a table of row numbers points to rows that exist. */
+/* Returns whether a table of row numbers points to rows that exist. */
 static int skinware__points_within(const unsigned char *table, uint64_t count, uint64_t rows) {
     const uint32_t *row = (const uint32_t *)(const void *)table;
     uint64_t i;
@@ -907,7 +907,7 @@ static skinware_result skinware__open_folder(const char *name_space, int *folder
         result = skinware__fail(SKINWARE_BAD_NAMESPACE, "the folder can be written by others; chmod 2750 it");
     else if (info.st_uid != geteuid() && info.st_uid != 0 && !(has_extra && info.st_uid == extra))
         result = skinware__fail(SKINWARE_BAD_NAMESPACE,
-                                "the folder belongs to somebody who is neither you nor root; if that is right, set"
+                                "the folder belongs to another account, not to you or root; if that is right, set"
                                 " SKINWARE_OWNER to that user");
     *owner = info.st_uid;
     if (result != SKINWARE_OK)
@@ -957,7 +957,7 @@ static int skinware__watch(const skinware__header *header) {
     return SKINWARE__ENDED;
 }
 
-/* Opens and checks the present file of the service. Whatever is open or mapped afterwards, skinware__release ends. */
+/* Opens and checks the present file of the service. skinware__release closes and unmaps everything. */
 static skinware_result skinware__open(skinware_reader *reader) {
     char file_name[56] = "";
     struct stat info;
@@ -1072,7 +1072,7 @@ void skinware_detach(skinware_reader *reader) {
 
 /* -- frames ------------------------------------------------------------------------------------------------------- */
 
-/* Whether the name stands for another file now. While this reader is attached, no other file can have its inode. */
+/* Returns whether the name stands for another file now. No other file can have the inode of an attached one. */
 static int skinware__is_replaced(const skinware_reader *reader) {
     char path[160];
     struct stat info;
@@ -1083,7 +1083,7 @@ static int skinware__is_replaced(const skinware_reader *reader) {
 skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *newer_than, int64_t deadline_ns) {
     int look_around = 0; /* at the rare things, which cost system calls: after a slice without news, and at the end */
     for (;;) {
-        /* the wake word first: whatever is published after it was read ends the sleep */
+        /* the wake word first: a publication after it was read ends the sleep */
         const uint32_t wake_word = skinware__load_32(reader->ring.map + SKINWARE__WAKE_WORD_OFFSET);
         const uint32_t state = skinware_state(reader);
         const uint64_t latest = skinware_latest(reader);
@@ -1137,7 +1137,7 @@ static void skinware__fill(const skinware_reader *reader, skinware_frame *frame,
 
 static skinware_result skinware__overrun(int alive) {
     return skinware__fail(SKINWARE_OVERRUN, alive ? "give the service more slots, or publish less often"
-                                                  : "its writer is dead, and its newest frame is not whole; start it again");
+                                                  : "its writer is dead, and its newest sample is not whole; start it again");
 }
 
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
@@ -1419,7 +1419,7 @@ const char *skinware_text(skinware_result result) {
     case SKINWARE_PAUSED: return "the writer is paused";
     case SKINWARE_GONE: return "the writer died or was stopped; start it again";
     case SKINWARE_RESTARTED: return "the service came back; reattach";
-    case SKINWARE_STRUCTURE_CHANGED: return "the service has another structure now; look everything up anew";
+    case SKINWARE_STRUCTURE_CHANGED: return "the service has another structure now; look everything up again";
     case SKINWARE_INTERRUPTED: return "a signal ended the wait";
     case SKINWARE_OVERRUN: return "the writer was faster than the copy";
     case SKINWARE_NOT_FOUND: return "no such service";

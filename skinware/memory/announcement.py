@@ -35,15 +35,15 @@ class ReaderRecord(msgspec.Struct):
         pid: its process (as seen in its own pid namespace).
         program: the process' name.
         kind: how it reads: ``asap``, ``in order``, ``periodic 30 Hz``, ``on demand``.
-        frames: frames taken so far.
-        lost: frames that were published since its first one and that it did not take.
+        frames: samples taken so far.
+        lost: samples that were published since its first one and that it did not take.
         overruns: how often the writer was too fast for a copy.
         missed_periods: periods that passed unused (periodic readers).
-        rate_hz: frames per second lately.
-        age_ms: how old the newest data of a recent frame was when it was taken.
-        wall: what its loop does with a frame, from having it to coming back.
+        rate_hz: samples per second lately.
+        age_ms: how old the newest data of a recent sample was when it was taken.
+        wall: what its loop does with a sample, from having it to coming back.
         cpu: from one wait to the next, on a processor.
-        age: how old the newest data was when a frame was taken.
+        age: how old the newest data was when a sample was taken.
         lateness: how late its periods began (periodic readers).
     """
 

@@ -69,7 +69,7 @@ HEADER = _packed(
     ("published_before", "<u8", 192),
 )
 """``period_ns`` is the writer's nominal period, 0 if it has none; ``kind`` says what the columns mean;
-``published_before`` how many frames the generations before this one published."""
+``published_before`` how many samples the generations before this one published."""
 
 CONTROL_OFFSET = 512
 LATEST_OFFSET = CONTROL_OFFSET
@@ -113,7 +113,7 @@ STATISTICS = np.dtype(
 )
 """Wall: time from ``begin`` to ``commit``; CPU: from publication to publication; how many stamps lay before boot; how
 old the data was when published; how late periods began. Bucket k of a histogram counts values of 2**(k-1) to
-2**k - 1 ns, the last one all above. Not covered by the slot protocol: a reader may see some of these words a frame
+2**k - 1 ns, the last one all above. Not covered by the slot protocol: a reader may see some of these words a sample
 ahead of others."""
 
 COLUMN_OFFSET = STATISTICS_OFFSET + STATISTICS.itemsize

@@ -20,12 +20,8 @@ from skinware.realtime import NS_PER_S, now_ns
 _TOTAL_STORE_ORDER = ("x86_64", "amd64", "AMD64")
 
 
-def _nothing() -> None:
-    pass
-
-
 fence: Callable[[], None] = (
-    _nothing if platform.machine() in _TOTAL_STORE_ORDER else native.core().quick.skinware_native_fence
+    (lambda: None) if platform.machine() in _TOTAL_STORE_ORDER else native.core().quick.skinware_native_fence
 )
 """Orders everything before it against everything after it, for all processes that map the memory."""
 

@@ -46,14 +46,14 @@ class FrameSource(Protocol):
 
 
 class Sample:
-    """One published frame: a private copy, or (from ``view``) the ring's own memory.
+    """One published sample: a private copy, or (from ``view``) the ring's own memory.
 
     Copies that were made in one look share a piece of memory, which lives as long as any of them or of their arrays.
 
     Attributes:
         generation: which incarnation of the service it belongs to.
         period_ns: the writer's nominal period, 0 if it has none.
-        stale: the writer was dead when the frame was taken: this is its last word.
+        stale: the writer was dead when the sample was taken: this is its last word.
         context: what the reader knows of the service (for a driver: its structure).
     """
 
@@ -120,7 +120,7 @@ class Sample:
         return memoryview(self._data)[self._start :]
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """One column of the frame, a view of its memory.
+        """One column of the sample, a view of its memory.
 
         Raises:
             KeyError: no column of that name.
@@ -139,7 +139,7 @@ class Sample:
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    SampleT = TypeVar("SampleT", bound=Sample, default=Sample)  # so that a reader of plain frames needs no annotation
+    SampleT = TypeVar("SampleT", bound=Sample, default=Sample)  # so that a reader of plain samples needs no annotation
 else:
     from typing import TypeVar
 

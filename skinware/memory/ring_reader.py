@@ -12,11 +12,9 @@ from skinware.errors import Overrun
 from skinware.memory import file_layout, futex
 from skinware.memory.futex import fence
 from skinware.memory.ring import (
-    ACQUIRED,
     COPY_ATTEMPTS,
     LATEST,
     MISSED_PERIODS,
-    PUBLISHED,
     SEQUENCE,
     STATE,
     WAKE_WORD,
@@ -53,8 +51,8 @@ class RingReader(Generic[SampleT]):
 
     Args:
         segment: the attached generation.
-        frame_class: class of the frames it hands out.
-        context: what every frame carries as ``context``.
+        frame_class: class of the samples it hands out.
+        context: what every sample carries as ``context``.
     """
 
     def __init__(self, segment: Segment, frame_class: type[SampleT], context: object = None) -> None:
@@ -77,7 +75,7 @@ class RingReader(Generic[SampleT]):
 
     @property
     def latest(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
+        """Sequence of the newest sample, 0 before the first."""
         return self.words[LATEST]
 
     def frame_in(self, data: bytearray, start: int) -> SampleT:
@@ -124,7 +122,7 @@ class RingReader(Generic[SampleT]):
     def _overrun(self) -> Overrun:
         if not self.segment.writer_lives():
             return Overrun(
-                f"{self.segment.path}: its writer is dead, and its newest frame is not whole; start it again"
+                f"{self.segment.path}: its writer is dead, and its newest sample is not whole; start it again"
             )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
@@ -163,15 +161,12 @@ class RingReader(Generic[SampleT]):
     def missed_periods(self) -> int:
         return self.words[MISSED_PERIODS]
 
-    def publication_times_ns(self) -> list[int]:
-        """When the frames that the ring still holds were published, oldest first."""
-        return [time_ns for _, time_ns in self._times_ns(PUBLISHED)]
+    def times_ns(self, word: int) -> list[tuple[int, int]]:
+        """Return (sequence, time) of the samples that the ring still holds, oldest first.
 
-    def acquisition_times_ns(self) -> list[tuple[int, int]]:
-        """(sequence, ``acquired_ns``) of the frames that the ring still holds, oldest first."""
-        return self._times_ns(ACQUIRED)
-
-    def _times_ns(self, word: int) -> list[tuple[int, int]]:
+        Args:
+            word: ``PUBLISHED`` or ``ACQUIRED``.
+        """
         times = []
         latest = self.latest
         for sequence in range(max(1, latest - len(self._slots) + 2), latest + 1):
@@ -183,7 +178,7 @@ class RingReader(Generic[SampleT]):
         return times
 
     def view(self) -> SampleT | None:
-        """Return the newest frame in place, without a copy; ask ``frame.valid`` after using it."""
+        """Return the newest sample in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(COPY_ATTEMPTS):
             wanted = self.latest
             if wanted == 0:

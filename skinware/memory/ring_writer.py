@@ -66,20 +66,20 @@ class RingWriter:
 
     @property
     def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
+        """Sequence of the newest sample, 0 before the first."""
         return self._words[LATEST]
 
     def begin(
         self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
     ) -> dict[str, npt.NDArray[Any]]:
-        """Return the columns of the next slot, to be filled; they hold an old frame.
+        """Return the columns of the next slot, to be filled; they hold an old sample.
 
-        Until ``commit``, readers of that old frame find that it is gone.
+        Until ``commit``, readers of that old sample find that it is gone.
 
         Args:
-            from_last: copy the newest frame into it first, for writers that change parts only.
+            from_last: copy the newest sample into it first, for writers that change parts only.
             skip: sequences before its own that are left out; readers count them as lost. It is one more where the slot
-                would be that of the newest frame, which stays readable meanwhile.
+                would be that of the newest sample, which stays readable meanwhile.
             contents: a whole slot of the same layout, to be copied into it first.
         """
         if self.segment.descriptor.fd < 0:
@@ -97,8 +97,8 @@ class RingWriter:
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish what was filled in since ``begin`` and wake all readers with one system call.
 
-        If it raises, nothing has changed: the newest frame is the one before, and the one begun may be committed still.
-        An exception from outside in the middle of it (Ctrl-C) leaves the frame published, or not at all.
+        If it raises, nothing has changed: the newest sample is the one before; the one begun may still be committed.
+        An exception from outside in the middle of it (Ctrl-C) leaves the sample published, or not at all.
 
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
@@ -107,18 +107,18 @@ class RingWriter:
             flags: bits for the service's own use.
 
         Returns:
-            The frame's sequence.
+            The sample's sequence.
 
         Raises:
             Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
-            ServiceError: there was no ``begin`` before it: the slot holds an old frame.
+            ServiceError: there was no ``begin`` before it: the slot holds an old sample.
             TypeError: ``acquired_ns`` or ``flags`` is no integer.
             ValueError: ``acquired_ns`` does not fit 63 bits, or ``flags`` 64.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         if not self._state.begun_ns:
-            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old frame as a new one")
+            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old sample as a new one")
         acquired_ns, flags = operator.index(acquired_ns), operator.index(flags)
         if acquired_ns > _MOST_NS or not 0 <= flags <= _ALL_FLAGS:
             raise ValueError(f"{self.segment.path}: a frame has 63 bits for acquired_ns ({acquired_ns}), 64 for flags")

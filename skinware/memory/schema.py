@@ -26,11 +26,11 @@ _MAX_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class Column:
-    """One named array of a frame.
+    """One named array of a sample.
 
     Attributes:
         dtype: numbers, fixed-length bytes, or a structure of them; anything that ``np.dtype`` takes.
-        shape: of the array in every frame.
+        shape: of the array in every sample.
         unit: of the numbers, for people.
         description: for people.
     """
@@ -47,7 +47,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Schema:
-    """All columns of a service's frames.
+    """All columns of a service's samples.
 
     Attributes:
         columns: by name.

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-import re
 import secrets
 import stat
-import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, NamespaceError, ServiceNotFound
+from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory import file_layout, futex
 from skinware.memory.file_layout import Layout
 from skinware.memory.futex import fence
@@ -27,15 +25,8 @@ from skinware.memory.locks import Descriptor, Process, ProcessWatch, has_ended, 
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
-_OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
+OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_LEAST = file_layout.COLUMN_OFFSET
-_COUNT = struct.Struct("<Q")
-_MOST_FRAMES = 1 << 62
-"""A greater count is of a forged or damaged file: 146,000 years at 1 MHz."""
-_HOLDER = struct.Struct("<QQQ")
-"""In the file of a name's lock, behind the count: the :class:`Process` that took it last."""
-_ORPHAN_S = 2.0
-"""How long a child that was forked just before its parent was killed may take to close the lock that it inherited."""
 _HEAD_BYTES = file_layout.COLUMN_OFFSET + file_layout.COLUMN.itemsize * file_layout.MAX_COLUMNS
 
 
@@ -114,108 +105,12 @@ class Segment:
         futex.Word(self.data, file_layout.WAKE_WORD_OFFSET).wake_all()
 
 
-def take_name(namespace: Namespace, name: str) -> Descriptor:
-    """Become the owner of a service's name, for as long as the returned descriptor is open.
-
-    What the owner before left half made or cannot take back (it was killed) is removed. A child of a killed owner may
-    still have the lock: for a moment where Python forked it, which is waited for, and as long as it lives where C did;
-    its lock's file is then replaced.
-
-    Raises:
-        NameInUse: a living process owns it.
-        NamespaceError: the lock file cannot be used.
-    """
-    path = namespace.lock_path(name)
-    deadline = time.monotonic() + _ORPHAN_S
-    while True:
-        descriptor = _opened_lock(path)
-        if try_lock(descriptor.fd):
-            _note_holder(descriptor.fd, path)
-            if current_inode(path) == _inode(descriptor.fd):
-                break  # otherwise it was removed or replaced meanwhile
-        elif not _holder_has_ended(descriptor.fd):
-            descriptor.close()
-            raise NameInUse(
-                f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
-                " stop it (skin-info shows its pid), or choose another name or namespace (SKINWARE_NAMESPACE)"
-            )
-        elif time.monotonic() > deadline:
-            _replace_lock(namespace, name, descriptor)
-        else:
-            time.sleep(0.005)
-        descriptor.close()
-    try:
-        _remove_leftovers(namespace, name)
-    except OSError as error:
-        descriptor.close()
-        raise NamespaceError(f"cannot remove what a dead {name!r} left in {namespace.path}: {error.strerror}") from None
-    return descriptor
-
-
-def _opened_lock(path: Path) -> Descriptor:
-    try:
-        return Descriptor(os.open(path, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600))
-    except OSError as error:
-        raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
-
-
-def _note_holder(fd: int, path: Path) -> None:
-    try:
-        os.pwrite(fd, _HOLDER.pack(*this_process()), _COUNT.size)
-    except OSError as error:
-        raise NamespaceError(f"cannot write the lock {path}: {error.strerror}") from None
-
-
-def _holder_has_ended(fd: int) -> bool:
-    """Return whether the process that took a lock has ended, so that a child of it holds the lock."""
-    noted = os.pread(fd, _HOLDER.size, _COUNT.size)
-    return len(noted) == _HOLDER.size and has_ended(Process(*_HOLDER.unpack(noted)))
-
-
-def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
-    """Put a free lock in the place of one that a child of a dead owner holds; the count in it is kept.
-
-    Where two programs do so at once, the owner notices within a second that its lock is gone, as after any removal
-    (``Ownership.keep_files``).
-    """
-    path = namespace.lock_path(name)
-    if current_inode(path) != _inode(held.fd):
-        return
-    temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
-    try:
-        with open(os.open(temporary, _OPEN_FLAGS | os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(os.pread(held.fd, _COUNT.size, 0))
-        os.rename(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise NamespaceError(f"cannot replace the lock {path}: {error.strerror}") from None
-
-
 def previous(namespace: Namespace, name: str) -> Segment | None:
     """Return the generation that a dead writer left, None if none is left that anybody can be attached to."""
     try:
         return attach(namespace, name, writable=True)
     except (ServiceNotFound, BadServiceFile):
         return None
-
-
-def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:
-    """Frames that were published under a name before.
-
-    A writer that is closed leaves the count in the file of the lock (:func:`note_published`), one that is killed in its
-    ring. Absurd counts are not believed.
-    """
-    noted = os.pread(name_lock.fd, _COUNT.size, 0)
-    count: int = _COUNT.unpack(noted)[0] if len(noted) == _COUNT.size else 0
-    counts = (count, last.published if last is not None else 0)
-    return max((count for count in counts if count <= _MOST_FRAMES), default=0)
-
-
-def note_published(name_lock: Descriptor, count: int) -> None:
-    """Leave word for the next owner of the name; see :func:`published_so_far`."""
-    with contextlib.suppress(OSError):  # shared memory is full
-        os.pwrite(name_lock.fd, _COUNT.pack(count), 0)
 
 
 def create(
@@ -244,7 +139,7 @@ def create(
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
     header = _header(name, layout, layout.digest(static), kind, period_ns, published_before)
     try:
-        fd = os.open(temporary, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        fd = os.open(temporary, OPEN_FLAGS | os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         descriptor = Descriptor(fd)
         try:
             if not try_lock(fd):
@@ -260,7 +155,7 @@ def create(
     except OSError as error:
         where = namespace.ring_path(name)
         raise NamespaceError(f"cannot make {where} ({layout.file_size} bytes): {error.strerror}") from None
-    return Segment(str(temporary), header[0], layout, data, descriptor, _inode(fd), schema, ProcessWatch(None))
+    return Segment(str(temporary), header[0], layout, data, descriptor, inode_of(fd), schema, ProcessWatch(None))
 
 
 def _write_head(
@@ -304,22 +199,11 @@ def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
     ``mmap`` keeps a duplicate of its descriptor; of the locked one, that would hold the lock for as long as any
     array lives, and in forked children too.
     """
-    fd = os.open(path, _OPEN_FLAGS | os.O_RDWR)
+    fd = os.open(path, OPEN_FLAGS | os.O_RDWR)
     try:
         return np.frombuffer(mmap.mmap(fd, size), np.uint8)
     finally:
         os.close(fd)
-
-
-def _remove_leftovers(namespace: Namespace, name: str) -> None:
-    """Remove what a writer that was killed left half made, and its socket; the caller owns the name.
-
-    The ring stays until another takes its place: readers still want its last frame.
-    """
-    pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
-    for entry in os.listdir(namespace.path):
-        if pattern.fullmatch(entry):
-            os.unlink(namespace.path / entry)
 
 
 def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segment:
@@ -335,7 +219,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     owner = namespace.check()
     path = namespace.ring_path(name)
     try:
-        fd = os.open(path, _OPEN_FLAGS | (os.O_RDWR if writable else os.O_RDONLY))
+        fd = os.open(path, OPEN_FLAGS | (os.O_RDWR if writable else os.O_RDONLY))
     except FileNotFoundError:
         raise ServiceNotFound(_not_found(namespace, name)) from None
     except OSError as error:
@@ -354,7 +238,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
         except OSError as error:
             raise _cannot(path, "mapped", error) from None
         segment = Segment(
-            str(path), header, layout, data, descriptor, _inode(fd), Schema(), ProcessWatch(_maker(header))
+            str(path), header, layout, data, descriptor, inode_of(fd), Schema(), ProcessWatch(_maker(header))
         )
         segment.schema = from_file(layout, segment.static_columns(), str(path))
     except BaseException:
@@ -425,7 +309,7 @@ def current_inode(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     return info.st_dev, info.st_ino
 
 
-def _inode(fd: int) -> tuple[int, int]:
+def inode_of(fd: int) -> tuple[int, int]:
     info = os.fstat(fd)
     return info.st_dev, info.st_ino
 
@@ -437,14 +321,14 @@ def _maker(header: np.void) -> Process:
 def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
     """(device, inode) of a service's present file if its writer lives and has published; maps and checks nothing."""
     try:
-        fd = os.open(namespace.ring_path(name), _OPEN_FLAGS | os.O_RDONLY)
+        fd = os.open(namespace.ring_path(name), OPEN_FLAGS | os.O_RDONLY)
     except OSError:
         return None
     try:
         head = os.pread(fd, file_layout.LATEST_OFFSET + 8, 0)
         if not any(head[file_layout.LATEST_OFFSET :]) or not is_locked(fd):
             return None
-        return None if has_ended(_maker(np.frombuffer(head, file_layout.HEADER, 1)[0])) else _inode(fd)
+        return None if has_ended(_maker(np.frombuffer(head, file_layout.HEADER, 1)[0])) else inode_of(fd)
     except OSError:
         return None
     finally:

@@ -74,13 +74,13 @@ class WriterStatistics(msgspec.Struct):
     """Figures that a writer counts in one generation of its service.
 
     Attributes:
-        published: frames.
+        published: samples.
         missed_periods: periods in which it published nothing because it was late.
-        before_boot: frames whose ``acquired_ns`` lay before this machine booted, and counts as 0.
-        ahead: frames whose ``acquired_ns`` lay more than 0.2 s in the future, so that nothing in them is fresh.
+        before_boot: samples whose ``acquired_ns`` lay before this machine booted, and counts as 0.
+        ahead: samples whose ``acquired_ns`` lay more than 0.2 s in the future, so that nothing in them is fresh.
         wall: from ``begin`` to ``commit``.
         cpu: from one publication to the next, on a processor.
-        age: how old the newest data of a frame was when it was published.
+        age: how old the newest data of a sample was when it was published.
         lateness: how late its periods began (periodic writers).
     """
 

@@ -17,7 +17,7 @@
 
 #include <limits.h>
 
-/* What a library shows to those who load it: all else is hidden. */
+/* Marks the functions that a library exports: all others are hidden. */
 #define SKINWARE_EXPORT __attribute__((visibility("default")))
 
 /* How often a reader tries again while the writer overwrites what it copies. */
@@ -121,7 +121,7 @@ static inline unsigned char *skinware_ring_slot(const skinware_ring_writer *writ
 
 /*
  * The slot of the next frame, to be filled from its 64th byte on; it holds an old one. Until the commit, readers of that
- * old frame are told that it is gone. May be called again instead of a commit.
+ * old frame find that it is gone. May be called again instead of a commit.
  */
 static inline unsigned char *skinware_ring_begin(skinware_ring_writer *writer) {
     unsigned char *slot = skinware_ring_slot(writer, skinware_ring_next(writer));
@@ -131,7 +131,7 @@ static inline unsigned char *skinware_ring_begin(skinware_ring_writer *writer) {
     return slot;
 }
 
-/* Wake everybody who waits for this generation: one system call. From any thread. */
+/* Wake all waiters of this generation: one system call. From any thread. */
 static inline void skinware_ring_wake(const skinware_ring_writer *writer) {
     uint32_t *wake_word = (uint32_t *)(void *)(writer->map + SKINWARE__WAKE_WORD_OFFSET);
     __atomic_fetch_add(wake_word, 1, __ATOMIC_RELEASE);

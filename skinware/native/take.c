@@ -72,7 +72,7 @@ static int64_t least(int64_t a, int64_t b) {
     return a < b ? a : b;
 }
 
-/* There has to be room for it: who takes a sample has seen to that. */
+/* The caller makes sure that there is room for it. */
 static void note_turn(skinware_native_reader *reader, int64_t acquired_ns, int64_t taken_ns, int64_t ended_ns,
                       int64_t cpu_ns) {
     turn *over = &reader->turns[reader->noted++];

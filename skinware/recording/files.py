@@ -14,12 +14,16 @@ from typing import Protocol
 from mcap.records import Channel, Schema
 
 from skinware.errors import BadRecording
+from skinware.limits import LIMITS
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import ClosedChunk, McapFile, OpenChunk
+from skinware.transfer.codec import Encoder
 
 _REPEATED_AFTER_NS = 60 * NS_PER_S
 _REPEATED_AFTER_BYTES = 64 << 20
+_CHUNK_BYTES = 8 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +135,62 @@ class RecordingFile:
         self.file.add(chunk.close())
         self._written |= dict.fromkeys(heads, self.file.size)
         self._written_ns = time_ns
+
+
+class PendingChunk:
+    """A chunk that is being filled, with the heads of its generations."""
+
+    def __init__(self) -> None:
+        self._chunk, self._heads = OpenChunk(), set[Head]()
+        self._decoded_size = 0
+
+    @property
+    def is_empty(self) -> bool:
+        return self._chunk.is_empty
+
+    @property
+    def is_large(self) -> bool:
+        return self._chunk.size > _CHUNK_BYTES or self._decoded_size > LIMITS.frames_size // 2
+
+    def add(
+        self,
+        channel: Channel,
+        schema: Schema,
+        sequence: int,
+        time_ns: int,
+        data: bytes | memoryview,
+        wall_ns: int | None = None,
+    ) -> None:
+        """Add a message; arguments as for :meth:`skinware.recording.mcap_writing.OpenChunk.add`."""
+        self._chunk.add(channel, schema, sequence, time_ns, data, wall_ns)
+
+    def add_sample(
+        self,
+        channel: Channel,
+        schema: Schema,
+        sample: Sample,
+        time_ns: int,
+        encoder: Encoder,
+        head: Head,
+        wall_ns: int | None = None,
+    ) -> None:
+        """Code a sample and add it; the first one of its channel becomes a key frame."""
+        if not self._chunk.has(channel):
+            encoder.next_is_key()
+        self._heads.add(head)
+        self._decoded_size += len(sample.slot)
+        self._chunk.add(channel, schema, sample.sequence, time_ns, encoder.encode(sample), wall_ns)
+
+    def add_head(self, head: Head) -> None:
+        self._heads.add(head)
+
+    def move_to(self, target: Target | RecordingFile) -> None:
+        """Close the chunk, add it to a target unless it is empty, and begin another."""
+        if self._chunk.is_empty:
+            return
+        chunk, heads = self._chunk.close(), self._heads
+        self._chunk, self._heads, self._decoded_size = OpenChunk(), set(), 0
+        target.add(chunk, heads)
 
 
 class Files:

@@ -25,8 +25,7 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
 from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
-from skinware.recording.files import Head, Target
-from skinware.recording.mcap_writing import OpenChunk
+from skinware.recording.files import Head, PendingChunk, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
 from skinware.transfer.codec import CodedColumn, Encoder
@@ -36,7 +35,6 @@ from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
 """A chunk is closed so long after its first message; a killed recorder loses at most that."""
-_CHUNK_BYTES = 8 << 20
 _CLOCK_NS = _REPORT_NS = NS_PER_S
 _MOST_WAITING = 128 << 20
 """Bytes of samples in memory."""
@@ -232,9 +230,7 @@ class _Coder(threading.Thread):
         self.failure: Exception | None = None
         self._target, self._jobs, self._disguise, self._renderer = target, jobs, disguise, renderer
         self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
-        self._chunk = OpenChunk()
-        self._frames_size = 0  # of the chunk, decoded
-        self._heads: set[Head] = set()
+        self._chunk = PendingChunk()
         self._abouts = 0
         self._due_ns = 0
         self._next_clock_ns = now_ns()
@@ -246,7 +242,7 @@ class _Coder(threading.Thread):
         try:
             while self._work():
                 pass
-            self._close_chunk()
+            self._chunk.move_to(self._target)
         except Exception as error:  # noqa: BLE001, Recorder.run raises it
             self.failure = error
         try:
@@ -258,9 +254,8 @@ class _Coder(threading.Thread):
         """Do one job; return False after the last."""
         if now_ns() >= self._next_clock_ns:
             self._look_around()
-        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
-        if not self._chunk.is_empty and (now_ns() >= self._due_ns or is_large):
-            self._close_chunk()
+        if now_ns() >= self._due_ns or self._chunk.is_large:
+            self._chunk.move_to(self._target)
         until_ns = self._next_clock_ns if self._chunk.is_empty else min(self._due_ns, self._next_clock_ns)
         try:
             job = self._jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
@@ -272,7 +267,6 @@ class _Coder(threading.Thread):
                     case _WireStream() as stream:
                         self._add_wire(stream, frame)
                     case _Stream() as stream:
-                        self._frames_size += len(frame.slot)
                         self._add_frame(stream, service, frame)
                 self.bytes_done += len(frame.slot)
             case _Began(service, head):
@@ -280,7 +274,7 @@ class _Coder(threading.Thread):
             case _Happened(event):
                 self._add_json(EVENTS, event)
             case _Save():
-                self._close_chunk()
+                self._chunk.move_to(self._target)
                 self._target.save()
             case _End():
                 return False
@@ -324,16 +318,14 @@ class _Coder(threading.Thread):
             about = {**wires.about, "buses": dict(zip(wires.buses, wires.about.get("buses", ()), strict=False))}
             self._abouts += 1
             channel, schema = self.channels.of_about(wires.driver)
-            self._heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
+            self._chunk.add_head(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
     def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
-        if not self._chunk.has(channel):
-            stream.encoder.next_is_key()
-        self._heads.add(stream.head)
-        self._add(channel, schema, frame.sequence, frame.published_ns, stream.encoder.encode(frame))
+        self._begin_chunk()
+        time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
+        self._chunk.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
         if self._renderer is not None and stream.generation is not None:
-            time_ns = self._axis.log_ns(frame.published_ns)
             for topic, encoding, known, data in self._renderer.messages(service, stream.generation, frame, time_ns):
                 self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
 
@@ -349,8 +341,7 @@ class _Coder(threading.Thread):
         self._add(channel, schema, 0, now_ns() if monotonic_ns is None else monotonic_ns, json.dumps(data).encode())
 
     def _add(self, channel: Channel, schema: Schema, sequence: int, monotonic_ns: int, data: bytes) -> None:
-        if self._chunk.is_empty:
-            self._due_ns = now_ns() + _CHUNK_NS
+        self._begin_chunk()
         axis = self._axis
         self._chunk.add(channel, schema, sequence, axis.log_ns(monotonic_ns), data, axis.wall_ns(monotonic_ns))
 
@@ -364,12 +355,9 @@ class _Coder(threading.Thread):
         self._add_json(CLOCK, {**clocks._asdict(), "boot": boot()}, clocks.monotonic_ns)
         self._target.check()
 
-    def _close_chunk(self) -> None:
+    def _begin_chunk(self) -> None:
         if self._chunk.is_empty:
-            return
-        chunk, heads = self._chunk.close(), self._heads
-        self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
-        self._target.add(chunk, heads)
+            self._due_ns = now_ns() + _CHUNK_NS
 
 
 def _wires_of(segment: segments.Segment) -> _WireStream | None:

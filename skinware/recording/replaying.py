@@ -6,7 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any
 
 from skinware.errors import BadRecording
@@ -24,6 +24,114 @@ _FINE_NS = 1_500_000
 """So long before a sample is due, no request is answered: that wait has a resolution of a millisecond."""
 _NEAR_S = 1.0
 _TIDY_NS = NS_PER_S // 2
+
+
+class _Tape:
+    """Moves along the moments of a recording, and publishes what was newest at each place.
+
+    Args:
+        recording: the recording.
+        names: of services; None: all.
+        ahead: decodes in the background.
+        republisher: publishes samples and events.
+        start_s, end_s: the part to publish, s since the recording began.
+
+    Attributes:
+        start_s: beginning of the part.
+        last_s: end of the part.
+        next: the moment that is due next; None: not taken yet, or the end.
+        reached_s: time of the last published moment.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        names: Collection[str] | None,
+        ahead: Executor,
+        republisher: Republisher,
+        start_s: float,
+        end_s: float,
+    ) -> None:
+        self._recording, self._republisher = recording, republisher
+        self._timeline = recording.timeline(names, ahead=ahead)
+        self._first_s = self._timeline.first_s()
+        self.start_s, self._end_s = start_s, end_s
+        self.last_s: float = min(end_s, recording.duration_s)
+        self.next: Moment | None = None
+        self.reached_s: float = start_s
+        self._jumped: set[str] = set()  # services whose next sample does not follow the published one
+
+    @property
+    def next_s(self) -> float:
+        """Time of the moment that is due next; at the end, the end."""
+        return self.last_s if self.next is None else self.next.time_s
+
+    def take_next(self) -> Moment | None:
+        """Take the moment that is due next from the timeline, if there is one before the end."""
+        if self.next is None:
+            self.next = self._timeline.next()
+            if self.next is not None and self.next.time_s >= self._end_s:
+                self._put_back()
+        return self.next
+
+    def publish_next(self) -> Moment | None:
+        """Publish the moment that is due next, and return it; None at the end."""
+        moment, self.next = self.take_next(), None
+        if moment is not None:
+            self._apply(moment)
+        return moment
+
+    def go_to(self, time_s: float) -> None:
+        self._put_back()
+        self._timeline.seek(time_s)
+        self.reached_s = time_s
+        self._show(self._timeline.services)
+
+    def step_on(self, samples: int) -> None:
+        while samples and (moment := self.publish_next()) is not None:
+            samples -= moment.frame is not None
+
+    def step_back(self, samples: int) -> None:
+        self._put_back()
+        changed: dict[str, None] = {}
+        while samples and (moment := self._timeline.back()) is not None:
+            if moment.time_s < self.start_s:
+                self._timeline.next()
+                break
+            changed[moment.service] = None
+            samples -= moment.frame is not None
+        before = self._timeline.back()
+        if before is not None:
+            self._timeline.next()
+        self.reached_s = self.start_s if before is None else max(self.start_s, before.time_s)
+        self._show(changed)
+
+    def _put_back(self) -> None:
+        if self.next is not None:
+            self._timeline.back()
+            self.next = None
+
+    def _apply(self, moment: Moment) -> None:
+        self.reached_s = moment.time_s
+        if moment.frame is None:
+            self._republisher.happened(moment.service, moment.event)
+        else:
+            follows = moment.service not in self._jumped
+            self._jumped.discard(moment.service)
+            generation = self._recording[moment.service].generation(moment.frame.generation)
+            self._republisher.publish(moment.service, moment.frame, generation, follows=follows)
+
+    def _show(self, services: Collection[str]) -> None:
+        so_far = self._timeline.so_far(services)
+        for name in services:
+            self._jumped.add(name)
+            moments = so_far.get(name, [])
+            if moments[-1].event in GONE if moments else self._first_s.get(name, 0.0) > self.reached_s + _NEAR_S:
+                self._republisher.withdraw_later(name)
+                continue
+            for moment in moments:
+                self._apply(moment._replace(time_s=self.reached_s))
+            self._jumped.add(name)
 
 
 class Replayer:
@@ -70,9 +178,6 @@ class Replayer:
         self._recording = recording
         _check_rings(recording, recording.services if names is None else names)
         self._ahead = ThreadPoolExecutor(1, "skinware replay")
-        self._timeline = recording.timeline(names, ahead=self._ahead)
-        self._first_s = self._timeline.first_s()
-        self._start_s, self._end_s = start_s, math.inf if end_s is None else end_s
         self._loops, self._paused, self._stays = loop, paused, stays
         operations = (self.replay, self.pause, self.resume, self.step, self.seek, self.speed, self.loop)
         self._republisher = Republisher(
@@ -80,11 +185,10 @@ class Replayer:
         )
         self._republisher.speed = speed
         self._republisher.pause(paused)
-        self._next: Moment | None = None
-        self._reached_s = self._from_s = start_s
-        self._from_ns = now_ns()
+        until_s = math.inf if end_s is None else end_s
+        self._tape = _Tape(recording, names, self._ahead, self._republisher, start_s, until_s)
+        self._from_s, self._from_ns = start_s, now_ns()
         self._turned = 0
-        self._jumped: set[str] = set()
         self._goes_on = False
         self._stopping = False
         self._report_ns = self._tidy_ns = 0
@@ -96,11 +200,7 @@ class Replayer:
         if self._paused:
             return self._from_s
         passed_s = self._from_s + (now_ns() - self._from_ns) / NS_PER_S * self._republisher.speed
-        return max(self._reached_s, min(passed_s, self._last_s if self._next is None else self._next.time_s))
-
-    @property
-    def _last_s(self) -> float:
-        return min(self._end_s, self._recording.duration_s)
+        return max(self._tape.reached_s, min(passed_s, self._tape.next_s))
 
     @property
     def frames(self) -> Counter[str]:
@@ -118,34 +218,31 @@ class Replayer:
             NameInUse: a running driver or service has one of the names.
             NamespaceError: the namespace cannot be used, or shared memory is full.
         """
-        if self._start_s > self._recording.duration_s:
+        if self._tape.start_s > self._recording.duration_s:
             return
         with short_turns():
             self._run(report, every_s)
 
     def _run(self, report: Callable[[], object], every_s: float) -> None:
-        self._go_to(self._start_s)
+        self._go_to(self._tape.start_s)
         if self._paused and not self.frames:  # programs that are to resume it must find its services
             self.step()
         while not self._stopping:
-            if not self._paused and self._next is None:
-                self._next = self._take_next()
-            time_s = self._last_s if self._next is None else self._next.time_s
-            due_ns = now_ns() + WAIT_SLICE_NS if self._paused else self._due_ns(time_s)
+            if not self._paused:
+                self._tape.take_next()
+            due_ns = now_ns() + WAIT_SLICE_NS if self._paused else self._due_ns(self._tape.next_s)
             if not self._wait(due_ns, report, every_s) or self._paused:
                 continue
-            if self._next is None:
+            behind_ns = now_ns() - due_ns
+            moment = self._tape.publish_next()
+            if moment is None:
                 if not self._end():
                     return
                 continue
-            behind_ns = now_ns() - due_ns
             if behind_ns > _MOST_BEHIND_NS:
                 self._from_ns += behind_ns
-            if self._next.frame is not None:
-                self.late += behind_ns > _LATE_NS
-            moment, self._next = self._next, None
+            self.late += moment.frame is not None and behind_ns > _LATE_NS
             self._goes_on = True
-            self._apply(moment)
 
     def stop(self) -> None:
         """End the replay; from any thread or signal handler."""
@@ -194,10 +291,10 @@ class Replayer:
             raise ValueError(f"frames={frames!r}: give a whole number, below 0 to go back")
         self._set_paused(True, self.time_s)
         if frames < 0:
-            self._step_back(-frames)
+            self._tape.step_back(-frames)
         else:
-            self._step_on(frames)
-        self._from_now(self._reached_s)
+            self._tape.step_on(frames)
+        self._from_now(self._tape.reached_s)
         return self.replay()
 
     def seek(self, time_s: float) -> dict[str, Any]:
@@ -207,7 +304,7 @@ class Replayer:
             time_s: since the recording began.
         """
         time_s = _number(time_s, "time_s")
-        self._go_to(min(max(time_s, self._start_s), self._last_s))
+        self._go_to(min(max(time_s, self._tape.start_s), self._tape.last_s))
         return self.replay()
 
     def speed(self, factor: float) -> dict[str, Any]:
@@ -223,6 +320,10 @@ class Replayer:
         """Switch looping on or off, and return what :meth:`replay` does."""
         self._loops = bool(on)
         return self.replay()
+
+    def _go_to(self, time_s: float) -> None:
+        self._tape.go_to(time_s)
+        self._from_now(time_s)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -254,87 +355,21 @@ class Replayer:
                 time.sleep(left_ns / NS_PER_S)
         return False
 
-    # -- publishing -----------------------------------------------------------------------------------------------
-
-    def _take_next(self) -> Moment | None:
-        """Pass the next moment and return it; None at the end."""
-        moment = self._timeline.next()
-        if moment is not None and moment.time_s >= self._end_s:
-            self._timeline.back()
-            return None
-        return moment
-
     def _end(self) -> bool:
         """Loop or pause at the end; return False if the replay is over."""
         if self._loops and self._goes_on:
             self._goes_on = False
-            self._go_to(self._start_s)
+            self._go_to(self._tape.start_s)
         elif self._stays:
-            self._set_paused(True, self._last_s)
+            self._set_paused(True, self._tape.last_s)
         else:
             return False
         return True
-
-    def _apply(self, moment: Moment) -> None:
-        self._reached_s = moment.time_s
-        if moment.frame is None:
-            self._republisher.happened(moment.service, moment.event)
-        else:
-            follows = moment.service not in self._jumped
-            self._jumped.discard(moment.service)
-            generation = self._recording[moment.service].generation(moment.frame.generation)
-            self._republisher.publish(moment.service, moment.frame, generation, follows=follows)
 
     def _set_paused(self, paused: bool, time_s: float) -> None:
         self._paused = paused
         self._republisher.pause(paused)
         self._from_now(time_s)
-
-    def _put_back(self) -> None:
-        """Return the pending moment to the timeline."""
-        if self._next is not None:
-            self._timeline.back()
-            self._next = None
-
-    def _go_to(self, time_s: float) -> None:
-        self._put_back()
-        self._timeline.seek(time_s)
-        self._reached_s = time_s
-        self._show(self._timeline.services)
-        self._from_now(time_s)
-
-    def _step_on(self, frames: int) -> None:
-        while frames and (moment := self._take_next() if self._next is None else self._next) is not None:
-            self._next = None
-            self._apply(moment)
-            frames -= moment.frame is not None
-
-    def _step_back(self, frames: int) -> None:
-        self._put_back()
-        changed: dict[str, None] = {}
-        while frames and (moment := self._timeline.back()) is not None:
-            if moment.time_s < self._start_s:
-                self._timeline.next()
-                break
-            changed[moment.service] = None
-            frames -= moment.frame is not None
-        before = self._timeline.back()
-        if before is not None:
-            self._timeline.next()
-        self._reached_s = self._start_s if before is None else max(self._start_s, before.time_s)
-        self._show(changed)
-
-    def _show(self, services: Collection[str]) -> None:
-        so_far = self._timeline.so_far(services)
-        for name in services:
-            self._jumped.add(name)
-            moments = so_far.get(name, [])
-            if moments[-1].event in GONE if moments else self._first_s.get(name, 0.0) > self._reached_s + _NEAR_S:
-                self._republisher.withdraw_later(name)
-                continue
-            for moment in moments:
-                self._apply(moment._replace(time_s=self._reached_s))
-            self._jumped.add(name)
 
 
 def _check_rings(recording: Recording, names: Collection[str]) -> None:

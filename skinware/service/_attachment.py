@@ -10,7 +10,7 @@ import numpy.typing as npt
 from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, RequestRefused, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring import ACQUIRED, PUBLISHED, Sample, SampleT
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
@@ -93,18 +93,18 @@ class Attachment(Generic[SampleT]):
         return self._ring.missed_periods
 
     def rate_hz(self) -> float | None:
-        """Return how often the writer publishes, from the times of the frames that the ring holds.
+        """Return how often the writer publishes, from the times of the samples that the ring holds.
 
-        None where they are too few: after its start a writer may publish two frames at once and then wait.
+        None where they are too few: after its start a writer may publish two samples at once and then wait.
         A writer that was held up publishes what has waited at once; then the times of the data count.
         """
-        times = self._ring.publication_times_ns()
+        times = [time_ns for _, time_ns in self._ring.times_ns(PUBLISHED)]
         span_ns = times[-1] - times[0] if times else 0
         is_full = len(times) >= self._ring.slot_count - 1  # the writer may be filling the last one
         if not span_ns or (span_ns < _TELLING_SPAN_NS and not is_full):
             return None
         rate_hz = (len(times) - 1) * NS_PER_S / span_ns
-        acquired_ns = [time_ns for _, time_ns in self._ring.acquisition_times_ns()]
+        acquired_ns = [time_ns for _, time_ns in self._ring.times_ns(ACQUIRED)]
         intervals_ns = sorted(after - before for before, after in pairwise(acquired_ns))
         usual_ns = intervals_ns[len(intervals_ns) // 2] if intervals_ns else 0
         if span_ns < _TELLING_SPAN_NS and rate_hz * usual_ns > _HASTE * NS_PER_S:
@@ -162,7 +162,7 @@ class Attachment(Generic[SampleT]):
         return RingReader(segment, self.frame_class, self._describe(segment))
 
     def _describe(self, _attached: segments.Segment) -> object:
-        """Return the ``context`` of frames (a subclass reads its structure here); kept while the columns are equal."""
+        """Return the ``context`` of samples (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
     def _attach_within(self, timeout_s: float | None) -> RingReader[SampleT]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy.typing as npt
 
 from skinware.errors import Closed, NameInUse, NamespaceError
-from skinware.memory import file_layout, segments
+from skinware.memory import file_layout, name_lock, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring_writer import RingWriter
@@ -25,7 +25,7 @@ log = logging.getLogger("skinware.service")
 _FILE_CHECK_NS = NS_PER_S
 
 Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
-"""Every array of a frame, by name: dtype and length, dtype and shape, or a :class:`Column`."""
+"""Every array of a sample, by name: dtype and length, dtype and shape, or a :class:`Column`."""
 
 
 class Ownership:
@@ -37,7 +37,7 @@ class Ownership:
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.
-        published_before: frames that were published under the name before; None: the count in the files.
+        published_before: samples that were published under the name before; None: the count in the files.
 
     Raises:
         NameInUse: a running writer has this name.
@@ -71,12 +71,12 @@ class Ownership:
         self._next_file_check_ns = 0
         self._file_trouble = ""
         self.namespace.create(group)
-        self._name_lock = segments.take_name(self.namespace, name)
+        self._name_lock = name_lock.take_name(self.namespace, name)
         try:
             sweep(self.namespace)
             previous = segments.previous(self.namespace, name)
             if published_before is None:
-                published_before = segments.published_so_far(self._name_lock, previous)
+                published_before = name_lock.published_so_far(self._name_lock, previous)
             self._begin_generation(schema, static, period_ns, previous, published_before)
         except BaseException:
             self._name_lock.close()
@@ -88,7 +88,7 @@ class Ownership:
 
     @property
     def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
+        """Sequence of the newest sample, 0 before the first."""
         return self._ring.sequence
 
     @property
@@ -176,7 +176,7 @@ class Ownership:
             return
         with self._changing:
             segment = self._ring.segment
-            segments.note_published(self._name_lock, segment.published)
+            name_lock.note_published(self._name_lock, segment.published)
             path = self.namespace.ring_path(self.name)
             if segments.current_inode(path) == segment.inode:
                 path.unlink()
@@ -258,12 +258,12 @@ class Ownership:
         if os.fstat(self._name_lock.fd).st_nlink == 0:
             self.namespace.create(self._group)
             try:
-                name_lock = segments.take_name(self.namespace, self.name)
+                taken = name_lock.take_name(self.namespace, self.name)
             except NameInUse:
                 self.close()
                 raise
             self._name_lock.close()
-            self._name_lock = name_lock
+            self._name_lock = taken
         if os.fstat(self._ring.segment.descriptor.fd).st_nlink == 0:
             self._succeed(self._ring.segment.schema, self._static)
         if self._server is not None:

@@ -10,7 +10,7 @@ from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Sample, SampleT
+from skinware.memory.ring import ACQUIRED, Sample, SampleT
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.take import NEWER, NEXT
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
@@ -24,8 +24,8 @@ _ENDLESS_NS = 1 << 61
 class ServiceReader(Taking[SampleT]):
     """Reads one service, and attaches again by itself when the writer comes back.
 
-    Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
-    slow loses frames (``lost`` counts them exactly, over restarts too) and never disturbs the writer or other readers.
+    Not for several threads at once; make one per thread. Samples of one generation come in order; a reader that is
+    slow loses samples (``lost`` counts them exactly, over restarts too) and never disturbs the writer or other readers.
 
     Args:
         name: the service.
@@ -51,9 +51,9 @@ class ServiceReader(Taking[SampleT]):
 
     @property
     def lost(self) -> int:
-        """Frames that were published since the first one that was taken, and that were not taken.
+        """Samples that were published since the first one that was taken, and that were not taken.
 
-        Those of generations that came and went meanwhile are counted too: each file has the number of frames that
+        Those of generations that came and went meanwhile are counted too: each file has the number of samples that
         were published under the name before it. It is unknown only if the namespace's files were removed in between.
         """
         self._settle()
@@ -61,18 +61,18 @@ class ServiceReader(Taking[SampleT]):
 
     @property
     def statistics(self) -> ReaderRecord:
-        """Frames, losses and times that this reader has counted so far; ``skin-info`` shows them."""
+        """Samples, losses and times that this reader has counted so far; ``skin-info`` shows them."""
         self._settle()
         return self._accounts.record
 
     @property
     def latest(self) -> Position | None:
-        """Position of the newest frame of the generation at hand, None before the first."""
+        """Position of the newest sample of the generation at hand, None before the first."""
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
 
     def refresh(self) -> Position | None:
-        """Go over to a newer generation if there is one; position of the newest frame then.
+        """Go over to a newer generation if there is one; position of the newest sample then.
 
         Reading does so by itself. If the newer one has another structure, ``structure_changed`` says so.
 
@@ -91,17 +91,17 @@ class ServiceReader(Taking[SampleT]):
         max_age_s: float | None = None,
         timeout_s: float | None = 5.0,
     ) -> SampleT:
-        """Return the newest frame, as a private copy.
+        """Return the newest sample, as a private copy.
 
         Args:
-            newer_than: wait for a frame that is newer than this one; any frame of a later generation is.
+            newer_than: wait for a sample that is newer than this one; any sample of a later generation is.
                 Default: take what is there, wait only if nothing was published yet.
-            max_age_s: wait for a frame whose newest data (``acquired_ns``) is at most this old when it is handed out;
+            max_age_s: wait for a sample whose newest data (``acquired_ns``) is at most this old when it is handed out;
                 default: of any age.
             timeout_s: longest wait; None for no limit.
 
         Raises:
-            ServiceTimeout: no such frame came in time; the message says whether the writer lives.
+            ServiceTimeout: no such sample came in time; the message says whether the writer lives.
             StructureChanged: the service came back with another structure, or as something that cannot be read; only
                 when waiting for newer.
             Overrun: the writer is too fast for this number of slots.
@@ -115,7 +115,7 @@ class ServiceReader(Taking[SampleT]):
 
     @contextlib.contextmanager
     def view(self) -> Iterator[SampleT]:
-        """The newest frame in place, with no copy, for as long as the block lasts.
+        """The newest sample in place, with no copy, for as long as the block lasts.
 
         The writer may overwrite it meanwhile: ``frame.valid`` says whether it still is whole, and the end of the block
         asks once more. Use the results of the block only if that did not raise.
@@ -124,11 +124,11 @@ class ServiceReader(Taking[SampleT]):
 
         Raises:
             ServiceTimeout: nothing was published yet.
-            Overrun: the frame was overwritten before the end of the block.
+            Overrun: the sample was overwritten before the end of the block.
             Closed: as ``read``.
         """
         alive = self._keep_up()  # which may replace the ring
-        frame = self._checked(self._whole(self._ring.view), alive)
+        frame = self._whole(self._ring.view, alive)
         try:
             yield frame
         finally:
@@ -139,21 +139,21 @@ class ServiceReader(Taking[SampleT]):
         if not valid:
             self._accounts.record.overruns += 1
             raise Overrun(
-                f"frame {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
+                f"sample {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
                 " with read(), or give the service more slots"
             )
 
     def frames(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
     ) -> Iterator[SampleT]:
-        """Newest frames, without end.
+        """Newest samples, without end.
 
         Args:
             rate_hz: None: each time the writer publishes (ASAP). A rate: at the deadlines of that rate, whatever
-                is newest then; the same frame comes again if there is no newer one. Without a rate, other threads of
+                is newest then; the same sample comes again if there is no newer one. Without a rate, other threads of
                 this process keep the interpreter for 0.1 ms at the most, for as long as the loop lives.
             max_age_s: what is older is not handed out but waited for, as by ``read``; default: any age.
-            timeout_s: longest wait for a frame; None for no limit. At a rate there is one to be had without a wait,
+            timeout_s: longest wait for a sample; None for no limit. At a rate there is one to be had without a wait,
                 unless nothing was published yet or all is older than ``max_age_s``.
 
         Raises:
@@ -179,9 +179,9 @@ class ServiceReader(Taking[SampleT]):
         return self.frames()
 
     def in_order(self, *, timeout_s: float | None = None) -> Iterator[SampleT]:
-        """Every frame, one after the other, as long as this program keeps up within the ring's slots.
+        """Every sample, one after the other, as long as this program keeps up within the ring's slots.
 
-        For recorders and tests; a control loop wants the newest (``frames``). Frames that were overwritten before
+        For recorders and tests; a control loop wants the newest (``frames``). Samples that were overwritten before
         their turn are counted in ``lost``. As long as the loop lives, other threads of this process keep the
         interpreter for 0.1 ms at the most.
 
@@ -195,7 +195,7 @@ class ServiceReader(Taking[SampleT]):
                 yield self._take_turn(NEXT, timeout_ns)
 
     def request(self, *, timeout_s: float = 5.0) -> SampleT:
-        """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
+        """Ask the writer for a sample, and wait for it: its acquisition begins after the writer heard of it.
 
         Raises:
             RequestTimeout: no answer in time.
@@ -224,7 +224,7 @@ class ServiceReader(Taking[SampleT]):
         self._closed = True
 
     def close(self) -> None:
-        """Stop reading and take the announcement back. Frames that were handed out stay readable. Idempotent."""
+        """Stop reading and take the announcement back. Samples that were handed out stay readable. Idempotent."""
         self._closed = True
         self._accounts.close()
         self._client.close()
@@ -264,11 +264,6 @@ class Tap(ServiceReader[SampleT]):
         return self._ring.segment.head
 
     @property
-    def inode(self) -> tuple[int, int]:
-        """Device and number of the file that is being read."""
-        return self._ring.segment.inode
-
-    @property
     def period_ns(self) -> int:
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
@@ -297,14 +292,14 @@ class Tap(ServiceReader[SampleT]):
         """Read in order from now on.
 
         Args:
-            with_first: begin with the first frame of the generation at hand, otherwise with the one that is its newest
+            with_first: begin with the first sample of the generation at hand, otherwise with the one that is its newest
                 now. Samples that are overwritten before they are taken are lost.
         """
         self._accounts.begin_loop("in order")
         self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
 
     def next_in_order(self) -> SampleT | None:
-        """Return the frame after the last one taken, over generations; None if it is not there yet. Never wait.
+        """Return the sample after the last one taken, over generations; None if it is not there yet. Never wait.
 
         Raises:
             StructureChanged, Overrun, Closed: as ``in_order``.
@@ -315,7 +310,7 @@ class Tap(ServiceReader[SampleT]):
             return None
 
     def newest(self) -> SampleT:
-        """Return a copy of the newest frame of the generation at hand.
+        """Return a copy of the newest sample of the generation at hand.
 
         Raises:
             ServiceTimeout: nothing was published yet.
@@ -324,7 +319,7 @@ class Tap(ServiceReader[SampleT]):
         return self._newest_now(self._ring.copy, True)
 
     def newest_acquired_ns(self) -> int:
-        """``acquired_ns`` of the newest frame.
+        """``acquired_ns`` of the newest sample.
 
         Raises:
             Overrun: it was overwritten meanwhile, or nothing was published yet.
@@ -332,7 +327,7 @@ class Tap(ServiceReader[SampleT]):
         return self._acquisitions()[-1][1]
 
     def nearest(self, time_ns: int) -> SampleT:
-        """Return a copy of the frame in the ring whose ``acquired_ns`` is nearest to a time.
+        """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time.
 
         Raises:
             Overrun: it was overwritten meanwhile, or nothing was published yet.
@@ -340,7 +335,7 @@ class Tap(ServiceReader[SampleT]):
         sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
         frame = self._ring.copy(sequence)
         if frame is None:
-            raise Overrun(f"service {self.name!r}: frame {sequence} was overwritten before it was copied")
+            raise Overrun(f"service {self.name!r}: sample {sequence} was overwritten before it was copied")
         before = self._last
         taken = self._newest_now(lambda: frame, True)
         if before is not None and before > taken.position:  # it came before, and is not lost again
@@ -348,7 +343,7 @@ class Tap(ServiceReader[SampleT]):
         return taken
 
     def _acquisitions(self) -> list[tuple[int, int]]:
-        times = self._ring.acquisition_times_ns()
+        times = self._ring.times_ns(ACQUIRED)
         if not times:
-            raise Overrun(f"service {self.name!r}: no frame could be read")
+            raise Overrun(f"service {self.name!r}: no sample could be read")
         return times

@@ -7,7 +7,7 @@ import os
 import select
 import socket
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,7 +77,7 @@ class Request:
 
         Args:
             result: anything that JSON can hold.
-            position: (generation, sequence) of the frame that goes with it.
+            position: (generation, sequence) of the sample that goes with it.
         """
         try:
             encoded = msgspec.json.encode(result)
@@ -345,15 +345,12 @@ def _user_of(peer: socket.socket) -> int:
     return user
 
 
-class short_path:  # noqa: N801
-    """A name for a path that fits into a socket address, whose 107 bytes are soon full: by way of its open folder."""
-
-    def __init__(self, path: os.PathLike[str]) -> None:
-        folder, self._name = os.path.split(os.fspath(path))
-        self._fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-
-    def __enter__(self) -> str:
-        return f"/proc/self/fd/{self._fd}/{self._name}"
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._fd)
+@contextlib.contextmanager
+def short_path(path: os.PathLike[str]) -> Iterator[str]:
+    """Return a name for a path that fits into a socket address, whose 107 bytes are soon full: by its open folder."""
+    folder, name = os.path.split(os.fspath(path))
+    fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{fd}/{name}"
+    finally:
+        os.close(fd)

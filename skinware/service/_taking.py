@@ -1,4 +1,4 @@
-"""Take the frames of a service: wait for them, and count them and those that were lost."""
+"""Take the samples of a service: wait for them, and count them and those that were lost."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from skinware.service._attachment import GENERATION_ENDED, Attachment
 _ANNOUNCE_EVERY_NS = NS_PER_S // 4
 
 Position = tuple[int, int]
-"""(generation, sequence) of a frame."""
+"""(generation, sequence) of a sample."""
 
 
 class Accounts:
     """Counts at the moments at which a reader is in no hurry: it notes times before it sleeps, and adds them up later.
 
-    With more readers than processors, what one does before it sleeps makes the next one's frame older.
+    With more readers than processors, what one does before it sleeps makes the next one's sample older.
 
     Args:
         namespace, service: what is read.
-        announce: let others see it, from its first frame or wait on.
+        announce: let others see it, from its first sample or wait on.
     """
 
     def __init__(self, namespace: Namespace, service: str, announce: bool) -> None:
@@ -106,7 +106,7 @@ class Accounts:
 
 
 class Taking(Attachment[SampleT]):
-    """Takes the frames of a service: the newest, or one after the other.
+    """Takes the samples of a service: the newest, or one after the other.
 
     Args:
         name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
@@ -148,10 +148,11 @@ class Taking(Attachment[SampleT]):
 
     def _read_in_order(self, deadline_ns: int) -> SampleT:
         self._require_open()
-        if self._lags():
-            self._end_turn()
-            return self._taken(self._whole(self._next_in_order), self.alive)
-        return self._next_frame(self._last, deadline_ns, in_order=True)
+        last = self._last
+        if last is not None and last < (self._ring.generation, self._ring.latest):
+            self._end_turn()  # the generation at hand has newer samples, though there may be another one already
+            return self._taken(self._next_in_order, self.alive)
+        return self._next_frame(last, deadline_ns, in_order=True)
 
     def _next_frame(
         self,
@@ -161,7 +162,7 @@ class Taking(Attachment[SampleT]):
         in_order: bool = False,
         max_age_s: float | None = None,
     ) -> SampleT:
-        """Wait for a frame that is newer than ``known``: the newest, or the next in order.
+        """Wait for a sample that is newer than ``known``: the newest, or the next in order.
 
         One that is slept for was published within the last slice, when its writer lived.
         """
@@ -179,7 +180,7 @@ class Taking(Attachment[SampleT]):
             latest = ring.latest
             if latest and (known is None or (ring.generation, latest) > known):
                 take = self._next_in_order if in_order else ring.copy
-                return self._taken(self._whole(take), slept or self.alive)
+                return self._taken(take, slept or self.alive)
             if self._moved:
                 raise self._structure_changed()
             remaining_ns = deadline_ns - now_ns()
@@ -196,19 +197,14 @@ class Taking(Attachment[SampleT]):
         )
 
     def _why_nothing_came(self, max_age_s: float | None) -> str:
-        wanted = "newer frame" if max_age_s is None else f"frame younger than {max_age_s:g} s"
+        wanted = "newer sample" if max_age_s is None else f"sample younger than {max_age_s:g} s"
         if not self.alive:
             return f"no {wanted} of {self.name!r}: its writer is dead or was stopped; start it again"
         if self.paused:
             return f"no {wanted} of {self.name!r}: its writer is paused"
         if not self._ring.latest:
-            return f"no frame of {self.name!r} yet: its writer is running, but has published nothing so far"
+            return f"no sample of {self.name!r} yet: its writer is running, but has published nothing so far"
         return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
-
-    def _lags(self) -> bool:
-        """Return whether the generation at hand has newer frames, though there may be another one already."""
-        last = self._last
-        return last is not None and last < (self._ring.generation, self._ring.latest)
 
     def _next_in_order(self) -> SampleT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
@@ -230,27 +226,25 @@ class Taking(Attachment[SampleT]):
         )
 
     def _newest_now(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
-        """Return the newest frame without a wait, so that this is the moment to count it."""
-        frame = self._taken(self._whole(take), alive)
+        """Return the newest sample without a wait, so that this is the moment to count it."""
+        frame = self._taken(take, alive)
         self._end_turn()
         return frame
 
-    def _whole(self, take: Callable[[], SampleT | None]) -> SampleT | None:
+    def _whole(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
         try:
-            return take()
+            frame = take()
         except Overrun:
             self._accounts.record.overruns += 1
             raise
-
-    def _taken(self, frame: SampleT | None, alive: bool) -> SampleT:
-        frame = self._checked(frame, alive)
-        self._count(frame)
-        return frame
-
-    def _checked(self, frame: SampleT | None, alive: bool) -> SampleT:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
         frame.stale = not alive
+        return frame
+
+    def _taken(self, take: Callable[[], SampleT | None], alive: bool) -> SampleT:
+        frame = self._whole(take, alive)
+        self._count(frame)
         return frame
 
     @property
@@ -266,15 +260,15 @@ class Taking(Attachment[SampleT]):
     def _take_turn(
         self, wanted: int, timeout_ns: int, max_age_s: float | None = None, newer_than: Position | None = None
     ) -> SampleT:
-        """Return the next frame after ``newer_than`` (default: the last one taken).
+        """Return the next sample after ``newer_than`` (default: the last one taken).
 
-        C takes it, as long as nothing but frames happens since the last one.
+        C takes it, as long as nothing but samples happens since the last one.
 
         Args:
             wanted: ``NEWER`` for the newest, or ``NEXT``.
             timeout_ns: longest wait.
             max_age_s: as for ``read``.
-            newer_than: position of a frame.
+            newer_than: position of a sample.
         """
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:
@@ -293,7 +287,7 @@ class Taking(Attachment[SampleT]):
         return frame
 
     def _leave_to_c(self) -> None:
-        """Leave the next turns to C until something else happens than frames."""
+        """Leave the next turns to C until something else happens than samples."""
         if self._last_taken is not None:
             self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
             self._turns_in_c, self._open_turn = True, None
@@ -305,7 +299,7 @@ class Taking(Attachment[SampleT]):
             self._turns_in_c = False
 
     def _settle(self) -> None:
-        """Count the frames that were taken in C since the last time."""
+        """Count the samples that were taken in C since the last time."""
         turns = self._ring.settle_turns() if self._turns_in_c else None
         if turns is not None:
             self._last_taken = self._ring.generation, turns.last

@@ -28,14 +28,14 @@ class Writer(Ownership):
     def begin(
         self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
     ) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of the next frame, to be filled in place; then ``commit``.
+        """Arrays of the next sample, to be filled in place; then ``commit``.
 
         Args:
-            from_last: begin with the contents of the newest frame, to change parts of it only; otherwise the arrays
+            from_last: begin with the contents of the newest sample, to change parts of it only; otherwise the arrays
                 hold something old.
-            skip: sequences before this frame that are left out, for who passes frames on of which some did not arrive:
-                readers count them as lost. It may become one more: the newest frame stays readable meanwhile.
-            contents: a slot of a service with the same columns (``Frame.slot``), to begin with.
+            skip: sequences before this sample that are left out, where a program passes samples on and some did not
+                arrive: readers count them as lost. It may become one more: the newest sample stays readable meanwhile.
+            contents: a slot of a service with the same columns (``Sample.slot``), to begin with.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -49,18 +49,18 @@ class Writer(Ownership):
         return self._ring.begin(from_last=from_last, skip=skip, contents=contents)
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
-        """Publish the frame: one system call wakes every reader.
+        """Publish the sample: one system call wakes every reader.
 
-        If it raises, readers have the frame before, and ``commit`` or ``begin`` may be called again.
+        If it raises, readers have the sample before, and ``commit`` or ``begin`` may be called again.
 
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
                 machine booted) it counts as 0, and is counted in the statistics (``before_boot``). More than 0.2 s in
-                the future it stays as it is, and is counted there (``ahead``): nothing in such a frame is fresh.
+                the future it stays as it is, and is counted there (``ahead``): nothing in such a sample is fresh.
             flags: bits for the service's own use.
 
         Returns:
-            The frame's sequence.
+            The sample's sequence.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -71,7 +71,7 @@ class Writer(Ownership):
         return self._ring.commit(acquired_ns, flags)
 
     def periodic(self, rate_hz: float, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
-        """Yield the arrays of one frame per period, at absolute deadlines; publish when the loop comes back.
+        """Yield the arrays of one sample per period, at absolute deadlines; publish when the loop comes back.
 
         A loop body that takes too long misses periods (``missed_periods``); they are never made up for. While paused
         nothing is yielded. Requests are carried out between two periods.
@@ -94,9 +94,9 @@ class Writer(Ownership):
                 yield from self._one_frame(waiting, from_last)
 
     def on_request(self, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
-        """Yield the arrays of one frame whenever a program asks for one; publish when the loop comes back.
+        """Yield the arrays of one sample whenever a program asks for one; publish when the loop comes back.
 
-        Several requests that wait at the same time are answered with the same frame.
+        Several requests that wait at the same time are answered with the same sample.
 
         Args:
             from_last: as for ``begin``.
@@ -110,7 +110,7 @@ class Writer(Ownership):
     def requests(self, timeout_s: float = 0.0) -> list[Request]:
         """Return the requests of programs, for writers with a loop of their own; each needs ``reply`` or ``fail``.
 
-        ``acquire`` asks for a frame whose acquisition begins now or later: publish it, then reply with
+        ``acquire`` asks for a sample whose acquisition begins now or later: publish it, then reply with
         ``position=writer.position``. The first call makes the socket (:meth:`request_server`).
 
         Args:
@@ -136,7 +136,7 @@ class Writer(Ownership):
             timeout_s: longest wait for the first request.
 
         Returns:
-            Those that ask for a frame (``acquire``), for a ``reply`` as in :meth:`requests`; none while paused.
+            Those that ask for a sample (``acquire``), for a ``reply`` as in :meth:`requests`; none while paused.
 
         Raises:
             Closed, NamespaceError, NameInUse: as for :meth:`requests`.
@@ -175,7 +175,7 @@ class Writer(Ownership):
                 raise
 
     def _one_frame(self, waiting: list[Request], from_last: bool) -> Iterator[dict[str, npt.NDArray[Any]]]:
-        """Yield a frame of a loop, which may be paused or closed from another thread at any moment."""
+        """Yield a sample of a loop, which may be paused or closed from another thread at any moment."""
         acquired_ns = now_ns()
         try:
             columns = self.begin(from_last=from_last)
@@ -224,19 +224,19 @@ class ServiceWriter(Writer):
 
     Args:
         name: unique in the namespace, 1 to 47 letters, digits, ``_`` or ``-``.
-        columns: the arrays of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
+        columns: the arrays of a sample, by name: (dtype, length or shape), or a :class:`Column` that also has a
             unit and a description. A dtype may be a structure.
-        static: arrays that are written once, for readers, besides the frames.
+        static: arrays that are written once, for readers, besides the samples.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         kind: of the service (``data``, ``driver``).
-        slots: frames that the ring holds, 2 to 64; default: those of a second at ``rate_hz``, but at least 8, at most
+        slots: samples that the ring holds, 2 to 64; default: those of a second at ``rate_hz``, but at least 8, at most
             64, and not more than 16 MiB; 8 where there is no rate.
         rate_hz: nominal rate, for readers; None for no fixed rate.
         group: group whose members may read; an existing namespace must have the same.
         description: of the service, for people.
-        operations: what programs may ask for besides a frame: name to function, called in the writer's own loop
+        operations: what programs may ask for besides a sample: name to function, called in the writer's own loop
             (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
-        published_before: frames that were published under this name before, for a program that passes frames on
+        published_before: samples that were published under this name before, for a program that passes samples on
             and counts as their origin does; None: the count in the files of the name.
 
     Raises:

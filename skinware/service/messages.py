@@ -13,7 +13,7 @@ _DECODING_ERRORS = (msgspec.MsgspecError, ValueError, RecursionError)
 ENCODING_ERRORS = (TypeError, ValueError, OverflowError, RecursionError)
 """Errors of encoding: no JSON type, half a surrogate pair, a number or a nesting without an end."""
 ACQUIRE = "acquire"
-"""Operation of every service: publish a frame whose acquisition begins after the request was received."""
+"""Operation of every service: publish a sample whose acquisition begins after the request was received."""
 OPERATIONS = "operations"
 """Operation of every service: the operations that it declares, by name, with a description each."""
 CANCEL = "cancel"
@@ -44,7 +44,7 @@ class Answer(msgspec.Struct):
 
     Attributes:
         id: of the request.
-        generation, sequence: a frame that was published after the request was carried out; 0: none was.
+        generation, sequence: a sample that was published after the request was carried out; 0: none was.
         result: what the operation returned.
         error: what went wrong, None if nothing did.
         why: kind of error.

@@ -101,13 +101,7 @@ class CalmedDriver:
         self._unknown: list[str] = []
 
     def follow(self, structure: Structure, source: DriverReader, rate_hz: float | None) -> None:
-        """Go on with another structure.
-
-        Args:
-            structure: structure of the calmed driver.
-            source: reader of the driver, for its counters and columns.
-            rate_hz: nominal rate of the driver.
-        """
+        """Go on with another structure; the reader of the driver knows its counters and columns."""
         static = source.static()
         names = [f"{what}_counter_name" for what in ("bus", "patch")]
         counters = [[bytes(one).decode() for one in static[name].tolist()] if name in static else [] for name in names]

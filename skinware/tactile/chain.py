@@ -78,9 +78,11 @@ class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_fie
         """
         name, unit = taxels.type.name, taxels.type.unit
         if name.startswith(_RESTLESS):
-            raise ConfigurationError(f"a {name} has no rest that it goes back to when nothing touches")
+            raise ConfigurationError(f"a {name} has no rest to return to")
         if name == "proximity" and unit == "m":
-            raise ConfigurationError("a proximity in m falls when something comes near; a baseline is for what rises")
+            raise ConfigurationError(
+                "a proximity in m falls when something comes near; baselines are for rising values"
+            )
         given = {field: getattr(self, field) for field in BaselineSettings.__struct_fields__}
         return BaselineStage(taxels, BaselineSettings(**given))
 

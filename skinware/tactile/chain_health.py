@@ -45,11 +45,7 @@ class ChainHealth:
         return bool(self._watched)
 
     def update(self, time_ns: int) -> None:
-        """Take in what the chain made of the next frame.
-
-        Args:
-            time_ns: of the frame, as for the baselines.
-        """
+        """Take in what the chain made of the frame of this time."""
         for stage, health in self._watched.values():
             if stage.calm is not None:
                 health.update(time_ns, stage.given, stage.calm)

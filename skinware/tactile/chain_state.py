@@ -26,11 +26,7 @@ _SAVE_EVERY_NS = 20 * NS_PER_S
 
 
 def save_state(path: Path, state: ChainState) -> None:
-    """Write a state.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a state; raises OSError if that fails."""
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {f"{kind}/{name}": array for kind, named in state.arrays.items() for name, array in named.items()}
     arrays |= {f"{_HEALTH}{kind}/{name}": array for kind, of in state.health.items() for name, array in of.items()}
@@ -96,11 +92,11 @@ class LearnedState:
     def restore(self, chain: Chain, state: ChainState | None = None) -> int:
         """Let a new chain, which its health follows already, go on with what was learned.
 
-        A state that does not fit costs what was learned, and a line in the log says why.
+        A state that does not fit is not used, and a line in the log says why.
 
         Args:
             chain: a new one.
-            state: what was learned; None: what the file has, if it is of the same sensors.
+            state: the state; None: the state in the file, if it is of the same sensors.
 
         Returns:
             The number of sensors that have their baselines again.
@@ -116,7 +112,7 @@ class LearnedState:
         except ConfigurationError as error:
             why = f"{self._path}: {error}"
         if why:
-            log.warning("what was learned is lost: %s", why)
+            log.warning("the learned state does not fit: %s", why)
         return restored
 
     def keep(self, chain: Chain | None) -> None:
@@ -147,7 +143,7 @@ class LearnedState:
             try:
                 save_state(path, state)
             except OSError as error:
-                log.warning("what was learned cannot be kept: %s: %s", path, error.strerror or error)
+                log.warning("the learned state cannot be kept: %s: %s", path, error.strerror or error)
 
         self._saving = threading.Thread(target=save, name="calm-state")
         self._saving.start()

@@ -73,12 +73,7 @@ class DerivedService(ABC, Generic[WriterT]):
         return "" if self._writer is None else self._writer.name
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
-        """Go on with another chain, of other sensors.
-
-        Args:
-            chain: the chain whose values come from now on.
-            rate_hz: nominal rate of the driver.
-        """
+        """Go on with another chain, of other sensors, at the nominal rate of the driver."""
         try:
             self._follow(chain, rate_hz)
         except (ConfigurationError, NameInUse) as error:  # places without neighbours; a name of another program
@@ -94,12 +89,7 @@ class DerivedService(ABC, Generic[WriterT]):
         self._writer = None
 
     def _open(self, make: Callable[[str], WriterT]) -> None:
-        """Make the writer, under the first name that is free.
-
-        Raises:
-            NameInUse: other programs have both names.
-            ConfigurationError: the longer name is too long.
-        """
+        """Make the writer, under the first name that is free; raises NameInUse if none is."""
         try:
             self._writer = make(self._name)
         except NameInUse:
@@ -112,10 +102,6 @@ class DerivedService(ABC, Generic[WriterT]):
 
 class CalmContacts(DerivedService[ContactsWriter]):
     """The contacts of one calmed driver, found in its pressure sensors, or else in others that a touch only raises.
-
-    Args:
-        name, driver, into, group: as for :class:`DerivedService`.
-        watched: regions whose motion is published beside it; None: none.
 
     Attributes:
         motion: the service of motion; None: there are no regions.
@@ -195,10 +181,6 @@ class CalmContacts(DerivedService[ContactsWriter]):
 class CalmMotion(DerivedService[MotionWriter]):
     """The motion of the regions of one calmed driver.
 
-    Args:
-        name, driver, into, group: as for :class:`DerivedService`.
-        regions: the regions.
-
     Attributes:
         contacts: the service of the contacts that move; None: there is none.
         type_name: sensor type of these contacts.
@@ -237,9 +219,6 @@ class CalmMotion(DerivedService[MotionWriter]):
 class CalmHealth(DerivedService[HealthWriter]):
     """The health of one calmed driver, for all types that have a baseline and that a touch only raises.
 
-    Args:
-        name, driver, into, group: as for :class:`DerivedService`.
-
     Attributes:
         faulty: number of sensors with a fault.
     """
@@ -269,11 +248,7 @@ class CalmHealth(DerivedService[HealthWriter]):
         return {} if self._health is None else self._health.state()
 
     def restore(self, state: ChainState) -> None:
-        """Go on with what was known of the sensors of this chain, if its baselines saw the same values then.
-
-        Raises:
-            ConfigurationError: that is no such state.
-        """
+        """Go on with what was known of the sensors of this chain; as :meth:`.ChainHealth.restore`."""
         if self._health is not None:
             self._health.restore(state)
 

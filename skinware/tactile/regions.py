@@ -152,7 +152,7 @@ def _in_turn(regions: Sequence[Region], places: Sequence[str]) -> list[Region]:
     except graphlib.CycleError as error:
         circle = error.args[1]
         names = " in ".join(map(repr, circle))
-        raise ConfigurationError(f"{place_of[circle[-1]]}a region that is in itself: {names}") from None
+        raise ConfigurationError(f"{place_of[circle[-1]]}a region is in itself: {names}") from None
 
 
 def _members(skin: SkinLayout | Structure, type_name: str, regions: Iterable[Region]) -> dict[str, Flags]:

@@ -89,6 +89,10 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 f"boards {', '.join(map(str, options.boards))}: the configuration leaves all triangles switched off"
             )
 
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        return BaselineWatch(tables)
+
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the boards that were named, or all that answer; a listener learns them from their data.
 

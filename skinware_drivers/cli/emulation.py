@@ -30,7 +30,7 @@ _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 """Pauses between attempts to open a bus that went down."""
 
 
-class Report(Protocol):
+class EventSink(Protocol):
     """Receives the events of an emulation."""
 
     def event(self, name: str, **facts: Any) -> None:
@@ -138,7 +138,7 @@ class Emulation:
         self,
         bus: Bus,
         hardware: EmulatedHardware,
-        report: Report,
+        report: EventSink,
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,

@@ -20,7 +20,7 @@ from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware_drivers.finding.interfaces import CanInterface
-    from skinware_drivers.finding.looking import Answer, HeardOnBus
+    from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer
     from skinware_drivers.finding.ports import SerialPort
     from skinware_drivers.finding.running import RunningDriver
 
@@ -165,10 +165,10 @@ async def _ask(
     running: list[RunningDriver],
     force: bool,
     driver_names: tuple[str, ...],
-) -> dict[str, Answer]:
+) -> dict[str, ProbeAnswer]:
     from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.guess import known_drivers
-    from skinware_drivers.finding.looking import Answer, ask, ask_port
+    from skinware_drivers.finding.looking import ProbeAnswer, ask, ask_port
     from skinware_drivers.finding.running import driver_on
 
     answers = {}
@@ -179,16 +179,16 @@ async def _ask(
         )
     for name in networks:
         owner = driver_on(name, running)
-        refused = Answer(name, refused=f"{owner} has it")
+        refused = ProbeAnswer(name, refused=f"{owner} has it")
         medium = "modbus" if parse_bus_name(name).interface == "modbus" else "serial"
         answers[name] = refused if owner else await ask_port(name, known_drivers(medium, driver_names))
     for port in ports:
         owner = driver_on(port.path, running)
         users = [f"{user.program} (pid {user.pid})" for user in port.users]
         if owner is not None or users:
-            answers[port.path] = Answer(port.path, refused=f"{owner or ', '.join(users)} has it")
+            answers[port.path] = ProbeAnswer(port.path, refused=f"{owner or ', '.join(users)} has it")
         elif not port.may_open:
-            answers[port.path] = Answer(port.path, refused="you may not open it")
+            answers[port.path] = ProbeAnswer(port.path, refused="you may not open it")
         else:
             of_ports = known_drivers("serial", driver_names) | known_drivers("modbus", driver_names)
             answers[port.path] = await ask_port(port.path, of_ports)
@@ -198,7 +198,7 @@ async def _ask(
 def _can_data(
     interfaces: list[CanInterface],
     heard: dict[str, HeardOnBus],
-    answers: dict[str, Answer],
+    answers: dict[str, ProbeAnswer],
     running: list[RunningDriver],
     *,
     whole: bool,
@@ -227,14 +227,14 @@ def _can_data(
 
 
 def _heard_data(
-    name: str, heard: dict[str, HeardOnBus], answers: dict[str, Answer], running: list[RunningDriver]
+    name: str, heard: dict[str, HeardOnBus], answers: dict[str, ProbeAnswer], running: list[RunningDriver]
 ) -> dict[str, Any]:
     from skinware_drivers.finding.running import driver_on
 
     return {"bus": name, "used_by": driver_on(name, running), "heard": heard.get(name), "probe": answers.get(name)}
 
 
-def _port_data(port: SerialPort, answers: dict[str, Answer], running: list[RunningDriver]) -> dict[str, Any]:
+def _port_data(port: SerialPort, answers: dict[str, ProbeAnswer], running: list[RunningDriver]) -> dict[str, Any]:
     import msgspec
 
     from skinware_drivers.finding.running import driver_on

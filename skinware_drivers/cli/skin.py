@@ -15,50 +15,50 @@ from skinware.cli._terminal import echo
 from skinware_drivers.options.declared import nearest_name
 
 
-class Entry(NamedTuple):
+class Tool(NamedTuple):
     """The module of a command, and its purpose in a line."""
 
     module: str
     summary: str
 
 
-GROUPS: Mapping[str, Mapping[str, Entry]] = {
+GROUPS: Mapping[str, Mapping[str, Tool]] = {
     "Connect a skin": {
-        "find": Entry("skinware_drivers.cli.find", "show which devices are plugged in and which driver knows them"),
-        "driver": Entry("skinware_drivers.cli.driver", "run a driver: buses into one stream of snapshots"),
-        "doctor": Entry("skinware_drivers.cli.doctor", "find out what is wrong"),
-        "config": Entry("skinware_drivers.cli.config", "change settings of boards"),
-        "import": Entry("skinware_drivers.cli.import_", "make configurations from files of other systems"),
+        "find": Tool("skinware_drivers.cli.find", "show which devices are plugged in and which driver knows them"),
+        "driver": Tool("skinware_drivers.cli.driver", "run a driver: buses into one stream of snapshots"),
+        "doctor": Tool("skinware_drivers.cli.doctor", "find out what is wrong"),
+        "config": Tool("skinware_drivers.cli.config", "change settings of boards"),
+        "import": Tool("skinware_drivers.cli.import_", "make configurations from files of other systems"),
     },
     "See and feel": {
-        "top": Entry("skinware.cli.top", "show all drivers live in the terminal"),
-        "view": Entry("skinware.cli.view", "show drivers live in a browser"),
-        "info": Entry("skinware.cli.info", "show drivers, buses, patches, services and readers"),
-        "dump": Entry("skinware_drivers.cli.dump", "print snapshots of a driver, or frames of a bus"),
-        "wipe": Entry("skinware.cli.wipe", "find sensors that never answer"),
-        "calm": Entry("skinware.cli.calm", "publish 0 where nothing touches, whatever drifts"),
-        "calibrate": Entry("skinware.cli.calibrate", "find where the sensors are by touching them"),
-        "regions": Entry("skinware.cli.regions", "name parts of a skin"),
+        "top": Tool("skinware.cli.top", "show all drivers live in the terminal"),
+        "view": Tool("skinware.cli.view", "show drivers live in a browser"),
+        "info": Tool("skinware.cli.info", "show drivers, buses, patches, services and readers"),
+        "dump": Tool("skinware_drivers.cli.dump", "print snapshots of a driver, or frames of a bus"),
+        "wipe": Tool("skinware.cli.wipe", "find sensors that never answer"),
+        "calm": Tool("skinware.cli.calm", "publish 0 where nothing touches, whatever drifts"),
+        "calibrate": Tool("skinware.cli.calibrate", "find where the sensors are by touching them"),
+        "regions": Tool("skinware.cli.regions", "name parts of a skin"),
     },
     "Keep and share": {
-        "record": Entry("skinware.cli.record", "record drivers and services"),
-        "replay": Entry("skinware_drivers.cli.replay", "publish a recording as if it ran now"),
-        "convert": Entry("skinware.cli.convert", "write a recording for numpy, pandas, LeRobot, ROS 2, Foxglove"),
-        "recover": Entry("skinware.cli.recover", "make a damaged recording whole"),
-        "bridge": Entry("skinware.cli.bridge", "share drivers with other machines, ROS 2 or YARP"),
+        "record": Tool("skinware.cli.record", "record drivers and services"),
+        "replay": Tool("skinware_drivers.cli.replay", "publish a recording as if it ran now"),
+        "convert": Tool("skinware.cli.convert", "write a recording for numpy, pandas, LeRobot, ROS 2, Foxglove"),
+        "recover": Tool("skinware.cli.recover", "make a damaged recording whole"),
+        "bridge": Tool("skinware.cli.bridge", "share drivers with other machines, ROS 2 or YARP"),
     },
     "Write a driver": {
-        "new": Entry("skinware_drivers.cli.new", "create a driver package with emulator and tests"),
-        "emulate": Entry("skinware_drivers.cli.emulate", "emulate devices on a bus, with faults on request"),
-        "press": Entry("skinware.cli.press", "press an emulated skin"),
-        "prove": Entry("skinware_drivers.cli.prove", "prove a driver on its device"),
+        "new": Tool("skinware_drivers.cli.new", "create a driver package with emulator and tests"),
+        "emulate": Tool("skinware_drivers.cli.emulate", "emulate devices on a bus, with faults on request"),
+        "press": Tool("skinware.cli.press", "press an emulated skin"),
+        "prove": Tool("skinware_drivers.cli.prove", "prove a driver on its device"),
     },
 }
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 _SHELLS = ("bash", "zsh", "fish")
 
 
-class Skin(click.Group):
+class CommandGroup(click.Group):
     """A group whose commands are imported when they are needed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - of click
@@ -85,7 +85,7 @@ class Skin(click.Group):
 
 @click.group(
     "skin",
-    cls=Skin,
+    cls=CommandGroup,
     context_settings=CONTEXT_SETTINGS,
     invoke_without_command=True,
     epilog="skin NAME --help explains a command; skin-NAME is the same command. Completion: skin completion --help",

@@ -75,7 +75,7 @@ class DriverLog:
     Attributes:
         frames: number of snapshots.
         newest: the last one; None before the first.
-        future_ns, backwards, longest_gap_s: see :class:`skinware_drivers.doctor.evidence.Timing`.
+        future_ns, backwards, longest_gap_s: see :class:`skinware_drivers.doctor.evidence.DriverTiming`.
     """
 
     structure: Structure

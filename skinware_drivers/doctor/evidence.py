@@ -132,7 +132,7 @@ class HealthSeen:
 
 
 @dataclass(frozen=True)
-class Timing:
+class DriverTiming:
     """Times of a driver.
 
     Attributes:
@@ -200,7 +200,7 @@ class DriverSeen:
     dark: Mapping[str, int]
     buses: tuple[BusSeen, ...]
     patches: tuple[PatchSeen, ...]
-    timing: Timing
+    timing: DriverTiming
     health: HealthSeen | None = None
 
 

@@ -23,10 +23,10 @@ from skinware_drivers.doctor.evidence import (
     ClockSet,
     Counted,
     DriverSeen,
+    DriverTiming,
     Evidence,
     PatchSeen,
     RecordingSeen,
-    Timing,
 )
 from skinware_drivers.doctor.looking import MachineWatch
 
@@ -195,7 +195,7 @@ class _DriverTrack:
                     for one in self._earlier
                 ],
             ),
-            timing=Timing(
+            timing=DriverTiming(
                 rate_hz=self._intervals * NS_PER_S / self._live_ns if self._live_ns > 0 else None,
                 period_ns=newest.period_ns,
                 missed=0,

@@ -23,7 +23,7 @@ from skinware.structure import Structure
 from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader
 from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge, taxel_faults
-from skinware_drivers.doctor.evidence import DriverSeen, HealthSeen, Timing
+from skinware_drivers.doctor.evidence import DriverSeen, DriverTiming, HealthSeen
 
 _LOOK_EVERY_S = 0.02
 _POLICIES = {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
@@ -121,9 +121,9 @@ class _DriverWatch:
             health=_by_calm(reader, life) or self._judge.seen(),
         )
 
-    def _timing(self, life: str) -> Timing:
+    def _timing(self, life: str) -> DriverTiming:
         before, now, log = self._begun, self._newest_statistics, self._log
-        return Timing(
+        return DriverTiming(
             rate_hz=rate_now_hz(life, self._reader.rate_hz()),
             period_ns=0 if self._newest is None else self._newest.period_ns,
             missed=now.missed_periods - before.missed_periods,

@@ -240,7 +240,7 @@ def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray
     return np.full(len(identifier), patch if isinstance(patch, int) else 0, np.int64)
 
 
-class _Replay(Link):
+class _HeardLink(Link):
     """A driver's link to recorded frames: it listens without waiting, and cannot send."""
 
     def __init__(self, bus: Bus, heard: dict[Heard, int]) -> None:
@@ -266,6 +266,6 @@ class _Replay(Link):
 async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
     """Return the patches that a listening driver would describe."""
     try:
-        return await asyncio.wait_for(adapter.describe(_Replay(bus, heard)), _NAMING_S)
+        return await asyncio.wait_for(adapter.describe(_HeardLink(bus, heard)), _NAMING_S)
     except (BusError, TimeoutError):
         return ()

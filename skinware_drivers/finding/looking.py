@@ -53,7 +53,7 @@ class HeardOnBus:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ProbeAnswer:
     """The answers on a bus.
 
     Attributes:
@@ -113,7 +113,7 @@ async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping
 
 async def ask(
     heard: HeardOnBus, drivers: Mapping[str, type[AnyAdapter]], *, force: bool = False, owner: str = ""
-) -> Answer:
+) -> ProbeAnswer:
     """Ask which devices are on a CAN bus, without disturbing any.
 
     On a silent bus all drivers ask. If frames are heard, only the drivers that know them ask, and only questions that
@@ -126,23 +126,23 @@ async def ask(
         owner: the running driver of the bus, in words; empty: none.
     """
     if heard.problem:
-        return Answer(heard.bus, refused=heard.problem)
+        return ProbeAnswer(heard.bus, refused=heard.problem)
     idle = force or not heard.frames
     known = {one.driver for one in heard.guesses if one.likely}
     meant = {name: driver for name, driver in drivers.items() if idle or name in known}
     asking = {name: driver for name, driver in meant.items() if can_ask(driver)}
     if not force and owner:
-        return Answer(heard.bus, refused=f"{owner} has it; use skin-config to ask through that driver")
+        return ProbeAnswer(heard.bus, refused=f"{owner} has it; use skin-config to ask through that driver")
     if not meant:
-        return Answer(
+        return ProbeAnswer(
             heard.bus, refused="no driver knows what is sending there, so a request could mean anything to it"
         )
     if not asking:
-        return Answer(heard.bus, refused=f"there is no harmless question in {', '.join(meant)}")
+        return ProbeAnswer(heard.bus, refused=f"there is no harmless question in {', '.join(meant)}")
     return await _ask_all(make_bus(heard.bus, payload_size=_CAN_PAYLOAD), heard.bus, asking, idle)
 
 
-async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer:
+async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeAnswer:
     """Ask which device is on a serial port, one driver after the other; opening it resets some microcontrollers.
 
     Args:
@@ -174,7 +174,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
         answers.update(answer.answers)
         problems.update(answer.problems)
     none = "no installed driver has a harmless question for serial devices"
-    return Answer(path, asked, answers, problems, "" if asked or problems else none)
+    return ProbeAnswer(path, asked, answers, problems, "" if asked or problems else none)
 
 
 def can_ask(driver: type[AnyAdapter]) -> bool:
@@ -182,7 +182,7 @@ def can_ask(driver: type[AnyAdapter]) -> bool:
     return inspect.getattr_static(driver, "identify") is not inspect.getattr_static(Adapter, "identify")
 
 
-async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapter]], idle: bool) -> Answer:
+async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapter]], idle: bool) -> ProbeAnswer:
     answers, problems = {}, {}
     try:
         async with attended(bus) as link:
@@ -199,5 +199,5 @@ async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapte
                     if answer:
                         answers[name] = answer
     except BusNotAvailable as error:
-        return Answer(bus_name, refused=str(error))
-    return Answer(bus_name, list(drivers), answers, problems)
+        return ProbeAnswer(bus_name, refused=str(error))
+    return ProbeAnswer(bus_name, list(drivers), answers, problems)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.icub.xml_tree import Element, Level, Notes, Reader, read_xml, words
+from skinware_drivers.icub.xml_tree import Element, Level, Notes, ValueReader, read_xml, words
 
 _MOST_INCLUDES = 200
 _LONGEST_CHAIN = 8
@@ -228,7 +228,7 @@ def read_wrapper(group: Group, notes: Notes) -> Wrapper:
     return _WrapperReader(notes).read(group)
 
 
-class _WrapperReader(Reader):
+class _WrapperReader(ValueReader):
     def read(self, group: Group) -> Wrapper:
         ports: list[Port] = []
         for element in group.lists.get("ports", ()):

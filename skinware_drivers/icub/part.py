@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD, TRIANGLES
 from skinware_drivers.icub.device import Group
-from skinware_drivers.icub.xml_tree import Element, Notes, Reader, words
+from skinware_drivers.icub.xml_tree import Element, Notes, ValueReader, words
 
 ETHERNET, CAN = "embObjSkin", "canBusSkin"
 _ONLY_PATCH = 1
@@ -102,7 +102,7 @@ def read_part(name: str, device_type: str, group: Group, notes: Notes) -> Part:
     return _PartReader(name, device_type, group, notes).read()
 
 
-class _PartReader(Reader):
+class _PartReader(ValueReader):
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
         super().__init__(notes)
         self._group = group

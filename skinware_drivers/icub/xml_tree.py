@@ -88,7 +88,7 @@ def number(text: str) -> int:
     return value
 
 
-class Reader:
+class ValueReader:
     """Read values of elements; note those that cannot be read, which count as not given.
 
     Args:
@@ -218,7 +218,7 @@ def read_xml(path: Path, notes: Notes) -> Element:
     Raises:
         ConfigurationError: the file does not exist, is not XML, or defines entities; the message says where.
     """
-    return _Reader(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
+    return _TreeBuilder(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
 
 
 def _without_odd_comments(data: bytes, path: Path, notes: Notes) -> bytes:
@@ -244,7 +244,7 @@ def _without_odd_comments(data: bytes, path: Path, notes: Notes) -> bytes:
     return b"".join([*parts, data[position:]])
 
 
-class _Reader:
+class _TreeBuilder:
     def __init__(self, path: Path, notes: Notes) -> None:
         self._path, self._notes = path, notes
         self._open: list[Element] = []

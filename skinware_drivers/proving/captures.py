@@ -99,7 +99,7 @@ def decoded_now(
         about = recording.about(wires[0].driver)
         began_ns, listens = _began_ns(recording, wires), bool(about.get("listen_only"))
         clock = HandClock()
-        replays = [_Replay(recording, wire, listens, clock) for wire in wires]
+        replays = [_ReplayedWire(recording, wire, listens, clock) for wire in wires]
         driver = driver or load_driver(_driver_type(recording, about))
         of_buses = about.get("buses", {})
         for replay in replays:
@@ -143,7 +143,7 @@ def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
     return 0 if first is None else first.time_ns - (first.epoch_ns - recording.start_ns)
 
 
-class _Replay:
+class _ReplayedWire:
     """A recorded wire, and the adapter of the present driver on it.
 
     Args:
@@ -244,7 +244,7 @@ class _Published:
                 self._frames.append((frame.structure, []))
             self._frames[-1][1].append(frame)
 
-    def decoding(self, replays: Sequence[_Replay], began_ns: int) -> Decoding:
+    def decoding(self, replays: Sequence[_ReplayedWire], began_ns: int) -> Decoding:
         found = Collected(began_ns)
         for structure, frames in self._frames:
             times = np.array([frame.module_time_ns for frame in frames])
@@ -260,7 +260,7 @@ class _Published:
 
 
 async def _run(
-    clock: HandClock, replays: Sequence[_Replay], found: _Published, namespace: Namespace, listens: bool
+    clock: HandClock, replays: Sequence[_ReplayedWire], found: _Published, namespace: Namespace, listens: bool
 ) -> None:
     """Run the driver until every frame is delivered, and the values are published."""
     lines = [replay.line for replay in replays if replay.line is not None]

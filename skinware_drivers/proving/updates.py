@@ -24,7 +24,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Updates:
+class ModuleUpdates:
     """The updates of one module, in order.
 
     Attributes:
@@ -41,7 +41,7 @@ class Updates:
         return len(self.time_ns)
 
 
-Decoding = Mapping[tuple[int, ...], Updates]
+Decoding = Mapping[tuple[int, ...], ModuleUpdates]
 """The updates of each module, by the uids of its sensors."""
 
 
@@ -90,7 +90,7 @@ class Collected:
 
     def __init__(self, began_ns: int = 0) -> None:
         self._began_ns = began_ns
-        self._parts: dict[tuple[int, ...], list[Updates]] = {}
+        self._parts: dict[tuple[int, ...], list[ModuleUpdates]] = {}
 
     def add(self, structure: Structure, values: npt.NDArray[Any], module_time_ns: Times) -> None:
         """Add snapshots of one structure, in order.
@@ -106,17 +106,17 @@ class Collected:
             rows = np.flatnonzero((time_ns != 0) & np.r_[True, np.diff(time_ns) != 0])
             if len(mine) and len(rows):
                 names = tuple(structure.sensor_name(int(position)) for position in mine)
-                found = Updates(names, time_ns[rows] - self._began_ns, values[np.ix_(rows, mine)])
+                found = ModuleUpdates(names, time_ns[rows] - self._began_ns, values[np.ix_(rows, mine)])
                 self._parts.setdefault(tuple(structure.sensor_uid[mine].tolist()), []).append(found)
 
     def decoding(self) -> Decoding:
         return {uids: _joined(parts) for uids, parts in self._parts.items()}
 
 
-def _joined(parts: list[Updates]) -> Updates:
+def _joined(parts: list[ModuleUpdates]) -> ModuleUpdates:
     time_ns, values = np.concatenate([part.time_ns for part in parts]), np.concatenate([part.values for part in parts])
     time_ns, first = np.unique(time_ns, return_index=True)
-    return Updates(parts[-1].sensors, time_ns, values[first])
+    return ModuleUpdates(parts[-1].sensors, time_ns, values[first])
 
 
 def compare(then: Decoding, now: Decoding) -> Comparison:
@@ -146,7 +146,7 @@ def _in_pairs(then: Decoding, now: Decoding) -> Iterator[tuple[int, Difference |
             yield 0, _without_partner(new, 0, is_then=False)
 
 
-def _of_module(old: Updates, new: Updates) -> tuple[int, Difference | None]:
+def _of_module(old: ModuleUpdates, new: ModuleUpdates) -> tuple[int, Difference | None]:
     if old.values.shape[1:] != new.values.shape[1:]:
         return 0, _without_partner(old, 0, is_then=True)
     common = min(len(old), len(new))
@@ -194,7 +194,7 @@ def _nearest(of_ns: Times, in_ns: Times) -> Times:
     return found
 
 
-def _without_partner(of: Updates, row: int, *, is_then: bool) -> Difference:
+def _without_partner(of: ModuleUpdates, row: int, *, is_then: bool) -> Difference:
     value = float(of.values[row, 0])
     then, now = (value, None) if is_then else (None, value)
     return Difference(float(of.time_ns[row]) / NS_PER_S, of.sensors[0], then, now)
@@ -231,7 +231,7 @@ def load(path: Path) -> Decoding:
         raise BadRecording(f"{path}: not a file of skin-prove --save ({error})") from None
 
 
-def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple[tuple[int, ...], Updates]]:
+def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple[tuple[int, ...], ModuleUpdates]]:
     for number in sorted({int(name.partition(".")[0]) for name in names}):
         uids, sensors, time_ns, values = (file[f"{number}.{what}"] for what in ("uids", "sensors", "time_ns", "values"))
-        yield tuple(uids.tolist()), Updates(tuple(sensors.tolist()), time_ns, values)
+        yield tuple(uids.tolist()), ModuleUpdates(tuple(sensors.tolist()), time_ns, values)

@@ -1,4 +1,4 @@
-"""Decide what a failure costs, by one rule; repeat calls, and bear with calls that hang.
+"""Decide what a failure costs, by one rule.
 
 * An ``Expand`` function fails: the frame is lost, and counted as bad content (``decoding.frame_kind``).
 * A device fails (``BusError`` or ``OSError`` in a hook): the attempt is repeated, for its patch or its bus.
@@ -10,9 +10,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -138,63 +136,3 @@ class Backoff:
 
     def begin_again(self) -> None:
         self._next_s = self._begin_s
-
-
-class SlowCall:
-    """A call in a thread that does not keep the program from ending.
-
-    Args:
-        name: of the thread.
-        call: what to do there.
-    """
-
-    def __init__(self, name: str, call: Callable[[], object]) -> None:
-        self._call = call
-        self._afterwards: Callable[[], object] | None = None
-        self._lock = threading.Lock()
-        self._has_returned = False
-        self._loop = asyncio.get_running_loop()
-        self._over: asyncio.Future[Exception | None] = self._loop.create_future()
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-        self._thread.start()
-
-    async def is_over(self, patience_s: float) -> bool:
-        """Wait for the call to return, at most for a time, s; return whether it did."""
-        over, _ = await asyncio.wait([self._over], timeout=patience_s)
-        if over:
-            self._thread.join()  # which has nothing left to do
-        return bool(over)
-
-    def check(self) -> None:
-        """Raise what the call raised; to be called once it is over."""
-        error = self._over.result()
-        if error is not None:
-            raise error
-
-    def leave(self, afterwards: Callable[[], object]) -> bool:
-        """Stop waiting for the call.
-
-        Args:
-            afterwards: called in its thread if it returns after all.
-
-        Returns:
-            False: the call is already over, and nothing is done.
-        """
-        with self._lock:
-            if not self._has_returned:
-                self._afterwards = afterwards
-            return not self._has_returned
-
-    def _work(self) -> None:
-        failure = None
-        try:
-            self._call()
-        except Exception as error:  # noqa: BLE001  (``check`` raises it)
-            failure = error
-        with self._lock:
-            self._has_returned = True
-        if self._afterwards is not None:
-            with contextlib.suppress(Exception):
-                self._afterwards()
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            self._loop.call_soon_threadsafe(self._over.set_result, failure)

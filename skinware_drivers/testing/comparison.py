@@ -37,7 +37,7 @@ class Update:
     burst: int | None
 
 
-class Comparison:
+class ShownUpdates:
     """The updates that a driver showed, each with its burst.
 
     Args:

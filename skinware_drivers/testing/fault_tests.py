@@ -13,11 +13,11 @@ from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.testing.comparison import Comparison
+from skinware_drivers.testing.comparison import ShownUpdates
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, in_its_time, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
-from skinware_drivers.testing.torn_tests import Heard
+from skinware_drivers.testing.torn_tests import FrameLog
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -35,7 +35,7 @@ class FaultTests(Suite):
         """Frames that are lost, cut short, or come twice: nothing torn is shown, every whole burst is."""
         async with self.running(clock) as rig:
             await self._damage(rig, fault)
-            comparison = Comparison(rig)
+            comparison = ShownUpdates(rig)
             comparison.require_right(f"frames were {fault} on the wire")
             comparison.require_complete(comparison.spoilt(), f" (others were {fault})")
             if fault == "truncated" and rig.adapter.medium == "can":
@@ -54,7 +54,7 @@ class FaultTests(Suite):
         """Random bytes under the devices' own identifiers: no exception, and all other bursts are right."""
         async with self.running(clock) as rig:
             await self._damage(rig, "garbage")
-            comparison = Comparison(rig)
+            comparison = ShownUpdates(rig)
             spoilt = comparison.spoilt()
             for update in comparison.wrong:
                 shown_ns = int(rig.record.frames[update.frame].module_time_ns[update.module])
@@ -75,7 +75,7 @@ class FaultTests(Suite):
         if rig.adapter.medium in ("serial", "modbus"):
             async with rig:
                 await self._damage(rig, "noise")
-                comparison = Comparison(rig)
+                comparison = ShownUpdates(rig)
                 comparison.require_right("there was noise on the line")
                 comparison.require_complete(comparison.spoilt(), " (before others there was noise)")
             return
@@ -94,7 +94,7 @@ class FaultTests(Suite):
                 f"{foreign} frames of other devices came, {counted} were counted as unknown: the layout takes"
                 " identifiers that are not its devices'",
             )
-            comparison = Comparison(rig)
+            comparison = ShownUpdates(rig)
             comparison.require_right("among frames of other devices")
             comparison.require_complete(because=" (among frames of other devices)")
 
@@ -135,10 +135,10 @@ class SilenceTests(Suite):
     def test_a_silent_kind_of_frame_is_not_shown_as_fresh(self) -> None:
         """One kind of frame falls silent while all others continue: sensors that only it carries become stale."""
 
-        async def scenario(clock: HandClock) -> tuple[Heard, Running]:
+        async def scenario(clock: HandClock) -> tuple[FrameLog, Running]:
             async with self.running(clock) as rig:
                 await rig.until_fresh()
-                heard = Heard(rig)
+                heard = FrameLog(rig)
                 await rig.sleep(_BURSTS * rig.adapter.period_s)
                 return heard, rig
 
@@ -210,7 +210,7 @@ class SilenceTests(Suite):
             within_s=within_s,
         )
         await rig.sleep(4 * rig.adapter.period_s)
-        Comparison(rig).require_right(f"{after}, and afterwards")
+        ShownUpdates(rig).require_right(f"{after}, and afterwards")
 
     @in_its_time
     async def test_a_dead_device_holds_up_no_other(self, clock: HandClock) -> None:
@@ -223,7 +223,7 @@ class SilenceTests(Suite):
             await rig.sleep(1.0 + 8 * rig.adapter.period_s)
             first = len(rig.record.frames)
             await rig.sleep(_BURSTS * rig.adapter.period_s)
-            comparison = Comparison(rig)
+            comparison = ShownUpdates(rig)
             comparison.require_right("one device had died")
             for module in range(comparison.structure.n_modules):
                 if comparison.structure.module_patch[module] == rig.first_patch_of(rig.numbers[0]):

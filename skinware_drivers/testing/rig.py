@@ -75,7 +75,7 @@ class Case:
         return msgspec.convert(given, self.emulator.Options, strict=False)
 
 
-class Recorder:
+class SnapshotLog:
     """Read every snapshot that a driver publishes, in order, as a user's program does.
 
     Attributes:
@@ -186,7 +186,7 @@ class Running(Rig):
 
     def __init__(self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
         super().__init__(case, clock, pattern, listen_only=listen_only, **more)
-        self.record: Recorder = Recorder(clock)
+        self.record: SnapshotLog = SnapshotLog(clock)
         self.answers = 0
         self.runner: Runner | None = None
         self._listen_only = listen_only
@@ -276,7 +276,7 @@ class Running(Rig):
         return frame
 
     def _explain_not_fresh(self, within_s: float) -> None:
-        from skinware_drivers.testing.comparison import Comparison  # which looks at rigs
+        from skinware_drivers.testing.comparison import ShownUpdates  # which looks at rigs
 
         within = f"after {within_s:.1f} s of emulated data"
         if not self.record.frames:
@@ -285,7 +285,7 @@ class Running(Rig):
             defect(f"nothing was published {within}: the devices sent no frame; the driver: {self.sent_in_words()}")
         frame = self.record.frames[-1]
         if self.truth.bursts:
-            Comparison(self).require_no_shift()
+            ShownUpdates(self).require_no_shift()
         else:
             defect(f"the devices sent no data {within}: does `start` start them? It sent: {self.sent_in_words()}")
         missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))

@@ -21,7 +21,7 @@ from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
-from skinware_drivers.testing.comparison import Comparison
+from skinware_drivers.testing.comparison import ShownUpdates
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.rig import Running, in_its_time
 from skinware_drivers.testing.suite import Suite
@@ -56,7 +56,7 @@ class TornTests(Suite):
             await rig.until_fresh()
             if not rig.adapter.layout.cycles:
                 return  # a frame is all of an update
-            heard = Heard(rig)
+            heard = FrameLog(rig)
             await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
             recording = heard.recording()
         if recording is None:
@@ -89,12 +89,12 @@ class TornTests(Suite):
             rig.wire.stumbling = None
             end_ns = clock.now_ns
             await rig.sleep(4 * rig.adapter.period_s)
-            Comparison(rig).require_right("runs of frames were lost, and the sender stood still and caught up")
+            ShownUpdates(rig).require_right("runs of frames were lost, and the sender stood still and caught up")
             shown_ns = rig.record.frames[-1].module_time_ns
             require((shown_ns > end_ns).all(), "the sender works again, but not all modules are shown")
 
 
-class Take(NamedTuple):
+class Delivery(NamedTuple):
     """Frames that a bus delivered at once.
 
     Attributes:
@@ -108,7 +108,7 @@ class Take(NamedTuple):
     time_ns: npt.NDArray[np.int64]
 
 
-class Heard:
+class FrameLog:
     """Write down the frames that the bus of a running driver delivers.
 
     Attributes:
@@ -120,7 +120,7 @@ class Heard:
         if rig.runner is None or rig.runner.builder.generation is None:
             defect("the driver publishes nothing yet")
         self._rig = rig
-        self.takes: list[Take] = []
+        self.takes: list[Delivery] = []
         self.tables: SkinTables = rig.runner.builder.generation.tables
         receive = rig.bus.receive
 
@@ -129,12 +129,12 @@ class Heard:
             count = receive(batch, ordinal)
             if batch.stop > first:
                 rows = slice(first, batch.stop)
-                self.takes.append(Take(rig.clock.now_ns, batch.wire[rows].copy(), batch.time_ns[rows].copy()))
+                self.takes.append(Delivery(rig.clock.now_ns, batch.wire[rows].copy(), batch.time_ns[rows].copy()))
             return count
 
         rig.bus.receive = listen  # type: ignore[method-assign]
 
-    def recording(self, bursts: int = BURSTS) -> Recording | None:
+    def recording(self, bursts: int = BURSTS) -> Bursts | None:
         """Return bursts of the first patch; None if there are too few."""
         if not self.takes:
             return None
@@ -146,7 +146,7 @@ class Heard:
 # -- variants of a recording ----------------------------------------------------------------------------------------
 
 
-class Recording(NamedTuple):
+class Bursts(NamedTuple):
     """Some bursts of one patch.
 
     Attributes:
@@ -182,7 +182,7 @@ class Trouble:
     held: int | None = None
     until_ns: int = 0
 
-    def in_words(self, recording: Recording) -> str:
+    def in_words(self, recording: Bursts) -> str:
         words = f"{self.lost} frames in a row were lost, from frame {self.first % recording.size + 1} of a burst on"
         if self.held is None:
             return words
@@ -209,7 +209,7 @@ class Outcome:
 
 def record(
     layout: Layout, tables: SkinTables, period_s: float, wire: npt.NDArray[Any], time_ns: Indices, bursts: int = BURSTS
-) -> Recording | None:
+) -> Bursts | None:
     """Return bursts of the first patch among the frames of a bus; None if there are too few.
 
     Args:
@@ -232,10 +232,10 @@ def record(
     own = own[: same[bursts]]
     size = len(own) // bursts
     own = own[: size * bursts]
-    return Recording(layout, tables, period_s, size, wire[own].copy(), time_ns[own].copy())
+    return Bursts(layout, tables, period_s, size, wire[own].copy(), time_ns[own].copy())
 
 
-def counter_values(recording: Recording) -> Indices:
+def counter_values(recording: Bursts) -> Indices:
     """Return (k,) the numbers that the counter of the cycle has in the recording; empty without a counter."""
     layout = recording.layout
     if layout.cycle is None or not layout.cycle.counters:
@@ -250,7 +250,7 @@ def counter_values(recording: Recording) -> Indices:
     return np.unique(np.concatenate(numbers))
 
 
-def try_troubles(recording: Recording, with_period: bool = True) -> Outcome:
+def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and count torn updates.
 
     Args:
@@ -280,7 +280,7 @@ def _step(size: int) -> int:
 
 
 def find_torn(
-    recording: Recording, rows: Indices, time_ns: Indices, *, with_period: bool = True
+    recording: Bursts, rows: Indices, time_ns: Indices, *, with_period: bool = True
 ) -> tuple[Updates, npt.NDArray[np.bool_]]:
     """Return the updates that are shown as fresh when frames of a recording arrive, and which are torn.
 
@@ -301,11 +301,11 @@ def find_torn(
     return fresh, ~np.isin(_marks(fresh, n_sensors), known)
 
 
-def _span_ns(recording: Recording) -> int:
+def _span_ns(recording: Bursts) -> int:
     return round(_APART * recording.period_s * 1e9)
 
 
-def _troubles_at(recording: Recording, first: int, step: int) -> Iterator[Trouble]:
+def _troubles_at(recording: Bursts, first: int, step: int) -> Iterator[Trouble]:
     period_ns = round(recording.period_s * 1e9)
     begin = _TROUBLE * recording.size
     for lost in range(0, 2 * recording.size + 1, step):
@@ -316,7 +316,7 @@ def _troubles_at(recording: Recording, first: int, step: int) -> Iterator[Troubl
         yield Trouble(first, lost, begin, over_ns + period_ns)
 
 
-def _suffer(recording: Recording, troubles: Sequence[Trouble]) -> tuple[Indices, Indices]:
+def _suffer(recording: Bursts, troubles: Sequence[Trouble]) -> tuple[Indices, Indices]:
     row, span_ns = np.arange(len(recording.wire)), _span_ns(recording)
     rows, times_ns = [], []
     for number, trouble in enumerate(troubles):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skinware.status import Status
-from skinware_drivers.testing.comparison import Comparison
+from skinware_drivers.testing.comparison import ShownUpdates
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import in_its_time
 from skinware_drivers.testing.suite import Suite, extreme
@@ -28,7 +28,7 @@ class ValueTests(Suite):
         async with self.running(clock) as rig:
             await rig.until_fresh()
             await rig.sleep(_BURSTS * rig.adapter.period_s)
-            comparison = Comparison(rig)
+            comparison = ShownUpdates(rig)
             comparison.require_right()
             comparison.require_complete()
             wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
@@ -45,7 +45,7 @@ class ValueTests(Suite):
         async with self.running(clock, pattern=extreme) as rig:
             await rig.until_fresh()
             await rig.sleep(24 * rig.adapter.period_s)
-            Comparison(rig).require_right()
+            ShownUpdates(rig).require_right()
 
     @in_its_time
     async def test_nothing_is_valid_before_the_first_data(self, clock: HandClock) -> None:
@@ -74,7 +74,7 @@ class ValueTests(Suite):
             await rig.sleep(_SILENCE_S)
             rig.wire.keep = lambda _identifier, _payload: True
             await rig.until_fresh()
-            Comparison(rig).require_right(
+            ShownUpdates(rig).require_right(
                 "with most frames missing on the wire, sensors without a frame of theirs were filled in"
             )
 

@@ -260,7 +260,7 @@ class Interference:
         return sorted([*frames, *others], key=lambda frame: frame.time_ns)
 
 
-class _EmulatedPort(Port):
+class _LineEnd(Port):
     """A serial line whose other end is emulated: the payloads of its frames are the bytes on the line."""
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock) -> None:
@@ -306,13 +306,13 @@ class _OnLine(Bus):
     opens_slowly: ClassVar[bool] = False  # a thread would not follow the clock's time
     _hardware: EmulatedHardware
     _clock: HandClock
-    _end: _EmulatedPort | None = None
+    _end: _LineEnd | None = None
     _present = True
 
     def _open_port(self) -> Port:
         if not self._present:
             raise BusNotAvailable("the emulated line is away")
-        self._end = _EmulatedPort(self._hardware, self._clock)
+        self._end = _LineEnd(self._hardware, self._clock)
         return self._end
 
     def vanish(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
+from skinware.text import age_text, count_text, rate_text
 from tests.browser.browsing import PATIENCE_MS
 from tests.browser.fake_server import PAGE
 
@@ -208,8 +209,7 @@ def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> N
 
 
 def test_figures(tell: Callable[..., Any]) -> None:
-    ages = "[0.04, 12.4, 1234, 200000, null, NaN].map(m.age)"
-    assert tell("format.js", ages) == ["0.0 ms", "12 ms", "1.2 s", "3 min", NONE, NONE]
+    assert tell("format.js", "[null, NaN].map(m.age)") == [NONE, NONE]
     figures = "[0, 1.23456, -120345.6, 1.5e-7, 2.5e9, undefined].map(m.figure)"
     assert tell("format.js", figures) == ["0", "1.235", "-120300", "1.50e-7", "2.50e+9", NONE]
     assert tell("format.js", "[999, 1234, 4.2e7, 5e12, 9e15].map(m.bytes)") == [
@@ -220,6 +220,15 @@ def test_figures(tell: Callable[..., Any]) -> None:
         "9000 TB",
     ]
     assert tell("format.js", "[0, 59.96, 125.25].map(m.clock)") == ["0:00.0", "1:00.0", "2:05.3"]
+
+
+def test_ages_rates_and_counts_look_as_in_the_terminal(tell: Callable[..., Any]) -> None:
+    ages_ms = [-5, 0, 0.04, 0.6, 9.9, 12.4, 999.6, 1234, 99_900, 200_000, 99 * 60_000, 7 * 3_600_000]
+    assert tell("format.js", "a[0].map(m.age)", ages_ms) == [age_text(age_ms * 1e6) for age_ms in ages_ms]
+    rates_hz = [0, 0.25, 1, 20.04, 999.9, 1000.2]
+    assert tell("format.js", "a[0].map(m.rate)", rates_hz) == [rate_text(rate_hz) for rate_hz in rates_hz]
+    counts = [0, 999, 30_848, 1_234_567]
+    assert tell("format.js", "a[0].map(m.count)", counts) == [count_text(count) for count in counts]
 
 
 # -- tree.js -------------------------------------------------------------------------------------------------------

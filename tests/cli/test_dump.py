@@ -188,7 +188,7 @@ def test_silence_fails_after_the_timeout(more: list[str], capsys: pytest.Capture
         printed = capsys.readouterr()
         assert printed.out.count("\n") == 1
         assert printed.err == (
-            "skin-dump: no newer frame of 'a': its writer is running, but is silent (hung, stopped or waiting)\n"
+            "skin-dump: no newer sample of 'a': its writer is running, but is silent (hung, stopped or waiting)\n"
         )
     with fake_process("b") as process:
         kill(process)

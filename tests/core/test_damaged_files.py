@@ -110,9 +110,9 @@ def test_a_forged_count_beside_the_lock_is_not_believed(namespace: Namespace) ->
 def test_a_dead_writer_was_not_too_fast(namespace: Namespace, program: Path) -> None:
     forged(namespace, *ABSURD["latest"])
     with ServiceReader[Sample]("x") as reader:
-        with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"):
+        with pytest.raises(Overrun, match="its writer is dead, and its newest sample is not whole"):
             reader.read()
-        with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"), reader.view():
+        with pytest.raises(Overrun, match="its writer is dead, and its newest sample is not whole"), reader.view():
             pass
     result = subprocess.run([program, "describe", "x"], capture_output=True, text=True, timeout=60)
     assert "its writer is dead" in result.stdout + result.stderr

@@ -88,7 +88,7 @@ def test_a_stopped_driver_does_not_look_fresh() -> None:
         with pytest.raises(ServiceTimeout, match=r"data is too old: fake \(\d"):
             skin.read(max_age_s=0.5, timeout_s=0.1)
         with pytest.raises(
-            ServiceTimeout, match=r"no frame younger than 0\.5 s of 'fake': its writer is running, but is"
+            ServiceTimeout, match=r"no sample younger than 0\.5 s of 'fake': its writer is running, but is"
         ):
             reader.read(max_age_s=0.5, timeout_s=0.1)
         os.kill(process.pid, signal.SIGCONT)
@@ -100,7 +100,7 @@ def test_loops_wait_for_what_is_young_enough() -> None:
     with DriverWriter("a", fake_structure(1, 2)) as writer, DriverReader("a") as reader, Skin() as skin:
         for frames in (reader.frames(max_age_s=0.5, timeout_s=0.05), reader.frames(50, max_age_s=0.5, timeout_s=0.05)):
             publish(writer, age_ns=NS_PER_S)
-            with pytest.raises(ServiceTimeout, match="no frame younger"):
+            with pytest.raises(ServiceTimeout, match="no sample younger"):
                 next(frames)
         for snapshots in (skin.frames(max_age_s=0.5, timeout_s=0.05), skin.frames(50, max_age_s=0.5, timeout_s=0.05)):
             publish(writer, age_ns=NS_PER_S)

@@ -110,7 +110,7 @@ def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
             with pytest.raises(PeerGone):
                 reader.request()
             last = reader.latest
-            monkeypatch.setattr("skinware.memory.segments._ORPHAN_S", 0.0)
+            monkeypatch.setattr("skinware.memory.name_lock._ORPHAN_S", 0.0)
             with ServiceWriter("x", COLUMNS) as again:
                 again.begin()["values"][:] = 1
                 again.commit(1)

@@ -12,7 +12,7 @@ import pytest
 
 from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Overrun, Paused, ServiceError, ServiceTimeout, StructureChanged
-from skinware.memory import file_layout, ring_reader, segments
+from skinware.memory import file_layout, name_lock, ring_reader, segments
 from skinware.memory import ring as ring_module
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.ring_writer import RingWriter
@@ -53,7 +53,7 @@ def test_a_view_says_when_it_was_overwritten() -> None:
         assert frame.valid
         writer.begin()
         assert not frame.valid
-        with pytest.raises(Overrun, match="frame 1 of 'x' was overwritten while it was viewed"):
+        with pytest.raises(Overrun, match="sample 1 of 'x' was overwritten while it was viewed"):
             view.__exit__(None, None, None)
         assert reader.statistics.overruns == 1
 
@@ -236,7 +236,7 @@ def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
 
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.create()
-    lock = segments.take_name(namespace, "x")
+    lock = name_lock.take_name(namespace, "x")
     schema = Schema.of(SMALL, "")
     segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
     writer = RingWriter(segment)
@@ -323,7 +323,7 @@ def test_commit_without_begin_is_refused() -> None:
         with pytest.raises(ServiceError, match="commit without begin"):
             writer.commit(1)
         publish_one(writer)
-        with pytest.raises(ServiceError, match="would publish an old frame"):
+        with pytest.raises(ServiceError, match="would publish an old sample"):
             writer.commit(1)
         assert writer.sequence == 1
 

@@ -14,7 +14,7 @@ from skinware import Namespace
 from skinware_drivers.cli.find import look
 from skinware_drivers.finding import ports
 from skinware_drivers.finding.guess import known_drivers
-from skinware_drivers.finding.looking import Answer, ask_port, can_ask
+from skinware_drivers.finding.looking import ProbeAnswer, ask_port, can_ask
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
@@ -56,14 +56,14 @@ def test_these_drivers_ask() -> None:
 def test_each_device_answers_its_driver_and_no_other() -> None:
     drivers = known_drivers("serial", DEVICES)
 
-    async def ask_until_it_answers(path: str, name: str) -> Answer:
+    async def ask_until_it_answers(path: str, name: str) -> ProbeAnswer:
         for _ in range(_MOST_TRIES):
             answer = await ask_port(path, drivers)
             if answer.answers:
                 return answer
         pytest.fail(f"{name} does not answer")
 
-    async def ask_all(paths: dict[str, str]) -> list[Answer]:
+    async def ask_all(paths: dict[str, str]) -> list[ProbeAnswer]:
         return await asyncio.gather(*(ask_until_it_answers(path, name) for name, path in paths.items()))
 
     with ExitStack() as running:

@@ -21,7 +21,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
-from skinware_drivers.finding.looking import Answer, HeardOnBus, ask, ask_port, listen_on
+from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_port, listen_on
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -56,7 +56,7 @@ def heard_on(bus: Bus, listen_s: float = 0.15) -> HeardOnBus:
     return heard
 
 
-def asked_on(bus: Bus, monkeypatch: pytest.MonkeyPatch, **how: Any) -> Answer:
+def asked_on(bus: Bus, monkeypatch: pytest.MonkeyPatch, **how: Any) -> ProbeAnswer:
     """Listen, then ask on the same bus."""
     heard = heard_on(bus)
     monkeypatch.setattr(looking, "make_bus", lambda *_, **__: bus)

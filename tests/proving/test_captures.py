@@ -15,7 +15,7 @@ from skinware.errors import BadRecording
 from skinware_drivers.bus import Bus
 from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.captures import check_capture, decoded_then, expected_of
-from skinware_drivers.proving.updates import Comparison, Decoding, Difference, Updates, compare, load, save
+from skinware_drivers.proving.updates import Comparison, Decoding, Difference, ModuleUpdates, compare, load, save
 from skinware_drivers.registry import load_driver
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import wait_until
@@ -41,7 +41,7 @@ class Mistaken(Tip):
 
 def decoding(times_ms: Sequence[float], values: Sequence[Sequence[float]], uids: Sequence[int] = (0, 1)) -> Decoding:
     names = tuple(f"tip, taxel {uid}" for uid in uids)
-    return {tuple(uids): Updates(names, np.array([round(ms * MS) for ms in times_ms]), np.array(values, float))}
+    return {tuple(uids): ModuleUpdates(names, np.array([round(ms * MS) for ms in times_ms]), np.array(values, float))}
 
 
 THEN = decoding([0, 10, 20, 31], [[1, 2], [3, 4], [5, np.nan], [7, 8]])
@@ -171,7 +171,9 @@ def test_a_folder_of_captures_is_a_test_for_each(capture: Path, tmp_path: Path) 
     for name in ("one", "other"):
         (folder / f"{name}.mcap").write_bytes(capture.read_bytes())
     then = decoded_then(capture)
-    save({uids: Updates(of.sensors, of.time_ns, of.values + 1) for uids, of in then.items()}, folder / "other.npz")
+    save(
+        {uids: ModuleUpdates(of.sensors, of.time_ns, of.values + 1) for uids, of in then.items()}, folder / "other.npz"
+    )
     tests = tmp_path / "test_tip.py"
     tests.write_text(
         "import sys\n"

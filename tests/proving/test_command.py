@@ -221,7 +221,7 @@ def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(tmp_path: 
     said, errors = prove.communicate(timeout=60)
     done = json.loads(said.splitlines()[-1])
     assert prove.returncode == 1
-    assert done["about"]["ended early"].startswith("no newer frame of 'hand': its writer")
+    assert done["about"]["ended early"].startswith("no newer sample of 'hand': its writer")
     assert "; ended early: File too large" in done["about"]["capture"]
     assert f"{tmp_path / 'proof.md'}: Is a directory" in errors
     assert str(tmp_path / "proof.json") in done["files"]

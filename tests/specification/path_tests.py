@@ -20,7 +20,7 @@ from skinware_drivers.testing import conformance
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
-from skinware_drivers.testing.torn_tests import Heard
+from skinware_drivers.testing.torn_tests import FrameLog
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.specification.both_paths import Pair, hand_clock
@@ -169,13 +169,13 @@ class PathTests(Suite):
             pair.pass_to(clock.now_ns + 4 * rig.period_ns)
             require(pair.frames, "nothing was published")
 
-    def _hear(self, trouble: Trouble) -> tuple[Heard, Running]:
+    def _hear(self, trouble: Trouble) -> tuple[FrameLog, Running]:
         """What a running driver receives while something is wrong."""
 
-        async def scenario(clock: HandClock) -> tuple[Heard, Running]:
+        async def scenario(clock: HandClock) -> tuple[FrameLog, Running]:
             async with self.running(clock) as rig:
                 await rig.until_fresh()
-                heard = Heard(rig)
+                heard = FrameLog(rig)
                 if trouble == "stumbling":
                     rig.wire.stumbling = Stumbling(rig.period_ns, _FRAMES_OF_A_BURST)
                 elif trouble == "restart":

@@ -138,7 +138,7 @@ def test_health_that_does_not_fit_is_begun_anew(
         LearnedState(path, skin.health).restore(skin.chain)
         skin.go_on(PERIOD_NS)
         assert skin.health.faulty == 0
-    assert ("what was learned is lost" in caplog.text) == (damage != "of another scale")
+    assert ("the learned state does not fit" in caplog.text) == (damage != "of another scale")
 
 
 def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace) -> None:

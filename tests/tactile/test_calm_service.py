@@ -220,7 +220,7 @@ def test_a_state_that_is_no_good_is_left_alone(tmp_path: Path, damage: str, capl
         path.mkdir()
     with publishing(idle(FakeSkin())), calming(state_path=path) as service:
         assert service.restored == 0
-    assert "what was learned is lost" in caplog.text or damage == "folder"
+    assert "the learned state does not fit" in caplog.text or damage == "folder"
 
 
 def test_a_state_says_nothing_of_sensors_that_it_does_not_have() -> None:

@@ -197,7 +197,7 @@ BROKEN = [
     (
         HEAD + '[[region]]\nname = "a"\nregions = ["b"]\n[[region]]\nname = "b"\nuid = [1]\nwithout = ["a"]\n',
         None,
-        "a region that is in itself: ",
+        "a region is in itself: ",
     ),
     (
         HEAD + '[[region]]\nname = "a"\ntype = "pressure"\nregions = ["b"]\n'

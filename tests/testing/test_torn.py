@@ -15,7 +15,7 @@ from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import assemble
 from skinware_drivers.layout import Cycle, Identifier, Layout, SequenceNumber
 from skinware_drivers.options import NoOptions
-from skinware_drivers.testing.torn_tests import BURSTS, Recording, record, try_troubles
+from skinware_drivers.testing.torn_tests import BURSTS, Bursts, record, try_troubles
 from tests.testing.fingertips import Fingertips
 
 PERIOD_NS = 20_000_000
@@ -23,14 +23,14 @@ README = Path(__file__).parents[2] / "README.md"
 Wire = npt.NDArray[np.void]
 
 
-def recording_of(adapter: AnyAdapter, wire: Wire, time_ns: npt.NDArray[np.int64]) -> Recording:
+def recording_of(adapter: AnyAdapter, wire: Wire, time_ns: npt.NDArray[np.int64]) -> Bursts:
     tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
     made = record(adapter.layout, tables, adapter.period_s, wire, time_ns)
     assert made is not None
     return made
 
 
-def fingertips(counter: SequenceNumber | None = None) -> Recording:
+def fingertips(counter: SequenceNumber | None = None) -> Bursts:
     """Ten bursts of two frames; the number of the burst is in byte 0, beside the bit that distinguishes the halves."""
     adapter = Fingertips(NoOptions())
     bursts = BURSTS + 2

@@ -34,7 +34,7 @@ from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
-from skinware_drivers.testing.torn_tests import Heard, Recording, find_torn, record
+from skinware_drivers.testing.torn_tests import Bursts, FrameLog, find_torn, record
 from skinware_drivers.virtual.hand_clock import HandClock
 
 Indices = npt.NDArray[np.int64]
@@ -43,7 +43,7 @@ VARIANTS_AT_ONCE = 200
 PERIOD_NS = 20_000_000
 
 
-def recordings() -> Iterator[tuple[str, Recording | None]]:
+def recordings() -> Iterator[tuple[str, Bursts | None]]:
     """Names, and what to replay."""
     for order, age in (("given", 0.5), ("ends_with", 0.5), ("any", 0.25)):
         for counter in (None, SequenceNumber(0, "u1", mask=0x0F)):
@@ -55,7 +55,7 @@ def recordings() -> Iterator[tuple[str, Recording | None]]:
             yield name.removeprefix("Test"), of_driver(suite())
 
 
-def fingertip(order: Any, age: float, counter: SequenceNumber | None) -> Recording:
+def fingertip(order: Any, age: float, counter: SequenceNumber | None) -> Bursts:
     """Four frames of three taxels, with the number of the burst in the first byte."""
     frames = [
         Frame(f"quarter {i}", [Identifier(0x405 + 2 * i)], [7], Values(1, "<u2", 3, to=range(3 * i, 3 * i + 3)))
@@ -72,22 +72,22 @@ def fingertip(order: Any, age: float, counter: SequenceNumber | None) -> Recordi
     return made
 
 
-def of_driver(suite: Suite) -> Recording | None:
+def of_driver(suite: Suite) -> Bursts | None:
     """What its emulator sends; None if a frame is all of an update."""
 
-    async def scenario(clock: HandClock) -> Recording | None:
+    async def scenario(clock: HandClock) -> Bursts | None:
         async with suite.running(clock) as rig:
             await rig.until_fresh()
             if not rig.adapter.layout.cycles:
                 return None
-            heard = Heard(rig)
+            heard = FrameLog(rig)
             await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
             return heard.recording(BURSTS)
 
     return play(scenario)
 
 
-def suffer(recording: Recording, troubles: int, random: np.random.Generator) -> tuple[Indices, Indices]:
+def suffer(recording: Bursts, troubles: int, random: np.random.Generator) -> tuple[Indices, Indices]:
     """Rows that arrive, and when, after so many things have gone wrong."""
     size, period_ns = recording.size, round(recording.period_s * 1e9)
     rows, time_ns = np.arange(len(recording.wire)), recording.time_ns.copy()
@@ -109,7 +109,7 @@ def suffer(recording: Recording, troubles: int, random: np.random.Generator) -> 
     return rows, np.maximum.accumulate(time_ns - behind_ns) + behind_ns
 
 
-def run(recording: Recording, cycles: int, most: int, seed: int) -> tuple[int, int, int]:
+def run(recording: Bursts, cycles: int, most: int, seed: int) -> tuple[int, int, int]:
     """Replay at least so many cycles; returns how many were sent, shown as fresh, and torn."""
     random = np.random.default_rng(seed)
     modules = max(1, len(np.unique(find_torn(recording, np.arange(len(recording.wire)), recording.time_ns)[0].module)))

@@ -54,7 +54,7 @@ class LoadSource:
         if driver_type != _CALM_TYPE:
             self._chain = ChainSettings.calm().chain(structure)
             if self.type_name not in self._chain.baselines:
-                raise ConfigurationError(f"{self.type_name} sensors have no rest that a touch raises them from")
+                raise ConfigurationError(f"{self.type_name} sensors have no rest to return to")
             self._values = np.zeros(structure.n_sensors, np.float32)
             self._status = np.zeros(structure.n_sensors, np.uint8)
 

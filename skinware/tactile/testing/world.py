@@ -49,7 +49,7 @@ class Block:
             ConfigurationError: there is no block.
         """
         if not blocks:
-            raise ConfigurationError("no frames: the time is over before it began")
+            raise ConfigurationError("no frames: give a later end")
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 

@@ -1,20 +1,26 @@
-// Figures as people read them.
+// Figures for people: ages, rates and counts as skinware/text.py writes them.
 
 const NONE = "–";
 export const isKnown = (x) => x !== null && x !== undefined && !Number.isNaN(x);
 
-/** Milliseconds as an age: "4 ms", "1.2 s", "3 min". */
+/** An age in milliseconds: "0.6 ms", "12 ms", "1.2 s", "3 min", "2 h". */
 export function age(ms) {
   if (!isKnown(ms)) return NONE;
-  if (ms < 10) return `${ms.toFixed(1)} ms`;
-  if (ms < 1000) return `${ms.toFixed(0)} ms`;
-  if (ms < 100_000) return `${(ms / 1000).toFixed(1)} s`;
-  return `${(ms / 60_000).toFixed(0)} min`;
+  const milliseconds = Math.max(0, ms);
+  if (milliseconds > 0 && milliseconds < 0.0995) return `${Math.max(1, Math.round(1000 * milliseconds))} us`;
+  if (milliseconds < 9.95) return `${milliseconds.toFixed(1)} ms`;
+  if (milliseconds < 999.5) return `${milliseconds.toFixed(0)} ms`;
+  const seconds = milliseconds / 1000;
+  if (seconds < 99.95) return `${seconds.toFixed(1)} s`;
+  const minutes = seconds / 60;
+  return minutes < 99.5 ? `${minutes.toFixed(0)} min` : `${(minutes / 60).toFixed(0)} h`;
 }
 
+/** A rate: "0.25 Hz", "20.0 Hz", "1000 Hz". */
 export function rate(hz) {
   if (!isKnown(hz)) return NONE;
-  return `${hz < 10 && hz > 0 ? hz.toFixed(1) : hz.toFixed(0)} Hz`;
+  if (hz > 0 && hz < 1) return `${hz.toFixed(2)} Hz`;
+  return `${hz < 999.95 ? hz.toFixed(1) : hz.toFixed(0)} Hz`;
 }
 
 /** A part of 1 in per cent. */
@@ -39,8 +45,9 @@ export function measure(x, unit) {
   return isKnown(x) && unit ? `${figure(x)} ${unit}` : figure(x);
 }
 
+/** A count: "30,848". */
 export function count(n) {
-  return isKnown(n) ? n.toLocaleString("en").replaceAll(",", "\u202f") : NONE;
+  return isKnown(n) ? n.toLocaleString("en") : NONE;
 }
 
 export function bytes(n) {

@@ -187,11 +187,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             await self._switch(link, patch, on)
             (self._disabled.discard if on else self._disabled.add)(patch.key)
 
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch the baselines of the boards."""
-        return BaselineWatch(tables)
-
     def _set_ups(self, boards: Iterable[int]) -> list[BoardSetUp]:
         return [BoardSetUp(self.options, board, is_mtb4=self._is_mtb4(board)) for board in boards]
 

@@ -1,4 +1,4 @@
-// The view in the part of the address behind "#": whoever opens it sees the same.
+// The view in the part of the address behind "#": another browser that opens it shows the same.
 
 const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 

@@ -16,15 +16,15 @@ export class Bar {
     for (const id of this.#chips.keys()) if (!skin.drivers.has(id)) this.#chips.delete(id);
     for (const [id, driver] of skin.drivers) {
       if (!this.#chips.has(id)) this.#chips.set(id, h("span", { class: "figure" }, h("b"), h("span")));
-      const told = states.get(id) ?? {};
+      const figures = states.get(id) ?? {};
       const chip = this.#chips.get(id);
-      chip.dataset.bad = badness(driver.isCut ? "stale" : told.state);
+      chip.dataset.bad = badness(driver.isCut ? "stale" : figures.state);
       chip.dataset.driver = driver.key;
       setText(chip.firstChild, driver.name);
-      const state = driver.isCut ? "no connection" : badness(told.state) ? told.state : null;
-      const fresh = told.fresh === undefined ? null : `${count(told.fresh)}/${count(told.sensors)} fresh`;
-      const parts = [state, rate(told.rate_hz), age(told.age_ms), fresh, `lost ${count(told.lost)}`];
-      if (told.load !== undefined && told.load !== null) parts.push(`load ${percent(told.load)}`);
+      const state = driver.isCut ? "no connection" : badness(figures.state) ? figures.state : null;
+      const fresh = figures.fresh === undefined ? null : `${count(figures.fresh)}/${count(figures.sensors)} fresh`;
+      const parts = [state, rate(figures.rate_hz), age(figures.age_ms), fresh, `lost ${count(figures.lost)}`];
+      if (figures.load !== undefined && figures.load !== null) parts.push(`load ${percent(figures.load)}`);
       setText(chip.lastChild, parts.filter(Boolean).join(" · "));
     }
     const drawing = `${stage.fps.toFixed(0)} pictures/s`;

@@ -1,4 +1,4 @@
-// Cards that tell all of one taxel: the one under the pointer, and those that are pinned.
+// Cards with everything about one taxel: the one under the pointer, and the pinned ones.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { age, figure, measure } from "./format.js";

@@ -69,7 +69,7 @@ void main() {
     float pen = clamp(1.3 / slope.z, 0.14, 0.4);
     bool rim = r > 1.0 - pen;
     vec3 soft = mix(ground, ink, 0.45);
-    vec3 away = distance(c, ink) > distance(c, ground) ? ink : ground;  // what is seen best on the colour
+    vec3 away = distance(c, ink) > distance(c, ground) ? ink : ground;  // the ink with the greater contrast
     if (kind == 1u) { if (rim) c = soft; else if (r > 0.62) c = ground; }
     else if (kind == 2u) { if (rim || (r > 1.0 - 3.0 * pen && r < 1.0 - 2.0 * pen)) c = away; }
     else if (kind == 3u) { if (r < 0.3) c = ink; else if (r < 0.66) c = ground; }

@@ -26,7 +26,7 @@ export class Past {
     this.#forget(at_ms);
   }
 
-  /** What a sheet showed at a time: the newest until then, the oldest if there is none, null of an unknown sheet. */
+  /** The picture of a sheet at a time: the newest until then, or else the oldest; null for an unknown sheet. */
   at(sheet, at_ms) {
     const series = this.#series.get(sheet);
     if (!series?.length) return null;

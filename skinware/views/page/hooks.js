@@ -1,4 +1,4 @@
-// What tests and scripts read of the page, as `window.skin`; nothing in it changes anything.
+// The state of the page for tests and scripts, as `window.skin`; nothing in it changes anything.
 
 import { DIMMED, MARKS } from "./marks.js";
 import { ramp } from "./palette.js";
@@ -47,7 +47,7 @@ export function hooks({ skin, stage, tree, probes, rewind, past, view, now }) {
       return [box.left + x, box.top + y];
     },
 
-    /** What is shown of a taxel; null if there is none. */
+    /** A taxel as it is shown; null if there is none. */
     stateOf(driver, position) {
       const found = skin.find(driver, position);
       if (!found) return null;

@@ -1,4 +1,4 @@
-// What is kept of a skin: a picture of the view, and a recording, which the server makes.
+// Save a picture of the view, and control a recording, which the server makes.
 
 import { h, save, setPressed, setText, stamp } from "./dom.js";
 import { bytes, clock } from "./format.js";
@@ -14,9 +14,9 @@ export function savePicture(stage, overlay) {
 }
 
 /** Show on its button how far a recording has come; null: none is made. */
-export function showRecording(button, told) {
-  setPressed(button, Boolean(told));
-  const lost = told?.lost ? `, ${told.lost} lost` : "";
-  setText(button.lastElementChild, told ? `${clock(told.s)} · ${bytes(told.bytes)}${lost}` : "Record");
-  button.title = told ? `${told.file} (r ends it)` : "Record (r)";
+export function showRecording(button, recording) {
+  setPressed(button, Boolean(recording));
+  const lost = recording?.lost ? `, ${recording.lost} lost` : "";
+  setText(button.lastElementChild, recording ? `${clock(recording.s)} · ${bytes(recording.bytes)}${lost}` : "Record");
+  button.title = recording ? `${recording.file} (r ends it)` : "Record (r)";
 }

@@ -1,4 +1,4 @@
-// What keys do, and the page that tells it.
+// The actions of keys, and the page that lists them.
 
 import { h } from "./dom.js";
 import { FRESH, MARKS } from "./marks.js";

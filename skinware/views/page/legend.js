@@ -1,4 +1,4 @@
-// What colours and marks mean: each scale in use with its ends, unit and drivers, and the marks in view with their counts.
+// The meaning of colours and marks: each scale in use with its ends, unit and drivers, and the marks in view with their counts.
 
 import { byId, h, setChildren, setHidden, setPressed, setText } from "./dom.js";
 import { count, figure, measure } from "./format.js";
@@ -7,7 +7,7 @@ import { gradient } from "./palette.js";
 import { CLEAR, inksOf, signOf } from "./signs.js";
 
 const SIZE = 16;
-const MIDDLE_LEVEL = 90; // of marks that show a value
+const MIDDLE_LEVEL = 90; // for marks that show a value
 
 export class Legend {
   #items = new Map(); // mark -> element

@@ -3,7 +3,7 @@
 export const PROTOCOL = "skinware.view.2";
 const FIRST_WAIT_MS = 300;
 const LONGEST_WAIT_MS = 4000;
-const SILENCE_MS = 3000; // the server answers within 0.5 s, however little there is to tell
+const SILENCE_MS = 3000; // the server answers within 0.5 s, also without news
 
 export class Link {
   #socket = null;
@@ -59,7 +59,7 @@ export class Link {
   #listen(socket) {
     clearTimeout(this.#silence);
     this.#silence = setTimeout(() => {
-      socket.onclose = null; // closing takes long where nobody answers
+      socket.onclose = null; // closing takes long without an answer
       socket.close();
       this.#lost("no answer");
     }, SILENCE_MS);

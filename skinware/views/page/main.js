@@ -29,7 +29,7 @@ import { Wipe } from "./wipe.js";
 
 const MODES = { raw: "Values", change: "Change", peak: "Peaks", wipe: "Wipe test" };
 const [TURN, NEARER, SCROLL_S] = [0.12, 0.85, 0.2]; // of a key: rad, of the distance, s
-const TELL_EVERY_MS = 90; // figures that change more often cannot be read
+const FIGURES_EVERY_MS = 90; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
@@ -53,7 +53,7 @@ const now = {
   problems: [],
   recording: null,
   wipe: null,
-  told_ms: 0, // when figures were brought up to date
+  figures_ms: 0, // when figures were brought up to date
 };
 
 const stage = new Stage(byId("stage"), {
@@ -92,7 +92,7 @@ const legend = new Legend((scale) => {
 });
 const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: byId("when") }, past, () => {
   show();
-  tell();
+  showFigures();
 });
 const replay = new ReplayControls(byId("replay"), (action, value) => send({ op: "replay", action, value }));
 const modes = new Modes(byId("modes"), MODES, setMode);
@@ -104,7 +104,7 @@ const wipe = new Wipe(byId("wipe"), {
 
 // -- what comes from the server ---------------------------------------------------------------------------------
 
-/** What a connection is worth shows at its first turn; until then what is shown stays old. */
+/** A connection counts from its first turn; until then the picture stays old. */
 function connected() {
   now.isAlive = false;
   sendLook();
@@ -120,37 +120,37 @@ function disconnected(reason, wait_ms) {
   now.isAlive = false;
   const why = reason ? ` (${reason})` : "";
   const again = `Trying again in ${(wait_ms / 1000).toFixed(1)} s.`;
-  setText(byId("lost"), `No connection to skin-view${why}. What is shown is old. ${again}`);
+  setText(byId("lost"), `No connection to skin-view${why}. The picture is old. ${again}`);
   setHidden(byId("lost"), false);
   skin.cut(true);
   show();
-  tell();
+  showFigures();
 }
 
 function turn(message) {
-  const told = decode(message);
-  const { header } = told;
+  const taken = decode(message);
+  const { header } = taken;
   if (!now.isAlive) alive();
   if (header.skin?.protocol && header.skin.protocol !== PROTOCOL) return reload(header.skin.protocol);
   now.turn = header.turn;
   if (header.error) notify(header.error);
-  if (skin.take(header, told.blob)) restructured();
+  if (skin.take(header, taken.blob)) restructured();
   if (header.state) takeState(header.state);
   if (header.wipe) now.wipe = header.wipe;
   now.contacts = touches.update(skin, { contacts: lastOf("contacts", header), regions: lastOf("regions", header) });
-  probes.take(told, performance.now());
+  probes.take(taken, performance.now());
   wipe.update(header.wipe);
   if (!rewind.isPaused) {
     remember(header.pictures);
     if (header.pictures || header.state || header.skin) show();
   }
-  if (performance.now() - now.told_ms > TELL_EVERY_MS) tell();
+  if (performance.now() - now.figures_ms > FIGURES_EVERY_MS) showFigures();
   afterFrame(() => link.next());
 }
 
 const newest = {};
 
-/** What a turn tells of something, or the one before it. */
+/** The newest value of a key of the header, from this turn or an earlier one. */
 function lastOf(name, header) {
   if (name in header) newest[name] = header[name];
   return newest[name];
@@ -176,11 +176,11 @@ function restructured() {
 }
 
 function takeState(state) {
-  for (const told of state.drivers ?? []) states.set(told.id, told);
+  for (const driver of state.drivers ?? []) states.set(driver.id, driver);
   now.problems = (state.problems ?? []).map(({ severity, driver, bus, patch, text }) => {
     const { name = driver, key = null } = skin.drivers.get(driver) ?? {};
-    const told = name === null || name === undefined ? text : `${name}: ${text}`;
-    return { severity, text: told, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    const named = name === null || name === undefined ? text : `${name}: ${text}`;
+    return { severity, text: named, key: key && [key, bus, patch].filter(Boolean).join("/") };
   });
   now.recording = state.recording ?? null;
   tree.update(skin, states);
@@ -207,8 +207,8 @@ function show() {
 }
 
 /** Bring everything beside the picture up to date. */
-function tell() {
-  now.told_ms = performance.now();
+function showFigures() {
+  now.figures_ms = performance.now();
   const isPast = rewind.isPaused;
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
   bar.update(skin, states, stage, now.recording);
@@ -320,12 +320,12 @@ function setTheme(theme, isChosen) {
   stage.setTheme(theme);
   legend.setTheme(theme);
   if (isChosen) storeTheme(theme);
-  tell();
+  showFigures();
 }
 
 function pin(found) {
   probes.toggle(found);
-  tell();
+  showFigures();
   stage.ask();
   keep();
 }
@@ -333,7 +333,7 @@ function pin(found) {
 function hover(found) {
   if (!probes.hover(found)) return;
   stage.ask();
-  tell();
+  showFigures();
 }
 
 /** Point at the taxel after the one that is pointed at, among those selected; for those without a mouse. */
@@ -356,7 +356,7 @@ function release() {
   probes.clear();
   probes.hover(null);
   choose(null);
-  tell();
+  showFigures();
 }
 
 let keepTimer = 0;

@@ -1,4 +1,4 @@
-// What a taxel's status looks like: one mark out of its bits, the same order as in skin-top.
+// The mark of a taxel's status: one for all its bits, in the same order as in skin-top.
 
 export const FRESH = 0;
 export const STALE = 1;

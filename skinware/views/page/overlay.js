@@ -1,4 +1,4 @@
-// What is drawn over the taxels: normals, shear, contacts, regions' names, and rings around taxels that are looked at.
+// Draw over the taxels: normals, shear, contacts, names of regions, and rings around chosen taxels.
 
 import { GROUND, INK } from "./palette.js";
 

@@ -1,4 +1,4 @@
-// Colours of levels: the further from the ground, the more. Brightness alone tells levels apart.
+// Colours of levels: the further from the ground, the more. Brightness alone distinguishes levels.
 
 export const TOP = 250; // levels 0 to 250
 

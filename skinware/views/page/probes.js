@@ -1,4 +1,4 @@
-// The taxels that somebody looks at: one under the pointer, some pinned; and what the server tells of each of them.
+// The chosen taxels, one under the pointer and some pinned, with the exact values that the server sends.
 
 const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
 const MOST_PINS = 12;
@@ -120,13 +120,13 @@ export class Probes {
     }
   }
 
-  /** A turn came: take what it tells, and ask for the next line of 10 s. */
+  /** Take a turn, and ask for the next line of 10 s. */
   take({ header, blob }, now_ms) {
     const of = ({ driver, position }) =>
       this.all.find((probe) => probe.sheet.driver.id === driver && probe.position === position);
-    for (const told of header.exact ?? []) {
-      const probe = of(told);
-      if (probe) probe.exact = told;
+    for (const exact of header.exact ?? []) {
+      const probe = of(exact);
+      if (probe) probe.exact = exact;
     }
     const series = header.series;
     const probe = series && of(series);

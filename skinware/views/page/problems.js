@@ -1,4 +1,4 @@
-// What is wrong, worst first; each selects what it is about.
+// Problems, the worst first; each selects its driver, bus or patch.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
 

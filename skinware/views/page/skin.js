@@ -1,4 +1,4 @@
-// What the page knows of the skin: drivers, their sheets of taxels, and the newest values as they came.
+// The skin as the page knows it: drivers, their sheets of taxels, and the newest values.
 
 import { fillMarks } from "./marks.js";
 import { TOP } from "./palette.js";
@@ -8,17 +8,17 @@ const DRAWN_PART = 0.44; // radius of a disc, of the distance to its neighbour
 
 /** n taxels of one type of a driver. */
 class Sheet {
-  constructor(driver, told, blob) {
+  constructor(driver, table, blob) {
     this.driver = driver;
-    this.type = told.name;
-    this.unit = told.unit ?? "";
-    this.n = told.n;
-    this.hasShear = Boolean(told.axes);
-    this.index = blob(told.index, Uint32Array); // positions in a frame
-    this.uid = told.uid ? blob(told.uid, BigUint64Array) : null;
-    this.patch = blob(told.patch, Uint16Array);
-    this.module = blob(told.module, Uint16Array);
-    this.arrange(told, blob);
+    this.type = table.name;
+    this.unit = table.unit ?? "";
+    this.n = table.n;
+    this.hasShear = Boolean(table.axes);
+    this.index = blob(table.index, Uint32Array); // positions in a frame
+    this.uid = table.uid ? blob(table.uid, BigUint64Array) : null;
+    this.patch = blob(table.patch, Uint16Array);
+    this.module = blob(table.module, Uint16Array);
+    this.arrange(table, blob);
     this.names = null; // asked for when somebody points at one
     this.status = new Uint8Array(this.n).fill(1); // never seen, until a picture says more
     this.levels = new Uint8Array(this.n).fill(NOTHING);
@@ -32,12 +32,12 @@ class Sheet {
   }
 
   /** Where the taxels are; that may change while they stay the same. */
-  arrange(told, blob) {
-    this.placed = told.placed;
-    this.position = blob(told.position, Float32Array);
-    this.normal = withZeros(told.normal ? blob(told.normal, Float32Array) : new Float32Array(3 * this.n));
-    const spacing = told.neighbour_spacing_m || smallestStep(this.position);
-    const given = told.radius ? blob(told.radius, Float32Array) : new Float32Array(this.n).fill(NaN);
+  arrange(table, blob) {
+    this.placed = table.placed;
+    this.position = blob(table.position, Float32Array);
+    this.normal = withZeros(table.normal ? blob(table.normal, Float32Array) : new Float32Array(3 * this.n));
+    const spacing = table.neighbour_spacing_m || smallestStep(this.position);
+    const given = table.radius ? blob(table.radius, Float32Array) : new Float32Array(this.n).fill(NaN);
     this.radius = given.map((r) => (spacing > 0 ? DRAWN_PART * spacing : r > 0 ? r : 0.002));
   }
 
@@ -64,7 +64,7 @@ class Sheet {
     if (fillMarks(status, levels, marks, how)) this.marksVersion++;
   }
 
-  /** The value that is shown of a taxel, as exactly as its level tells it; null if there is none. */
+  /** The value of a taxel, as exact as its level; null without one. */
   valueOf(i) {
     const { levels, scale } = this.shown;
     return levels[i] > TOP ? null : scale[0] + (levels[i] / TOP) * (scale[1] - scale[0]);
@@ -78,18 +78,18 @@ class Sheet {
 
 /** A driver of a generation. */
 class Driver {
-  constructor(told, blob) {
-    this.id = told.id;
-    this.name = told.name;
-    this.namespace = told.namespace;
-    this.key = keyOf(told);
-    this.generation = told.generation;
-    this.buses = told.buses ?? [];
-    this.patches = told.patches ?? [];
-    this.modules = told.modules ?? [];
+  constructor(table, blob) {
+    this.id = table.id;
+    this.name = table.name;
+    this.namespace = table.namespace;
+    this.key = keyOf(table);
+    this.generation = table.generation;
+    this.buses = table.buses ?? [];
+    this.patches = table.patches ?? [];
+    this.modules = table.modules ?? [];
     this.state = "live";
     this.isCut = false; // the connection to the server is lost
-    this.sheets = new Map(told.types.map((type) => [type.name, new Sheet(this, type, blob)]));
+    this.sheets = new Map(table.types.map((type) => [type.name, new Sheet(this, type, blob)]));
   }
 
   get isOld() {
@@ -104,19 +104,19 @@ export class Skin {
   mode = "raw"; // of the newest pictures
 
   /**
-   * Take what a turn tells of the skin itself, of names and of values.
+   * Take tables, names and values from a turn.
    * @returns {boolean} the structure is another one.
    */
   take(header, blob) {
     if (header.skin) {
       this.namespaces = header.skin.namespaces ?? [];
       this.links = header.skin.links ?? [];
-      this.drivers = new Map(header.skin.drivers.map((told) => [told.id, this.#driver(told, blob)]));
+      this.drivers = new Map(header.skin.drivers.map((table) => [table.id, this.#driver(table, blob)]));
     }
     this.mode = header.mode ?? this.mode;
-    for (const told of header.state?.drivers ?? []) {
-      const driver = this.drivers.get(told.id);
-      if (driver) driver.state = told.state;
+    for (const table of header.state?.drivers ?? []) {
+      const driver = this.drivers.get(table.id);
+      if (driver) driver.state = table.state;
     }
     for (const picture of header.pictures ?? []) {
       const sheet = this.sheet(picture.driver, picture.type);
@@ -128,10 +128,10 @@ export class Skin {
   }
 
   /** A driver whose structure is known is kept, with what is known of its taxels. */
-  #driver(told, blob) {
-    const driver = this.drivers.get(told.id);
-    if (driver?.generation !== told.generation || driver.key !== keyOf(told)) return new Driver(told, blob);
-    for (const type of told.types) driver.sheets.get(type.name).arrange(type, blob);
+  #driver(table, blob) {
+    const driver = this.drivers.get(table.id);
+    if (driver?.generation !== table.generation || driver.key !== keyOf(table)) return new Driver(table, blob);
+    for (const type of table.types) driver.sheets.get(type.name).arrange(type, blob);
     return driver;
   }
 
@@ -145,7 +145,7 @@ export class Skin {
     return type === undefined ? all : all.filter((sheet) => sheet.type === type);
   }
 
-  /** What is drawn: the sheets of a type; of none, the first of each driver. */
+  /** The sheets to draw: those of a type, or without a type the first of each driver. */
   shown(type) {
     const firsts = [...this.drivers.values()].map((driver) => driver.sheets.values().next().value);
     return type ? this.sheets(type) : firsts.filter(Boolean);

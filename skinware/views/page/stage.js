@@ -6,7 +6,7 @@ import { eyeOf } from "./framing.js";
 import { Solid } from "./solid.js";
 
 const VIEW_ANGLE = 35; // degrees, from the bottom of the picture to its top
-const FILLED = 0.95; // of the picture, by what is to be seen
+const FILLED = 0.95; // part of the picture that the taxels fill
 const BELOW = 44; // CSS pixels, of the scale
 const SLOW_MS = 55;
 const QUICK_MS = 24;
@@ -21,7 +21,7 @@ export class Stage {
   /**
    * @param {HTMLElement} host what the canvases fill.
    * @param {object} options `flat`: without WebGL; `sharp`: in all pixels, however slow; `theme`; `drawOver(stage)`:
-   *     draws over each frame; `moved()`: the eye moved; `resized()`: nobody has turned the view, which has another
+   *     draws over each frame; `moved()`: the eye moved; `resized()`: the view, which was not turned, has another
    *     size now; `changed()`: taxels are drawn another way now.
    */
   constructor(host, options) {

@@ -1,4 +1,4 @@
-// Contacts and regions, where services tell them: lists, and where contacts are drawn.
+// Contacts and regions that services publish: their lists, and the places of contacts.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { short } from "./format.js";
@@ -30,7 +30,7 @@ export class Touches {
       places.map((contact) => [
         `${contact.id}`,
         contact.kind ?? "",
-        load.tell(contact.load, contact.unit),
+        load.write(contact.load, contact.unit),
         short(1000 * contact.speed),
         short(contact.age_s),
       ]),
@@ -41,17 +41,17 @@ export class Touches {
     setText(this.regionHead.cells[1], region.unit);
     fill(
       this.regionRows,
-      regions.map(({ name, value, unit, touched }) => [name, region.tell(value, unit), touched ? "◉ touched" : ""]),
+      regions.map(({ name, value, unit, touched }) => [name, region.write(value, unit), touched ? "◉ touched" : ""]),
     );
     return places.filter(({ at }) => at);
   }
 }
 
-/** The unit that all of them have, for the head of their column, and how each is told; several units stay with each. */
-function inUnit(told) {
-  const units = new Set(told.map(({ unit }) => unit ?? ""));
-  if (units.size > 1) return { unit: "", tell: (x, unit) => `${short(x)} ${unit ?? ""}`.trim() };
-  return { unit: [...units][0] ?? "", tell: short };
+/** The unit of all rows for the head of a column, and the text of a value; with several units, each value has its own. */
+function inUnit(rows) {
+  const units = new Set(rows.map(({ unit }) => unit ?? ""));
+  if (units.size > 1) return { unit: "", write: (x, unit) => `${short(x)} ${unit ?? ""}`.trim() };
+  return { unit: [...units][0] ?? "", write: short };
 }
 
 function placeOf(skin, { position, driver, sensor }) {

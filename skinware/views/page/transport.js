@@ -62,7 +62,7 @@ export class ReplayControls {
     this.host = host;
     this.act = act;
     const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
-    const toggle = () => act(this.told.paused ? "resume" : "pause", null);
+    const toggle = () => act(this.replay.paused ? "resume" : "pause", null);
     this.play = button("Pause", "Stop or go on with the replay", toggle);
     this.back = button("Back", "One frame back (,)", () => this.step(-1));
     this.on = button("Step", "One frame on (.)", () => this.step(1));
@@ -70,7 +70,7 @@ export class ReplayControls {
     this.slider.addEventListener("change", () => act("seek", Number(this.slider.value)));
     this.speed = h("select", { "aria-label": "Speed" }, ...SPEEDS.map((x) => h("option", { value: x }, `${x}×`)));
     this.speed.addEventListener("change", () => act("speed", Number(this.speed.value)));
-    this.loop = button("Loop", "Begin anew at the end", () => act("loop", !this.told.loop));
+    this.loop = button("Loop", "Begin again at the end", () => act("loop", !this.replay.loop));
     this.when = h("output");
     const { play, back, on, slider, when, speed, loop } = this;
     host.append(h("span", { class: "name" }, "Replay"), play, back, on, slider, when, speed, loop);
@@ -78,22 +78,22 @@ export class ReplayControls {
 
   /** Go so many frames on, or back. */
   step(frames) {
-    if (this.told) this.act("step", frames);
+    if (this.replay) this.act("step", frames);
   }
 
-  update(told) {
-    setHidden(this.host, !told);
-    this.told = told;
-    if (!told) return;
-    setText(this.play, told.paused ? "Play" : "Pause");
-    setPressed(this.loop, Boolean(told.loop));
-    this.slider.max = told.duration_s;
-    if (!this.slider.matches(":active")) this.slider.value = told.time_s;
-    if (![...this.speed.options].some(({ value }) => Number(value) === told.speed)) {
-      this.speed.append(h("option", { value: told.speed }, `${told.speed}×`));
+  update(replay) {
+    setHidden(this.host, !replay);
+    this.replay = replay;
+    if (!replay) return;
+    setText(this.play, replay.paused ? "Play" : "Pause");
+    setPressed(this.loop, Boolean(replay.loop));
+    this.slider.max = replay.duration_s;
+    if (!this.slider.matches(":active")) this.slider.value = replay.time_s;
+    if (![...this.speed.options].some(({ value }) => Number(value) === replay.speed)) {
+      this.speed.append(h("option", { value: replay.speed }, `${replay.speed}×`));
     }
-    if (document.activeElement !== this.speed) this.speed.value = String(told.speed);
-    setText(this.when, `${clock(told.time_s)} of ${clock(told.duration_s)}`);
-    this.host.title = told.file ?? "";
+    if (document.activeElement !== this.speed) this.speed.value = String(replay.speed);
+    setText(this.when, `${clock(replay.time_s)} of ${clock(replay.duration_s)}`);
+    this.host.title = replay.file ?? "";
   }
 }

@@ -14,7 +14,7 @@ export function badness(state) {
   return 1;
 }
 
-const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: told apart without colour
+const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: distinguishable without colour
 
 /**
  * The rows of the tree, in order.
@@ -23,8 +23,8 @@ const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: told apart without co
  */
 export function rowsOf(drivers, states) {
   const worst = (rows) => rows.toSorted((one, other) => other.bad - one.bad); // stable
-  const rowOf = (level, key, name, told, more) => {
-    return { level, key, name, told: told ?? {}, bad: badness(told?.state), ...more };
+  const rowOf = (level, key, name, report, more) => {
+    return { level, key, name, report: report ?? {}, bad: badness(report?.state), ...more };
   };
   const branches = [...drivers].map((driver) => {
     const state = states.get(driver.id);
@@ -113,13 +113,13 @@ export class Tree {
       this.#rows.set(row.key, element);
     }
     const [fold, sign, name, state, figures] = element.children;
-    const own = badness(row.told.state);
+    const own = badness(row.report.state);
     setText(fold, row.children?.length ? (this.#isFolded(row) ? "▸" : "▾") : "");
     if (row.children?.length) element.setAttribute("aria-expanded", String(!this.#isFolded(row)));
     setText(sign, SIGNS[own]);
     element.dataset.bad = own;
     setText(name, row.level === 1 && this.severalNamespaces ? `${row.name} · ${row.driver.namespace}` : row.name);
-    setText(state, own ? [row.told.state, row.told.reason].filter(Boolean).join(": ") : "");
+    setText(state, own ? [row.report.state, row.report.reason].filter(Boolean).join(": ") : "");
     const texts = figuresOf(row);
     while (figures.children.length < texts.length) figures.append(h("span"));
     texts.forEach((text, i) => setText(figures.children[i], text));
@@ -165,7 +165,7 @@ export class Tree {
 }
 
 /** Texts of a row's figures; always as many for a row of a level. */
-function figuresOf({ level, told }) {
-  if (level === 2) return [isKnown(told.load) ? percent(told.load) : ""];
-  return [isKnown(told.rate_hz) ? rate(told.rate_hz) : "", isKnown(told.age_ms) ? age(told.age_ms) : ""];
+function figuresOf({ level, report }) {
+  if (level === 2) return [isKnown(report.load) ? percent(report.load) : ""];
+  return [isKnown(report.rate_hz) ? rate(report.rate_hz) : "", isKnown(report.age_ms) ? age(report.age_ms) : ""];
 }

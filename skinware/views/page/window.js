@@ -1,9 +1,9 @@
-// What the page wants of the browser's window: notices, a chosen theme that is kept, files, reloading.
+// The browser's window: notices, the chosen theme, files, reloading.
 
 import { byId, setHidden, setText } from "./dom.js";
 
 const NOTICE_MS = 6000;
-const UNSEEN_MS = 1000; // between turns of a page that nobody sees
+const UNSEEN_MS = 1000; // between turns of a hidden page
 
 let noticeTimer = 0;
 
@@ -15,7 +15,7 @@ export function notify(text) {
   noticeTimer = setTimeout(() => setHidden(byId("notice"), true), NOTICE_MS);
 }
 
-/** Load the page anew, since it is of another version than the server; but not for ever. */
+/** Load the page again, because it has another version than the server; but only once. */
 export function reload(version) {
   const isDone = sessionStorage.getItem("reloaded") === version;
   if (isDone) return notify("This page and skin-view are of different versions.");
@@ -23,7 +23,7 @@ export function reload(version) {
   location.reload();
 }
 
-/** Go on when the next frame is drawn; of a page that nobody sees, none is. */
+/** Call back when the next frame is drawn; a hidden page draws none. */
 export function afterFrame(go) {
   let isDone = false;
   const once = () => {

@@ -12,9 +12,9 @@ export function untouched(sheets) {
 }
 
 /** The list as a text: a line for each, with its place in a frame, its uid and its name. */
-function listOf(sheets, told) {
+function listOf(sheets, progress) {
   const found = untouched(sheets);
-  const title = `# ${told.touched} of ${told.of} touched; those that were not:`;
+  const title = `# ${progress.touched} of ${progress.of} touched; those that were not:`;
   const head = [title, "# driver, position in a frame, uid, name"];
   const rows = found.map(({ sheet, i }) =>
     [sheet.driver.name, sheet.index[i], `0x${sheet.uid[i].toString(16)}`, sheet.names?.[i] ?? ""].join("\t"),
@@ -41,7 +41,7 @@ export class Wipe {
     if (isShown === !this.host.hidden) return;
     setHidden(this.host, !isShown);
     this.isRunning = isShown;
-    this.told = null;
+    this.progress = null;
     setText(this.text, "Wipe over the whole skin");
     setText(this.run, "Stop");
   }
@@ -52,18 +52,18 @@ export class Wipe {
     this.actions[this.isRunning ? "start" : "stop"]();
   }
 
-  update(told) {
-    if (!told) return;
-    this.told = told;
-    this.isRunning = told.running ?? this.isRunning;
+  update(progress) {
+    if (!progress) return;
+    this.progress = progress;
+    this.isRunning = progress.running ?? this.isRunning;
     setText(this.run, this.isRunning ? "Stop" : "Start anew");
-    setText(this.text, `${count(told.touched)} of ${count(told.of)} touched`);
-    this.meter.max = Math.max(told.of, 1);
-    this.meter.value = told.touched;
+    setText(this.text, `${count(progress.touched)} of ${count(progress.of)} touched`);
+    this.meter.max = Math.max(progress.of, 1);
+    this.meter.value = progress.touched;
   }
 
   save() {
-    if (!this.told) return;
-    save(new Blob([listOf(this.actions.sheets(), this.told)], { type: "text/plain" }), `never-touched-${stamp()}.txt`);
+    if (!this.progress) return;
+    save(new Blob([listOf(this.actions.sheets(), this.progress)], { type: "text/plain" }), `never-touched-${stamp()}.txt`);
   }
 }

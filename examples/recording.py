@@ -1,4 +1,4 @@
-"""What a skin felt in a recording: of every driver the frames, the patches that felt most, and the strongest moment.
+"""Print what a recorded skin felt: for each driver its samples, its busiest patches and its strongest moment.
 
 ``python examples/recording.py walk.mcap``; needs ``pip install 'skinware[record]'``. As arrays throughout: each line
 works in a notebook too.

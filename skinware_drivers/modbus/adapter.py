@@ -74,6 +74,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         address_step: from the address of one register to the next: 2 where addresses count bytes.
         largest_gap: unwanted registers that are read along at most, to save a question.
         most_registers: of a read.
+        asks_first: ask for no registers before ``describe`` has asked the device which it has.
         follows_line: lengthen ``period_s`` where a serial line is too slow for it; see also :meth:`learn_period`.
     """
 
@@ -88,6 +89,7 @@ class ModbusAdapter(Adapter[OptionsT]):
     address_step: int = 1
     largest_gap: int = 16
     most_registers: int = wire.MOST_REGISTERS
+    asks_first: ClassVar[bool] = False
     follows_line: bool = False
     _line: ModbusBus | None = None
 
@@ -131,7 +133,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         """
         super().fit(bus)
         self._line = bus if isinstance(bus, ModbusBus) else None
-        self.use_registers(self.registers)
+        self.use_registers(() if self.asks_first and not bus.listen_only else self.registers)
 
     def use_registers(self, registers: Sequence[Registers]) -> None:
         """Read other registers from now on, for devices that are asked in ``describe`` which they have.

@@ -33,7 +33,6 @@ from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -102,15 +101,11 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))
     timeout_s = 0.05
+    watch = DfrobotWatch
 
     def __init__(self, options: DfrobotOptions) -> None:
         self.follows_line = options.period_ms is None
         super().__init__(options)
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for arrays that send only 0 or are not ready, and for values that no cell has."""
-        return DfrobotWatch(tables)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask each array for its shape, unless the options give it.

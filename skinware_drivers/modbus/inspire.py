@@ -64,11 +64,7 @@ _MATRICES = (
 
 
 class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Options of the driver."""
 
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; the manual has 255 over TCP")] = 1

@@ -28,9 +28,8 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
-from skinware_drivers.bus import Bus
 from skinware_drivers.decoding.skin_state import Updates
-from skinware_drivers.description import Module, Patch, Sensor, SkinTables, taxels
+from skinware_drivers.description import Module, Patch, Sensor, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import AnyFlag, Flag, Sentinel, Values
 from skinware_drivers.link import Link
@@ -39,7 +38,7 @@ from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice, Watch, ZeroWatch
+from skinware_drivers.polling import Notice, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -192,11 +191,7 @@ def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
 
 
 class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Options of the driver."""
 
     side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
     unit: Annotated[
@@ -247,6 +242,8 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
     baudrate = 460_800
     timeout_s = 0.03
     largest_gap = 80
+    asks_first = True
+    watch = Revo2Watch
 
     def __init__(self, options: Revo2Options) -> None:
         self._unit = options.unit or _UNITS[options.side or "right"]
@@ -254,12 +251,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         self._is_asked = False
         self._declare(self._said, options.side or "right", with_status=options.status)
         super().__init__(options)
-
-    def fit(self, bus: Bus) -> None:
-        """Ask for no registers before the edition of the hand is known."""
-        super().fit(bus)
-        if not bus.listen_only:
-            self.use_registers(())
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the hand for its side and edition; while only listening, use the options.
@@ -277,11 +268,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         self._declare(self._said, side or "right", with_status=options.status and not link.listen_only)
         self.use_registers(self.registers)
         return self.patches
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for fingers that send only 0, and for hands without data."""
-        return Revo2Watch(tables)
 
     async def configure(self, link: Link) -> None:
         if self.options.enable:

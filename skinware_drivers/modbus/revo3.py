@@ -27,8 +27,7 @@ from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.bus import Bus
-from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Sentinel, Values
 from skinware_drivers.link import Link
@@ -37,7 +36,7 @@ from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice, Watch, ZeroWatch
+from skinware_drivers.polling import Notice, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -201,6 +200,8 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
     timeout_s = 0.05
     largest_gap = 40
     most_registers = 120
+    asks_first = True
+    watch = ZeroWatch
 
     def __init__(self, options: Revo3Options) -> None:
         self.follows_line = options.period_ms is None
@@ -208,12 +209,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         self._said: _Said | None = None
         self._declare(_unasked(options.mapping), options.side or "right", options.points)
         super().__init__(options)
-
-    def fit(self, bus: Bus) -> None:
-        """Ask for no registers before the form of the data is known."""
-        super().fit(bus)
-        if not bus.listen_only:
-            self.use_registers(())
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the hand for the form of its data, then measure how long it needs for all of them.
@@ -253,11 +248,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
             if self._said is not None and said != self._said:
                 log.warning("%s: the hand sends something else now: %s", link.bus_name, said.text)
                 self.tell(self.patches[0], Notice.CHANGED)
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for pads that send only 0."""
-        return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def enable(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002

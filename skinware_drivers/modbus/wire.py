@@ -134,8 +134,8 @@ def tcp_frame(message: Message) -> bytes:
     return _MBAP.pack(message.number, 0, len(message.data) + 1, message.unit) + message.data
 
 
-class TcpMessages:
-    """Find the messages in the bytes of a connection.
+class _Messages:
+    """The bytes of a connection or line that are no whole message yet.
 
     Args:
         counters: count what is found.
@@ -144,6 +144,22 @@ class TcpMessages:
     def __init__(self, counters: FramerCounters) -> None:
         self._counters = counters
         self._rest = b""
+
+    @property
+    def pending(self) -> int:
+        """Bytes that may still become part of a message."""
+        return len(self._rest)
+
+    def drop(self) -> None:
+        self._skip(len(self._rest))
+
+    def _skip(self, count: int) -> None:
+        self._counters.skipped_bytes += count
+        self._rest = self._rest[count:]
+
+
+class TcpMessages(_Messages):
+    """Find the messages in the bytes of a connection."""
 
     def feed(self, chunk: bytes) -> Iterator[Message]:
         """Yield the messages that a chunk completes.
@@ -167,26 +183,9 @@ class TcpMessages:
             self._counters.frames += 1
             yield Message(unit, data, number)
 
-    @property
-    def pending(self) -> int:
-        """Bytes that may still become part of a message."""
-        return len(self._rest)
 
-    def drop(self) -> None:
-        self._counters.skipped_bytes += len(self._rest)
-        self._rest = b""
-
-
-class RtuMessages:
-    """Find messages in the bytes of a serial line, where only lengths and checksums show their limits.
-
-    Args:
-        counters: count what is found.
-    """
-
-    def __init__(self, counters: FramerCounters) -> None:
-        self._counters = counters
-        self._rest = b""
+class RtuMessages(_Messages):
+    """Find messages in the bytes of a serial line, where only lengths and checksums show their limits."""
 
     def feed(self, chunk: bytes) -> None:
         self._counters.bytes_in += len(chunk)
@@ -199,14 +198,6 @@ class RtuMessages:
     def next_of(self, asked: Message | None) -> Message | None:
         """Return the next message on a line with another master: the reply to ``asked``, or a question."""
         return self._first(None if asked is None else (asked.unit, asked.data), also_questions=True)
-
-    @property
-    def pending(self) -> int:
-        """Bytes that may still become part of a message."""
-        return len(self._rest)
-
-    def drop(self) -> None:
-        self._skip(len(self._rest))
 
     def _first(self, asked: tuple[int, bytes] | None, *, also_questions: bool) -> Message | None:
         place, rest, was_damaged = 0, self._rest, False
@@ -239,10 +230,6 @@ class RtuMessages:
         self._counters.frame_bytes += size
         self._counters.frames += 1
         return Message(frame[0], frame[1:-_CRC])
-
-    def _skip(self, count: int) -> None:
-        self._counters.skipped_bytes += count
-        self._rest = self._rest[count:]
 
 
 @functools.lru_cache(256)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -105,20 +105,31 @@ class NetworkBus(SerialBus):
     """A serial bus over a network.
 
     Args:
-        channel: ``HOST:PORT``.
-        payload_size: longest body that fits into a batch.
-        listen_only: refuse every ``send``.
+        channel: ``HOST:PORT``, in the form of its scheme.
+        options: of the class ``options_class``.
 
     Raises:
-        ConfigurationError: no such address.
+        ConfigurationError: no such address, or an option is unknown or has a bad value.
+
+    Attributes:
+        scheme: with which its name begins.
+        options_class: of its options.
+        needs_host: a host must be given.
     """
 
     scheme: ClassVar[str]
+    options_class: ClassVar[type[msgspec.Struct]]
     needs_host: ClassVar[bool] = False
 
-    def __init__(self, channel: str, *, payload_size: int, listen_only: bool) -> None:
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._address: Address = parse_address(self.scheme, channel, needs_host=self.needs_host)
+        self._options: Any = options_from_strings(self.options_class, options or {})
+        self._address = self._parse(channel)
+
+    def _parse(self, channel: str) -> Address:
+        return parse_address(self.scheme, channel, needs_host=self.needs_host)
 
     @property
     def name(self) -> str:
@@ -147,8 +158,6 @@ class ServerBus(SerialBus):
     Args:
         channel: of the bus' name.
         options: see :class:`ServerOptions`.
-        payload_size: longest body that fits into a batch.
-        listen_only: makes no difference, because nothing is sent.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.

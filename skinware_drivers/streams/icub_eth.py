@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -16,11 +16,10 @@ from skinware.sensor_types import SensorType
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_layout import SKIN_TYPES
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
-from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Watch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -72,11 +71,7 @@ _FRAMES = Packet(
 
 
 class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver: the CAN port, and those of ``roboskin`` that matter while only listening.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Options of the driver: the CAN port, and those of ``roboskin`` that matter while only listening."""
 
     port: Annotated[Literal[1, 2], Meta(description="CAN port of the Ethernet board that the skin is on")] = 1
     period_ms: Annotated[int, Meta(ge=1, le=255, description="time between two updates, as the boards are set up")] = 50
@@ -108,17 +103,14 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
     types: Sequence[SensorType] = SKIN_TYPES
     dtype: npt.DTypeLike = np.uint8
     layout: Layout
-    payload_bytes: ClassVar[int] = 8
+    watch = RoboskinDriver.watch
+    payload_size = 8
 
     def __init__(self, options: IcubEthOptions) -> None:
         super().__init__(options)
         self.framing = rops(options.port)
         self._boards = RoboskinDriver(options.of_roboskin())
         self.layout, self.period_s = self._boards.layout, self._boards.period_s
-
-    @property
-    def payload_size(self) -> int:
-        return self.payload_bytes
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Learn the boards and modules from the data.
@@ -136,7 +128,3 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
 
     async def revive(self, link: Link, patch: Patch) -> None:
         """Wait: only the robot's program sets a board up."""
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        return RoboskinDriver.watch(tables)

@@ -18,7 +18,6 @@ from msgspec import Meta
 
 from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.streams.bus import Address, NetworkBus, reason_of, unknown_name
 
@@ -145,42 +144,27 @@ class ListeningPort(Port):
             self.caller = None
 
 
-class _TcpEnd(NetworkBus):
-    scheme: ClassVar[str] = "tcp"
-
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(TcpOptions, options or {})
-
-
-class TcpServerBus(_TcpEnd):
+class TcpServerBus(NetworkBus):
     """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
 
     ``note`` shows where it listens.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
+
+    scheme: ClassVar[str] = "tcp"
+    options_class: ClassVar[type[msgspec.Struct]] = TcpOptions
 
     def _open_port(self) -> Port:
         return ListeningPort(self._address, self._options.patience_s)
 
 
-class TcpBus(_TcpEnd):
+class TcpBus(NetworkBus):
     """A connection to a device, or to a converter of serial lines. Its name is ``tcp://HOST:PORT?key=value``.
 
-    Args:
-        channel: ``HOST:PORT``; an IPv6 address stands in brackets.
-        options: see :class:`TcpOptions`.
-        payload_size: longest body that fits into a batch.
-        listen_only: refuse every ``send``.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
+    An IPv6 address stands in brackets. The options are those of :class:`TcpOptions`.
     """
 
+    scheme: ClassVar[str] = "tcp"
+    options_class: ClassVar[type[msgspec.Struct]] = TcpOptions
     needs_host: ClassVar[bool] = True
     device_end: ClassVar[Callable[..., Bus] | None] = TcpServerBus
 

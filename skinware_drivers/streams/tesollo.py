@@ -30,13 +30,13 @@ from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, Sensor, SkinTables
+from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice, Poll, Watch, ZeroWatch
+from skinware_drivers.polling import Notice, Poll, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.framings import LengthFirst
@@ -107,11 +107,7 @@ _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
 
 
 class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Options of the driver."""
 
     period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two questions, ms")] = 10
     timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
@@ -148,17 +144,14 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
     baudrate: int = 100_000_000  # Ethernet
     dtype: npt.DTypeLike = np.uint8
     layout: Layout
+    watch = ZeroWatch
+    payload_size = -(-_MOST_BODY // 8) * 8  # of any hand: the model is known only after it was asked
 
     def __init__(self, options: TesolloOptions) -> None:
         super().__init__(options)
         self.period_s: float = options.period_ms / 1e3
         self.geometry: Geometry | None = None
         self._hand: _Hand | None = None
-
-    @property
-    def payload_size(self) -> int:
-        """Bytes of the longest answer of any hand: the model is known only after it was asked."""
-        return -(-_MOST_BODY // 8) * 8
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -209,11 +202,6 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
             return True
         self.tell(patch, Notice.CHANGED)
         return False
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for fingertips that send only 0."""
-        return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002

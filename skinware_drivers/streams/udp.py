@@ -16,7 +16,6 @@ from msgspec import Meta
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.bus import Address, NetworkBus
@@ -128,23 +127,17 @@ class UdpBus(NetworkBus):
     A framing finds frames in the joined content of the datagrams, as converters of serial lines send it. With
     ``Unframed``, each datagram is a frame.
 
-    Args:
-        channel: ``HOST:PORT`` or ``:PORT``.
-        options: see :class:`UdpOptions`.
-        payload_size: longest body that fits into a batch.
-        listen_only: refuse every ``send``.
-
     Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
+        ConfigurationError: no such address, or an option of :class:`UdpOptions` is unknown or has a bad value.
     """
 
     scheme: ClassVar[str] = "udp"
+    options_class: ClassVar[type[msgspec.Struct]] = UdpOptions
 
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(UdpOptions, options or {})
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         if self._options.local and not self._address.host:
             raise ConfigurationError(f"{self.name}: its port is that of this computer already; leave local out")
         self._udp: UdpPort | None = None

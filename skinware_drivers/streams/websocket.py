@@ -58,8 +58,6 @@ class WebSocketBus(ServerBus):
     Args:
         channel: the URL.
         options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
-        payload_size: longest body that fits into a batch.
-        listen_only: makes no difference, because nothing is sent.
 
     Raises:
         ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from typing import ClassVar
 
+import msgspec
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidURI
 from websockets.frames import CloseCode, Frame, Opcode
@@ -21,11 +22,9 @@ from websockets.uri import parse_uri
 
 from skinware.errors import BusNotAvailable
 from skinware.status import BusReason
-from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import Address, ServerOptions, parse_address
+from skinware_drivers.streams.bus import Address, NetworkBus, ServerOptions, parse_address
 from skinware_drivers.streams.tcp import ListeningPort, connect, keep_alive
 from skinware_drivers.streams.websocket import split_url
 
@@ -232,21 +231,14 @@ class ServingPort(Port):
             self._unsent = self._unsent[self._line.write(self._unsent) :]
 
 
-class WebSocketServerBus(SerialBus):
-    """The device's end, for emulators: ``skin-emulate --bus websocket:ws://HOST:PORT``. ``note`` shows the address.
-
-    Raises:
-        ConfigurationError: no such URL, or an option is unknown or has a bad value.
-    """
+class WebSocketServerBus(NetworkBus):
+    """The device's end, for emulators: ``skin-emulate --bus websocket:ws://HOST:PORT``. ``note`` shows the address."""
 
     scheme: ClassVar[str] = "ws"
+    options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(ServerOptions, options or {})
-        self._address = parse_address(self.scheme, split_url(channel), needs_host=False)
+    def _parse(self, channel: str) -> Address:
+        return parse_address(self.scheme, split_url(channel), needs_host=False)
 
     @property
     def name(self) -> str:

@@ -27,12 +27,12 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.options import check_options
-from skinware_drivers.polling import Notice, Watch, ZeroWatch
+from skinware_drivers.polling import Notice, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framed, Framer, Framing
 
@@ -173,11 +173,7 @@ _PITCH_M = 0.0047
 
 
 class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Options of the driver."""
 
     period_ms: Annotated[
         float, Meta(ge=1, le=10_000, description="nominal time between two messages of the server, ms")
@@ -210,6 +206,8 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
     framing: Framing = XelaMessages()
     dtype: npt.DTypeLike = np.float32
     layout: Layout
+    watch = ZeroWatch
+    payload_size = -(-framing.maximum_body // 8) * 8
 
     def __init__(self, options: XelaServerOptions) -> None:
         super().__init__(options)
@@ -217,10 +215,6 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         self.types: Sequence[SensorType] = ()
         self.geometry: Geometry | None = None
         self._known: Seen = {}
-
-    @property
-    def payload_size(self) -> int:
-        return -(-self.framing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Learn the sensors from the first messages.
@@ -259,11 +253,6 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
                 seen = _read(await lists.get())
                 if any(self._known.get(number) != sensor for number, sensor in seen.items()):
                     self.tell(self._describe(self._known)[0], Notice.CHANGED)
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for sensors that send only 0."""
-        return ZeroWatch(tables)
 
     def _describe(self, seen: Seen) -> list[Patch]:
         frames, patches, places = [], [], []

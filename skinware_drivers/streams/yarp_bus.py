@@ -12,17 +12,17 @@ import socket
 from collections.abc import Callable
 from typing import ClassVar
 
+import msgspec
+
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware.yarp.carriers import READ, Carrier, unframed
 from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server, is_port_name
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import Address, ServerBus, ServerOptions, parse_address
+from skinware_drivers.streams.bus import Address, NetworkBus, ServerBus, ServerOptions, parse_address
 from skinware_drivers.streams.tcp import ListeningPort, TcpPort, connect
 from skinware_drivers.streams.yarp_messages import BEGIN, message_size
 
@@ -182,27 +182,17 @@ def _size(heard: bytes) -> int:
     return _MOST_HEARD
 
 
-class YarpServerBus(SerialBus):
-    """The device's end, for emulators: ``skin-emulate --bus yarp://HOST:PORT/NAME``. ``note`` shows the name server.
+class YarpServerBus(NetworkBus):
+    """The device's end, for emulators: ``skin-emulate --bus yarp://HOST:PORT/NAME``. ``note`` shows the name server."""
 
-    Raises:
-        ConfigurationError: no such name, or an option is unknown or has a bad value.
-    """
+    scheme: ClassVar[str] = "yarp"
+    options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(ServerOptions, options or {})
-        server, self._port_name = split_channel(channel)
-        self._address = server or Address("127.0.0.1", 0)
-
-    @property
-    def name(self) -> str:
-        return f"bus yarp://{self.channel}"
+    def _parse(self, channel: str) -> Address:
+        return split_channel(channel)[0] or Address("127.0.0.1", 0)
 
     def _open_port(self) -> Port:
-        return ServedPort(self._address, self._port_name, self._options.patience_s)
+        return ServedPort(self._address, split_channel(self.channel)[1], self._options.patience_s)
 
 
 class YarpPort(TcpPort):
@@ -283,8 +273,6 @@ class YarpBus(ServerBus):
     Args:
         channel: ``HOST:PORT/NAME`` or ``/NAME``.
         options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
-        payload_size: longest body that fits into a batch.
-        listen_only: makes no difference: only the request for messages is sent.
 
     Raises:
         ConfigurationError: no such name, or an option is unknown or has a bad value.

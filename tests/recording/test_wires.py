@@ -109,6 +109,7 @@ def is_recorded(recorder: Any, least: int = 1, topic: str = "/wire/tip/can0") ->
 def test_a_can_bus_is_recorded_with_everything_on_it(path: Path, cable: Cable, way: type[EndOfCable]) -> None:
     with recording(path, with_wires=True) as recorder, tip_on(way(cable.end), wait=False) as driver:
         before_ns = time.time_ns()
+        wait_until(lambda: driver.runner is not None)  # its thread makes it
         line = driver.runner.lines[0]  # type: ignore[union-attr]
         for sent in range(1, 201):
             for data, _ in EVERYTHING:

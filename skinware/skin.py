@@ -133,9 +133,8 @@ class Skin:
             newer_than: wait until a driver has published something newer, came or went. Default: take what is
                 there, and wait only if there is no driver.
             max_age_s: wait until the newest data of every driver is at most this old; default: of any age.
-            align: take from every driver the snapshot nearest to one moment, among those that its ring still holds: the
-                newest moment that all drivers have reached. A silent driver does not hold the moment back.
-                ``Snapshot.spread_s`` is the remaining difference.
+            align: take from each ring the snapshot nearest to the newest moment that all drivers have reached. A silent
+                driver does not hold the moment back. ``Snapshot.spread_s`` is the remaining difference.
             timeout_s: longest wait; None for no limit.
 
         Raises:
@@ -218,7 +217,7 @@ class Skin:
         align: bool = False,
         timeout_s: float | None = None,
     ) -> Iterator[Snapshot]:
-        """Snapshots without end: whenever any driver publishes, or at the deadlines of a rate.
+        """Yield snapshots without end: whenever any driver publishes, or at the deadlines of a rate.
 
         Args:
             rate_hz: None: whenever any driver publishes. A rate: at its deadlines, what is newest then.

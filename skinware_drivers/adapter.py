@@ -1,4 +1,4 @@
-"""Describe hardware: a driver subclasses the adapter of its transport, such as ``can.adapter.CanAdapter``."""
+"""Describe hardware: a driver subclasses the adapter of its transport, such as ``skinware_drivers.can.CanAdapter``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     have the smallest dtype that holds those of each.
 
     Attributes:
-        medium: kind of bus: ``can``, ``serial`` or ``virtual``.
+        medium: kind of bus: ``can``, ``serial``, ``modbus`` or ``virtual``.
         elsewhere: classes with the same options for the same devices on other kinds of bus.
         Options: struct of the options, as named in the brackets; its fields become command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
@@ -59,7 +59,8 @@ class Adapter(HasOptions[OptionsT], ABC):
             person takes its place. For hands: :mod:`skinware_drivers.hand`.
         period_s: nominal time between two updates of a module, 0.02 by default; an option ``period_ms`` sets it. Ages
             and silence are judged by it.
-        by_cycle: publish when every live patch has delivered (True), or at the rate of ``period_s``.
+        by_cycle: publish when every live update group has arrived, or after a short wait (True); False: at the rate
+            of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
         heard_by: receives the notices of ``tell``; the runner sets it.
     """
@@ -143,8 +144,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask a silent patch whether it is there; called repeatedly while it is silent.
 
-        By default no request is sent, since many devices answer none: the patch may have lost its power, and is
-        revived.
+        By default it is not asked, since many devices answer no request, but revived, in case it lost its power.
 
         Returns:
             True: the patch answered. It has restarted, and ``revive`` is called next.
@@ -158,8 +158,8 @@ class Adapter(HasOptions[OptionsT], ABC):
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
         """Set one patch up again and start it; by default all patches of the bus.
 
-        Override it if patches can be set up one by one. Otherwise a missing patch disturbs the others, after 1 s, 2 s,
-        4 s and so on, at last once a minute.
+        Override it if patches can be set up one by one. Otherwise each attempt to revive a missing patch interrupts the
+        others: after 1 s, 2 s, 4 s and so on, at last once a minute.
         """
         await self.configure(link)
         await self.start(link)

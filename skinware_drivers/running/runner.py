@@ -38,10 +38,10 @@ class Runner:
         name: the driver's name in the namespace.
         listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.
         wait_for_buses: if no bus is available at the start, wait for one.
-        publish: ``cycle`` (when every living patch has delivered), ``rate`` (at the adapter's rate), ``request`` (by
-            cycle, but only what a program has asked for); default: what the adapter says.
-        latency_s: the longest time that frames may wait so that more are taken with them, s; default: a quarter of the
-            shortest period, 1 to 20 ms.
+        publish: ``cycle`` (when every live update group has arrived, or after a short wait), ``rate`` (at the adapter's
+            rate), ``request`` (by cycle, but only on request); default: what the adapter says.
+        latency_s: longest time that frames may wait to be taken in one batch, s; default: a quarter of the shortest
+            period, 1 to 20 ms.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         geometry: where the sensors are; None: as the buses and their adapters say.
         on_ready: called once, when frames are being published.

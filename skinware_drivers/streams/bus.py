@@ -48,6 +48,18 @@ class Address(NamedTuple):
         return family, (str(numbers[0]), int(numbers[1]))
 
 
+def split_url(channel: str) -> str:
+    """Return host and port of a URL.
+
+    Raises:
+        ConfigurationError: this is no URL of a websocket without encryption.
+    """
+    parts = urlsplit(channel)
+    if parts.scheme != "ws":
+        raise ConfigurationError(f"bus websocket:{channel}: write websocket:ws://HOST:PORT (there is no wss)")
+    return parts.netloc
+
+
 def parse_address(scheme: str, channel: str, *, default_port: int | None = None, needs_host: bool = True) -> Address:
     """Parse ``HOST:PORT`` or ``[HOST]:PORT``; an IPv6 address stands in brackets.
 

@@ -6,13 +6,12 @@ import logging
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
-from urllib.parse import urlsplit
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.bus import ServerBus, parse_address
+from skinware_drivers.streams.bus import ServerBus, parse_address, split_url
 
 if TYPE_CHECKING:
     from skinware_drivers.streams.websocket_ends import WebSocketPort
@@ -22,18 +21,6 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _HTTP = 80
 _MOST_MESSAGES = 256
 """Messages of a take, before other buses get their turn."""
-
-
-def split_url(channel: str) -> str:
-    """Return host and port of a URL.
-
-    Raises:
-        ConfigurationError: this is no URL of a websocket without encryption.
-    """
-    parts = urlsplit(channel)
-    if parts.scheme != "ws":
-        raise ConfigurationError(f"bus websocket:{channel}: write websocket:ws://HOST:PORT (there is no wss)")
-    return parts.netloc
 
 
 def _need_package(name: str) -> None:

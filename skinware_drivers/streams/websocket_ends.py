@@ -24,9 +24,8 @@ from skinware.errors import BusNotAvailable
 from skinware.status import BusReason
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import Address, NetworkBus, ServerOptions, parse_address
+from skinware_drivers.streams.bus import Address, NetworkBus, ServerOptions, parse_address, split_url
 from skinware_drivers.streams.tcp import ListeningPort, connect, keep_alive
-from skinware_drivers.streams.websocket import split_url
 
 LONGEST = CHUNK - 1
 """Bytes of the longest message that is used."""

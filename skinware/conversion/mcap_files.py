@@ -134,27 +134,27 @@ class _RecordingWriter:
         self._file = file
         self._channels = Channels()
         self._streams: dict[str, _Stream] = {}
-        self._chunk, self._begun_ns = PendingChunk(), 0
+        self._pending, self._begun_ns = PendingChunk(), 0
 
     def add_frame(self, timed: TimedFrame) -> None:
         stream = self._streams.get(timed.service)
         if stream is None or stream.generation is not timed.generation:
             stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
         channel, schema = self._channels.of_service(timed.service, FRAME)
-        self._chunk.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
+        self._pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
 
     def add_json(self, item: _TimedJson) -> None:
         channel, schema = self._channels.of_all(item.topic)
-        self._chunk.add(channel, schema, 0, item.time_ns, json.dumps(item.data).encode())
+        self._pending.chunk.add(channel, schema, 0, item.time_ns, json.dumps(item.data).encode())
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
-        if self._chunk.is_large or time_ns >= self._begun_ns + _CHUNK_NS:
+        if self._pending.is_large or time_ns >= self._begun_ns + _CHUNK_NS:
             self.close_chunk()
             self._begun_ns = time_ns
 
     def close_chunk(self) -> None:
-        self._chunk.move_to(self._file)
+        self._pending.move_to(self._file)
 
     def _stream(self, service: str, generation: Generation, before: _Stream | None) -> _Stream:
         number = 1 if before is None else before.head.sequence + 1

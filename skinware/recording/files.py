@@ -138,31 +138,19 @@ class RecordingFile:
 
 
 class PendingChunk:
-    """A chunk that is being filled, with the heads of its generations."""
+    """A chunk that is being filled, with the heads of its generations.
+
+    Attributes:
+        chunk: takes messages; another one after each :meth:`move_to`.
+    """
 
     def __init__(self) -> None:
-        self._chunk, self._heads = OpenChunk(), set[Head]()
+        self.chunk, self._heads = OpenChunk(), set[Head]()
         self._decoded_size = 0
 
     @property
-    def is_empty(self) -> bool:
-        return self._chunk.is_empty
-
-    @property
     def is_large(self) -> bool:
-        return self._chunk.size > _CHUNK_BYTES or self._decoded_size > LIMITS.frames_size // 2
-
-    def add(
-        self,
-        channel: Channel,
-        schema: Schema,
-        sequence: int,
-        time_ns: int,
-        data: bytes | memoryview,
-        wall_ns: int | None = None,
-    ) -> None:
-        """Add a message; arguments as for :meth:`skinware.recording.mcap_writing.OpenChunk.add`."""
-        self._chunk.add(channel, schema, sequence, time_ns, data, wall_ns)
+        return self.chunk.size > _CHUNK_BYTES or self._decoded_size > LIMITS.frames_size // 2
 
     def add_sample(
         self,
@@ -175,21 +163,21 @@ class PendingChunk:
         wall_ns: int | None = None,
     ) -> None:
         """Code a sample and add it; the first one of its channel becomes a key frame."""
-        if not self._chunk.has(channel):
+        if not self.chunk.has(channel):
             encoder.next_is_key()
         self._heads.add(head)
         self._decoded_size += len(sample.slot)
-        self._chunk.add(channel, schema, sample.sequence, time_ns, encoder.encode(sample), wall_ns)
+        self.chunk.add(channel, schema, sample.sequence, time_ns, encoder.encode(sample), wall_ns)
 
     def add_head(self, head: Head) -> None:
         self._heads.add(head)
 
     def move_to(self, target: Target | RecordingFile) -> None:
         """Close the chunk, add it to a target unless it is empty, and begin another."""
-        if self._chunk.is_empty:
+        if self.chunk.is_empty:
             return
-        chunk, heads = self._chunk.close(), self._heads
-        self._chunk, self._heads, self._decoded_size = OpenChunk(), set(), 0
+        chunk, heads = self.chunk.close(), self._heads
+        self.chunk, self._heads, self._decoded_size = OpenChunk(), set(), 0
         target.add(chunk, heads)
 
 

@@ -230,7 +230,7 @@ class _Coder(threading.Thread):
         self.failure: Exception | None = None
         self._target, self._jobs, self._disguise, self._renderer = target, jobs, disguise, renderer
         self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
-        self._chunk = PendingChunk()
+        self._pending = PendingChunk()
         self._abouts = 0
         self._due_ns = 0
         self._next_clock_ns = now_ns()
@@ -242,7 +242,7 @@ class _Coder(threading.Thread):
         try:
             while self._work():
                 pass
-            self._chunk.move_to(self._target)
+            self._pending.move_to(self._target)
         except Exception as error:  # noqa: BLE001, Recorder.run raises it
             self.failure = error
         try:
@@ -254,9 +254,9 @@ class _Coder(threading.Thread):
         """Do one job; return False after the last."""
         if now_ns() >= self._next_clock_ns:
             self._look_around()
-        if now_ns() >= self._due_ns or self._chunk.is_large:
-            self._chunk.move_to(self._target)
-        until_ns = self._next_clock_ns if self._chunk.is_empty else min(self._due_ns, self._next_clock_ns)
+        if now_ns() >= self._due_ns or self._pending.is_large:
+            self._pending.move_to(self._target)
+        until_ns = self._next_clock_ns if self._pending.chunk.is_empty else min(self._due_ns, self._next_clock_ns)
         try:
             job = self._jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
         except queue.Empty:
@@ -274,7 +274,7 @@ class _Coder(threading.Thread):
             case _Happened(event):
                 self._add_json(EVENTS, event)
             case _Save():
-                self._chunk.move_to(self._target)
+                self._pending.move_to(self._target)
                 self._target.save()
             case _End():
                 return False
@@ -318,13 +318,13 @@ class _Coder(threading.Thread):
             about = {**wires.about, "buses": dict(zip(wires.buses, wires.about.get("buses", ()), strict=False))}
             self._abouts += 1
             channel, schema = self.channels.of_about(wires.driver)
-            self._chunk.add_head(Head(channel, schema, self._abouts, json.dumps(about).encode()))
+            self._pending.add_head(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
     def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
         self._begin_chunk()
         time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
-        self._chunk.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
+        self._pending.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
         if self._renderer is not None and stream.generation is not None:
             for topic, encoding, known, data in self._renderer.messages(service, stream.generation, frame, time_ns):
                 self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
@@ -343,7 +343,7 @@ class _Coder(threading.Thread):
     def _add(self, channel: Channel, schema: Schema, sequence: int, monotonic_ns: int, data: bytes) -> None:
         self._begin_chunk()
         axis = self._axis
-        self._chunk.add(channel, schema, sequence, axis.log_ns(monotonic_ns), data, axis.wall_ns(monotonic_ns))
+        self._pending.chunk.add(channel, schema, sequence, axis.log_ns(monotonic_ns), data, axis.wall_ns(monotonic_ns))
 
     def _look_around(self) -> None:
         """Record the clocks, and make sure that the target still exists; once a second."""
@@ -356,7 +356,7 @@ class _Coder(threading.Thread):
         self._target.check()
 
     def _begin_chunk(self) -> None:
-        if self._chunk.is_empty:
+        if self._pending.chunk.is_empty:
             self._due_ns = now_ns() + _CHUNK_NS
 
 

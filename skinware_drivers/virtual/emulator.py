@@ -63,7 +63,9 @@ class Press:
 
 
 class Emulator(Stage[OptionsT]):
-    """Emulated devices on one bus. Subclasses define the following; :class:`.Stage` has faults and time.
+    """Emulated devices on one bus. Subclasses define the following.
+
+    :class:`skinware_drivers.virtual.stage.Stage` has faults and time.
 
     The brackets name the class of its options: ``class EmulatedThumb(Emulator[EmulatedThumbOptions])``.
 

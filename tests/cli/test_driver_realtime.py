@@ -10,8 +10,8 @@ import pytest
 
 from skinware import DriverReader
 from skinware.errors import ConfigurationError
+from skinware_drivers.cli import driver_setup
 from skinware_drivers.cli.driver import command
-from skinware_drivers.running import runner
 from tests import scheduling
 from tests.commands import BIN, refused, running
 from tests.scheduling import may_have_fifo
@@ -101,7 +101,7 @@ def test_how_long_frames_may_wait(
         known.update(settings)
         raise ConfigurationError("enough")
 
-    monkeypatch.setattr(runner, "Runner", remember)
+    monkeypatch.setattr(driver_setup, "Runner", remember)
     with pytest.raises(ConfigurationError, match="enough"):
         command.main(["--config", str(config_file(tmp_path, file)), *arguments], standalone_mode=False)
     assert known["latency_s"] == (None if latency_s is None else pytest.approx(latency_s))

@@ -283,7 +283,8 @@ def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pyt
     with skinware.recording.open(path) as opened:
         assert not opened.is_whole
         sequence = opened["torso"].read(["status"]).sequence
-        assert sequence.tolist() == list(range(1, len(sequence) + 1))
+        assert len(sequence) > 0
+        assert (np.diff(sequence) == 1).all()  # from the first that was published after the recorder began
 
 
 def test_a_long_file_needs_no_more_memory_than_a_short_one(path: Path) -> None:

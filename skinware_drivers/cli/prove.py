@@ -81,7 +81,7 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "--captured",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="No device: decode a capture (skin-driver --capture FILE) again, and compare with the values of then.",
+    help="No device: decode a capture (skin-driver --capture FILE) again, and compare with the recorded values.",
 )
 @click.option(
     "--save",

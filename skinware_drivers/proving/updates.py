@@ -123,7 +123,7 @@ def compare(then: Decoding, now: Decoding) -> Comparison:
     """Compare two decodings of one wire.
 
     The beginnings may differ, because a driver shows nothing until it knows its devices. So each module is compared
-    from its first common update to its last. In between, each update of then must exist now with the same values. More
+    from its first common update to its last. In between, each recorded update must exist now with the same values. More
     updates now are no difference: a machine may have been too busy to show all.
     """
     pairs = list(_in_pairs(then, now))
@@ -178,7 +178,7 @@ def _differ(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> Flags:
 
 
 def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:
-    """Return (k,) the update of now nearest to each of then, and whether the two are nearest to each other."""
+    """Return (k,) the decoded update nearest to each recorded one, and whether the two are nearest to each other."""
     nearest, back = _nearest(old_ns, new_ns), _nearest(new_ns, old_ns)
     apart_ns = np.abs(new_ns[nearest] - old_ns)
     usual_ns = float(np.median(np.diff(old_ns))) if len(old_ns) > 1 else np.inf

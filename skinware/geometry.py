@@ -265,7 +265,6 @@ def geometry_of(text: TomlText) -> Geometry:
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
-    """Return the text of a geometry file."""
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]

@@ -170,7 +170,6 @@ class RobotPart:
             self._streams[name].take(frame)
 
     def find(self, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of this part of a driver."""
         _, cut = self._cuts.get(name, (None, None))
         return None if cut is None else (cut.file, self._streams[name])
 
@@ -214,7 +213,6 @@ class Parts:
             return part
 
     def find(self, number: str, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of a driver's part."""
         part = self._parts.get(number)
         return None if part is None else part.find(name)
 

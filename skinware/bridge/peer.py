@@ -65,7 +65,6 @@ class Jobs:
                 os.eventfd_write(self.fd, 1)
 
     def run(self) -> None:
-        """Do all jobs that wait."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         for _ in range(len(self._jobs)):

@@ -63,7 +63,6 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
 
 
 def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict[str, Any]:
-    """Return a finding for programs."""
     return {
         "kind": finding.kind,
         "modules": [structure.module_names[number] for number in finding.modules],

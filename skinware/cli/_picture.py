@@ -106,7 +106,6 @@ class Picture:
         self._region = names[(names.index(self._region) + 1) % len(names)]
 
     def regions_of(self, driver: str, position: int) -> list[str]:
-        """Return the names of the regions of a sensor."""
         structure = self._memories[driver].structure
         in_regions = self._in_regions(driver, structure, _type_of(structure, position).name)
         return [name for name, is_inside in in_regions.items() if is_inside[position]]

@@ -79,7 +79,6 @@ class NarrowedTable(Table):
         self.sensor_names = [table.sensor_names[position] for position in positions.tolist()]
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         for block in self._table.blocks(names):
             for name in PER_SENSOR:
                 if COLUMNS + name in block:

@@ -38,8 +38,6 @@ _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Message(NamedTuple):
-    """A message for viewers."""
-
     topic: str
     encoding: str
     schema: Schema

@@ -192,8 +192,6 @@ class Recorder:
 
 @dataclass
 class _Stream:
-    """Codes the samples of one service."""
-
     head: Head
     encoder: Encoder
     generation: Generation | None

@@ -252,7 +252,6 @@ class Replayer:
         self._republisher.watch(fd, call)
 
     def unwatch(self, fd: int) -> None:
-        """End a watch."""
         self._republisher.unwatch(fd)
 
     # -- operations -----------------------------------------------------------------------------------------------

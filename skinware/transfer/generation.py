@@ -93,7 +93,6 @@ class Generation:
         return self._segment.schema
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the tables, by name."""
         return self._segment.static_columns()
 
     def only(self, positions: Index) -> Generation:

@@ -134,7 +134,6 @@ class ShownDriver:
         return report_of(live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status)
 
     def take(self, frame: DriverSnapshot, services: TactileServices) -> None:
-        """Go on to a newer snapshot."""
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)

@@ -85,7 +85,6 @@ class LiveDriver:
         return report_of(self.reader, self.frame, self.rate_hz, self.patch_rates_hz)
 
     def take(self, frame: DriverSnapshot) -> None:
-        """Make a snapshot the newest one."""
         counts = self._counts
         if self.frame is not None and frame.generation != self.frame.generation:
             counts.clear()
@@ -151,8 +150,6 @@ class LiveDrivers:
 
 
 class LiveBridges(Drivers[BridgeReader]):
-    """The bridges of a namespace."""
-
     def __init__(self, namespace: Namespace) -> None:
         super().__init__(namespace, BridgeReader)
 

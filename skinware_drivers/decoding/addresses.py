@@ -114,7 +114,6 @@ class Addresses:
         return slots
 
     def modules_of(self, kind: int, frame: Frame) -> list[int]:
-        """Return the modules that frames of a kind can be of."""
         found = set(self.entry[self.sets[self.candidates, kind]].tolist())
         byte = frame.module_byte
         if byte is None:

@@ -16,8 +16,6 @@ from skinware_drivers.registry import load_driver
 
 
 class Severity(enum.IntEnum):
-    """How bad something is."""
-
     NOTE = 1
     """It costs no data now."""
     WARNING = 2

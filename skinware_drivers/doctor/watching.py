@@ -53,8 +53,6 @@ def watch(namespace: Namespace, seconds: float, progress: Callable[[float], obje
 
 
 class _DriverWatch:
-    """Read one driver."""
-
     def __init__(self, reader: DriverReader) -> None:
         self._reader = reader
         self._log = DriverLog(reader.structure)

@@ -103,7 +103,6 @@ class ImportedPart:
         return geometry_to_toml(groups, lines) if groups else ""
 
     def yarp_regions_text(self) -> str:
-        """Return a file of regions for it: each port is one."""
         regions = [
             Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
             for bus, port in enumerate(self.yarp)
@@ -291,8 +290,6 @@ def _shared(one: Sequence[str], other: Sequence[str]) -> int:
 
 
 class _BodyFiles:
-    """Position files and drawings, by body part."""
-
     def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
         self._chosen, self._notes = chosen, notes
         self._positions = sources.positions

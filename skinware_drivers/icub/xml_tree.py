@@ -46,8 +46,6 @@ def shown(text: object) -> str:
 
 
 class Notes:
-    """Remarks in order, each once."""
-
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
 
@@ -168,7 +166,6 @@ class Element:
 
     @property
     def label(self) -> str:
-        """Return it for messages: ``param "period"``."""
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:

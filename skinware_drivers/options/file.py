@@ -150,8 +150,6 @@ class ConfigFile:
 
 
 class _Wrong(Exception):
-    """A mistake, and the key that has it."""
-
     def __init__(self, text: str, keys: Keys) -> None:
         super().__init__(text)
         self.keys = keys

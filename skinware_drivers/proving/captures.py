@@ -221,8 +221,6 @@ def snapshots_after(reader: DriverReader, last: tuple[int, int] | None) -> Itera
 
 
 class _Published:
-    """Every snapshot that a driver publishes."""
-
     def __init__(self) -> None:
         self._reader: DriverReader | None = None
         self._frames: list[tuple[Structure, list[DriverSnapshot]]] = []

@@ -55,7 +55,6 @@ class TimedTable:
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
     def window(self, wanted: LearningSet) -> int:
-        """Return the number of samples in a row."""
         return wanted.window or max(1, int(np.ceil(self.rate_hz / wanted.fps - 1e-3)))
 
     def runs(self, gap_s: float | None) -> Iterator[tuple[int, int]]:

@@ -35,7 +35,6 @@ class Drivers(Generic[ReaderT]):
     another kind, is tried again when it is replaced, and after ten seconds.
 
     Args:
-        namespace: where to look.
         reader: makes a reader from a name and ``namespace=``. It raises
             :class:`skinware.errors.BadServiceFile` for a service of another kind; a class of readers does.
         names: of the services to follow; None: all.
@@ -137,7 +136,6 @@ class Drivers(Generic[ReaderT]):
         """Return the newest sample of a service; never wait.
 
         Args:
-            name: which service.
             newer_than: a sample that is not wanted again.
 
         Returns:

@@ -58,13 +58,11 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Sensors of one type in one frame.
 
     Attributes:
-        type: name of their sensor type.
         frame: name of the coordinate frame of the numbers.
         uid: of each sensor.
         position_m: of each sensor, m.
         normal: of each sensor, of length 1, outwards; NaN where it is not known, None if no normal is known.
         radius_m: of each of them, m; None if it is not known.
-        name: for people.
         confidence: 0 to 1, the part of them that is within half a pitch of its place, as estimated from
             measurements; None: not estimated.
     """
@@ -267,12 +265,7 @@ def geometry_of(text: TomlText) -> Geometry:
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
-    """Return the text of a geometry file.
-
-    Args:
-        groups: what is in it.
-        comment: lines for its head.
-    """
+    """Return the text of a geometry file."""
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]

@@ -137,10 +137,6 @@ def printable(text: str, keep: str = "") -> str:
 
     Nothing in it moves the cursor, changes colours, or turns the reading direction: control and format characters (also
     of bidirectional text), lone surrogates and all line ends are replaced.
-
-    Args:
-        text: any.
-        keep: characters that stay.
     """
     if text.translate(dict.fromkeys(map(ord, keep))).isprintable():
         return text

@@ -20,9 +20,6 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     """Refuse a layout under which values would be cut or dropped, or halves of two cycles be joined.
 
     Args:
-        layout: of one bus.
-        patches: on that bus.
-        tables: made of them.
         period_s: nominal time between two updates of a module.
 
     Raises:

@@ -82,7 +82,6 @@ def check_polls(polls: Sequence[Poll], wire_s: Callable[[Poll], float]) -> str:
     """Refuse polls that cannot be answered in time.
 
     Args:
-        polls: those of one bus.
         wire_s: returns the least time that question and answer take on the line, s; 0 if it is not known.
 
     Returns:

@@ -40,8 +40,6 @@ class Exchange:
     """Bounds of our clock minus the other one, from a question and its answer.
 
     Attributes:
-        at_ns: the moment, by our clock.
-        low_ns, high_ns: the bounds.
         round_trip_ns: without the time that the other end took.
     """
 

@@ -36,7 +36,6 @@ class LinkTraffic:
 
     Attributes:
         lost: frames of the robot that were not published here, since the first one; all others: since the last report.
-        bytes: of messages.
         ages_ns: from the publication there to the one here.
     """
 
@@ -92,7 +91,6 @@ class FrameOutput:
 
     Attributes:
         count: the robot's number of the newest frame, over generations; None: none so far.
-        newest: position of that frame.
         is_dead: nothing was published since the robot was lost.
     """
 
@@ -143,7 +141,6 @@ class ServiceFollower:
 
     Attributes:
         service: its newest state there.
-        is_over: the service has ended.
     """
 
     def __init__(

@@ -33,7 +33,6 @@ class Question:
     """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
 
     Attributes:
-        reply: sends the answer.
         fail: sends the reason why there is no answer.
     """
 

@@ -82,7 +82,6 @@ class Pacing:
         size: of a frame as it would be pushed, bytes.
 
     Attributes:
-        pulls: frames are asked for.
         open: how many questions are open at once.
     """
 
@@ -126,7 +125,6 @@ class Pacing:
         """Take the age of a frame that came; return whether the mode changed.
 
         Args:
-            at_ns: now.
             age_ns: since its publication on the robot.
             round_trip_ns: the shortest of the link.
         """

@@ -57,12 +57,10 @@ class Cut:
     """Some sensors of a generation of a driver, with their modules, patches and buses.
 
     Args:
-        whole: the generation.
         positions: (n,) of the sensors that stay, in a frame, ascending.
 
     Attributes:
         generation: of the same number, with what stays.
-        file: of that generation.
 
     Raises:
         StructureError: it is not a driver, or no sensor stays.

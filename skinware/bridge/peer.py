@@ -114,7 +114,6 @@ class Bridges:
         instance, host, start: of the one that is followed, as in :class:`Services`; empty: none so far.
         switches: how often another robot of this name took the place of the first.
         there: numbers of all that are there.
-        other_robots: names of robots that other bridges serve.
     """
 
     instance: str = ""
@@ -135,7 +134,6 @@ class Peer:
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
-        is_connected: the robot is heard.
         since_ns: when that began.
         guard: counts its messages that cannot be read.
     """

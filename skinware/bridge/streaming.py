@@ -69,7 +69,6 @@ class FrameStream:
     ``soon`` calls a function in the only thread that codes.
 
     Attributes:
-        frames: number of frames so far.
         newest: the newest frame; None: none of this generation so far.
     """
 

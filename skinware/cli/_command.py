@@ -220,7 +220,6 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     SIGTERM ends a command as Ctrl-C does.
 
     Args:
-        command: to run.
         goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
 

@@ -37,7 +37,6 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
     """Return everything that can be seen of a namespace, as ``skin-info --json`` prints it.
 
     Args:
-        namespace: to show.
         only: name of the only service to show.
 
     Raises:
@@ -265,7 +264,6 @@ def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any
     """Return the health of all sensors that services publish, as ``skin-info --health --json`` prints it.
 
     Args:
-        namespaces: to look in.
         driver: name of the only driver to show.
 
     Raises:

@@ -34,9 +34,6 @@ _AT_THE_END_S = 1.0
 class PatientStream(io.TextIOBase):
     """Accept text at once, and write it when the reader takes it.
 
-    Args:
-        stream: to write to.
-
     Attributes:
         left_out: writes that were left out because too much text waited.
     """

@@ -64,7 +64,6 @@ class SkinTop(App[None]):
     """Show drivers, buses and patches, and a picture of the sensors under the cursor.
 
     Args:
-        namespace: to show.
         type_name: type of sensors to draw first; default: each driver's first.
         duration_s: end after this time; None: only by a key or signal.
         scale_name: the first meaning of the colours: ``change``, ``range`` or ``raw``.

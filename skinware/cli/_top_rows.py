@@ -96,11 +96,8 @@ def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: s
     """Return the title of a picture.
 
     Args:
-        key: of the row.
         structure: of its driver now, which may have changed since the list was made.
         patches: that :func:`patches_of` returned.
-        type_name: the type of sensors that are drawn.
-        sensors: their number.
     """
     if not patches:
         return "no patches here"

@@ -114,7 +114,6 @@ class _Painter:
     """Collect the sensors that are touched.
 
     Args:
-        reader: of the driver.
         type_name: of the sensors; None: the driver's first type.
         as_json: print JSON, not text.
     """

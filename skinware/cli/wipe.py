@@ -69,7 +69,6 @@ class _Wipe:
     """Run a wipe test and report it.
 
     Args:
-        reader: of the driver.
         type_name: of the sensors; None: the driver's first type.
         as_json: print JSON, not text.
     """

@@ -26,7 +26,6 @@ class Format(NamedTuple):
     """A format of files or folders.
 
     Attributes:
-        suffix: of its files or folders.
         write: writes a source to a path that does not exist.
         without: returns a line for each thing of a source that the format cannot hold.
     """

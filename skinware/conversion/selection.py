@@ -70,7 +70,6 @@ class NarrowedTable(Table):
     """A driver's table with some of its sensors.
 
     Args:
-        table: with all sensors.
         positions: (n,) positions of the sensors to keep.
     """
 

@@ -69,7 +69,6 @@ class ArrayFormat(NamedTuple):
 
     Attributes:
         shape: () for one number.
-        dtype: of its numbers.
     """
 
     shape: tuple[int, ...]
@@ -85,11 +84,7 @@ class Table(ABC):
 
     Args:
         name: of the table: the service's, with ``@2`` for its second part.
-        service: name of the service.
         generations: of its samples, by number; all have the same columns and tables.
-
-    Attributes:
-        name, service, generations: as given.
     """
 
     def __init__(self, name: str, service: str, generations: Sequence[Generation]) -> None:
@@ -159,7 +154,6 @@ class DerivedSource:
     """A source with other tables than the one that it stands for.
 
     Args:
-        source: everything but the tables.
         tables: made of the source's.
     """
 
@@ -191,9 +185,6 @@ class Output:
     """An array to write: one of a table's, or computed from them.
 
     Attributes:
-        name: in the file.
-        format: of a row.
-        unit: of its numbers, for people.
         needs: names of the table's arrays that it is computed from.
         of: computes it from a block of these.
     """
@@ -316,7 +307,6 @@ class RecordedSource:
     """A recording.
 
     Args:
-        path: of the file.
         start_s, end_s: part of its time, s since it began; None: to its end.
 
     Raises:

@@ -105,9 +105,6 @@ class TakeState(ctypes.Structure):
 class FramePool(Generic[SampleT]):
     """Samples to be filled by C: one of each ring, all in one piece of memory. Not for several threads at once.
 
-    Args:
-        rings: whose samples.
-
     Attributes:
         starts: where each sample begins in the memory, bytes.
     """
@@ -149,7 +146,6 @@ class Take(Generic[SampleT]):
 
     Args:
         rings: 1 to :data:`skinware.memory.futex.MAX_WORDS`.
-        pool: where samples are put.
         is_loop: it is the loop of one reader, whose turn ends with the next call.
     """
 

@@ -31,7 +31,6 @@ class Head:
     """The message that describes a generation, written before the first chunk with its samples.
 
     Attributes:
-        channel, schema: of the message.
         sequence: number of the generations of the service before it.
         data: the service's file up to its slots.
     """
@@ -65,7 +64,6 @@ class Target(Protocol):
         """Add a chunk.
 
         Args:
-            chunk: the chunk.
             heads: descriptions of the generations of its samples.
 
         Raises:

@@ -30,15 +30,11 @@ class _Tape:
     """Moves along the moments of a recording, and publishes what was newest at each place.
 
     Args:
-        recording: the recording.
         names: of services; None: all.
         ahead: decodes in the background.
-        republisher: publishes samples and events.
         start_s, end_s: the part to publish, s since the recording began.
 
     Attributes:
-        start_s: beginning of the part.
-        last_s: end of the part.
         next: the moment that is due next; None: not taken yet, or the end.
         reached_s: time of the last published moment.
     """
@@ -142,9 +138,7 @@ class Replayer:
     that runs the replay.
 
     Args:
-        recording: the recording to publish.
         names: of services; None: all.
-        namespace: in which to publish them.
         speed: 2.0 is twice as fast as recorded.
         start_s: begin at this time, s since the recording began.
         end_s: end before this time; None: at the end of the recording.

@@ -353,7 +353,6 @@ class _Request(NamedTuple):
 
     Attributes:
         origin: their generation, reduced to the sensors to read.
-        columns: names.
         positions: of these sensors in a sample; None: all.
     """
 

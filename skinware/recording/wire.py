@@ -67,8 +67,6 @@ def export_candump(recording: Recording, path: Path, chosen: Chosen | None = Non
     """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
 
     Args:
-        recording: a recording with wires.
-        path: of the new file.
         chosen: the part to export; None: all.
 
     Raises:
@@ -95,8 +93,6 @@ def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None
     An interface of a CAN bus has the link type :data:`SOCKETCAN`, one of a serial line :data:`SERIAL`.
 
     Args:
-        recording: a recording with wires.
-        path: of the new file.
         chosen: the part to export; None: all.
 
     Raises:

@@ -83,7 +83,6 @@ class DdsNode:
     """A :class:`skinware.ros2.transport.Node`.
 
     Args:
-        identity: of the node.
         interfaces: networks to use, by the name or address of an interface of this machine; empty: as
             ``CYCLONEDDS_URI`` says, or loopback alone if that is not set.
 

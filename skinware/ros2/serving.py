@@ -45,7 +45,6 @@ class ServedReport:
         rate_hz: frames that it publishes; None: not known yet.
         age_ms: of its newest data; None: no frame so far.
         lost: frames so far that a subscriber wanted and that could not be taken.
-        messages: sent so far.
         left_out: messages that were not sent, because the carrier took no more.
     """
 
@@ -94,8 +93,6 @@ class Ros2Server:
     """Publishes drivers in a ROS 2 graph; nothing there can hold them up.
 
     Args:
-        node: of the graph.
-        namespace: whose drivers.
         names: of drivers; empty: all, also later ones.
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.

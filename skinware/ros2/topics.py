@@ -24,7 +24,6 @@ class DriverTopics:
     """The topics of a driver, which begin with ``base``.
 
     Attributes:
-        messages: number of those that were sent.
         left_out: number of those that were not sent, because a subscriber is too slow.
     """
 
@@ -48,8 +47,6 @@ class DriverTopics:
         """Publish a frame under all topics that have subscribers.
 
         Args:
-            frame: to be published.
-            with_pictures: point clouds and images, too.
             is_last: no newer frame comes for now: all sensors are stale.
         """
         time_ns = time.time_ns() - (now_ns() - frame.published_ns)

@@ -90,7 +90,6 @@ class ServiceType(MessageType):
 
     Attributes:
         request: type of the question: ``std_srvs/srv/Trigger_Request``.
-        response: type of the answer.
     """
 
     request: MessageType

@@ -32,8 +32,6 @@ class Ownership:
     """Holds a name from its construction to ``close``, and publishes one generation after the other under it.
 
     Args:
-        name: the service.
-        namespace: where it is.
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.

@@ -28,7 +28,6 @@ class Accounts:
     With more readers than processors, what one does before it sleeps makes the next one's sample older.
 
     Args:
-        namespace, service: what is read.
         announce: let others see it, from its first sample or wait on.
     """
 

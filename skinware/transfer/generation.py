@@ -32,13 +32,9 @@ class Generation:
 
     Args:
         head: the bytes of the file up to its slots.
-        name: of the service.
 
     Attributes:
-        head, name: as given.
-        generation: its number.
         kind: of the service: ``driver``, ``data``.
-        is_driver: the service is a driver.
         context: the structure of a driver; None for other services.
         period_ns: the writer's nominal period, 0 if it has none.
         published_before: frames of earlier generations.
@@ -128,7 +124,6 @@ def disguised(head: bytes, name: str, disguise: Callable[[str], str]) -> bytes:
 
     Args:
         head: the bytes of the service's file up to its slots.
-        name: of the service.
         disguise: returns the other name of a bus.
 
     Raises:

@@ -42,7 +42,6 @@ class LiveDriver:
     """One driver and its newest snapshot.
 
     Attributes:
-        reader: of the driver.
         frame: its newest snapshot; None before the first.
     """
 
@@ -108,7 +107,6 @@ class LiveDrivers:
     """The drivers of a namespace, dead ones too as long as their last snapshot can be read.
 
     Args:
-        namespace: where to look.
         names: of the drivers to follow; default: all.
     """
 
@@ -153,11 +151,7 @@ class LiveDrivers:
 
 
 class LiveBridges(Drivers[BridgeReader]):
-    """The bridges of a namespace.
-
-    Args:
-        namespace: where to look.
-    """
+    """The bridges of a namespace."""
 
     def __init__(self, namespace: Namespace) -> None:
         super().__init__(namespace, BridgeReader)
@@ -188,7 +182,6 @@ class TactileServices:
     """Calmed drivers, contacts and motion for the drivers of a namespace, from it and from the namespace of calm.
 
     Args:
-        drivers: of the namespace.
         names: of the drivers that count; default: all.
         calm: namespace of calmed drivers; None: without it.
     """
@@ -243,11 +236,8 @@ class TouchedPlace(NamedTuple):
     """A contact, and its place on the skin.
 
     Attributes:
-        contact: from the service of contacts.
-        unit: of its load.
         sensor: position in a snapshot of the taxel nearest to its centre; of its first taxel where places are not
             known.
-        module: name of the module of that taxel.
     """
 
     contact: Contact
@@ -286,11 +276,7 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
 
 
 class Overview:
-    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges.
-
-    Args:
-        namespace: to follow.
-    """
+    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges."""
 
     def __init__(self, namespace: Namespace) -> None:
         self.drivers = LiveDrivers(namespace)

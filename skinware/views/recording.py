@@ -150,7 +150,6 @@ class ReplayControl:
         """Call an operation of the replay.
 
         Args:
-            action: name of the operation.
             value: of its argument; None: its default.
             complain: called with the reason if the operation failed.
 

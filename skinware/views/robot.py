@@ -56,7 +56,6 @@ class Robot:
 
     Attributes:
         poses: (4, 4) of each frame, by name.
-        meshes: of links.
         left_out: the parts of the file that could not be used, for people.
     """
 

@@ -45,7 +45,6 @@ class SdoClient:
     """Access to one device's object dictionary; one transfer at a time.
 
     Args:
-        link: the bus.
         node: node id, 1 to 127.
     """
 
@@ -193,12 +192,7 @@ class PdoMap:
     """The frames, types and patches of all nodes of a bus.
 
     Args:
-        dictionary: the object dictionary, of any node.
-        nodes: TPDOs by node id.
         default_type: type of objects whose name contains none.
-
-    Attributes:
-        layout, types, dtype, patches: for an adapter.
 
     Raises:
         ConfigurationError: no mapped object is a number, or sensors of one type differ in scale.

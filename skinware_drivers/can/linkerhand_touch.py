@@ -38,7 +38,6 @@ class Question(NamedTuple):
     """A command that asks for touch.
 
     Attributes:
-        payload: of the question.
         last: first bytes of the last frame of the reply.
         shortest: least bytes of that frame: more than other programs' questions have.
         patience_s: how long to wait for the reply.
@@ -58,7 +57,6 @@ class Touch(ABC):
     """One kind of touch.
 
     Attributes:
-        types: of the sensors.
         period_s: a usual time between two updates.
     """
 

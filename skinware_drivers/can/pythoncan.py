@@ -198,11 +198,6 @@ class PythonCanBus(Bus):
 class _Messages:
     """The messages of one opened interface. A thread takes them and shuts the interface down, as both may hang.
 
-    Args:
-        bus: the interface.
-        name: of the bus, for messages.
-        counters: of the bus.
-
     Attributes:
         queue: time of arrival, identifier (with its flags), payload and flags of CAN FD of each message.
         failure: why no more messages come; None as long as they may.

@@ -62,7 +62,6 @@ def make_layout(options: RoboskinOptions, shortest_period_s: float) -> Layout:
     """Return the layout of a bus. A tail belongs to the frame right before it from the same board, or to none.
 
     Args:
-        options: of the bus.
         shortest_period_s: of all boards; head and tail are at most half of it apart.
     """
     # set up the old way, an MTB3 sends class 3 and an MTB4 class 4: the keys of the patches distinguish them

@@ -128,7 +128,6 @@ class Emulation:
     Args:
         bus: not opened yet.
         hardware: not powered up yet.
-        report: receives the events.
         clock: CLOCK_MONOTONIC ns.
         poll: waits until a descriptor is readable, or for a time: ``(descriptors, timeout_s)``.
         companion: other work in the same loop.

@@ -66,9 +66,7 @@ class Addresses:
     A *slot* stands for all identifiers of a bus with the same meaning; ``foreign`` is the slot of all others.
 
     Args:
-        frames: all kinds of frame.
         kinds_of_bus: for each bus, the numbers of the kinds that it carries.
-        tables: what is attached to the buses.
 
     Attributes:
         entry: (n_slots,) int64: 0 to n_modules - 1: a module; then n_patches entries for "some module of this patch";
@@ -116,12 +114,7 @@ class Addresses:
         return slots
 
     def modules_of(self, kind: int, frame: Frame) -> list[int]:
-        """Return the modules that frames of a kind can be of.
-
-        Args:
-            kind: its number.
-            frame: its declaration.
-        """
+        """Return the modules that frames of a kind can be of."""
         found = set(self.entry[self.sets[self.candidates, kind]].tolist())
         byte = frame.module_byte
         if byte is None:

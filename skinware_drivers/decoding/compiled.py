@@ -46,10 +46,6 @@ class Groups:
     A module that one kind of frame or one cycle fills is one group. Where several kinds fill it, one of them can fall
     silent while the others continue. Sensors that the same kinds carry are then a group.
 
-    Args:
-        tables: the skin; its groups are replaced.
-        carriers: all kinds and cycles that make updates.
-
     Attributes:
         tables: the same skin with the groups.
         of_carrier: for each carrier (n_modules + 1, most) int64, groups that an update of a module belongs to;
@@ -115,19 +111,14 @@ class CompiledLayouts:
 
     Args:
         layouts: of each bus; None for a bus whose layout is not known yet.
-        described: what is attached to the buses.
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 
     Attributes:
-        layouts, described: as given.
         tables: what is attached, with the update groups that follow from the layouts.
-        frames: all kinds of frame.
         kinds: the same, compiled.
-        addresses: whose frames are whose.
         payload_names: (n_sets,) bool, sets of kinds of which one is named by its payload.
         alone: by number of its kind, what reads a frame that is an update by itself.
-        cycles: those of all layouts.
         width: number of values of every update.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
         header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.

@@ -49,9 +49,7 @@ class Decoder:
         layouts, tables, periods_s: as for :class:`CompiledLayouts`.
 
     Attributes:
-        compiled: what the layouts compile to.
         tables: what is attached to the buses, with update groups.
-        state: the values and states of the sensors.
         samples: for each bus, some of the frames that could not be used.
         sequences, device_stamps: the last numbers and the clocks of the devices.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
@@ -92,7 +90,6 @@ class Decoder:
         """Return the updates of a batch, and count its wrong frames.
 
         Args:
-            batch: the frames.
             interrupted: buses that are known to have lost frames since the last batch: frames that wait for partners on
                 them are not joined with new ones.
 

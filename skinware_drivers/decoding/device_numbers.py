@@ -27,7 +27,6 @@ def read_numbers(payload: Bytes, sequence: SequenceNumber) -> Indices:
 
     Args:
         payload: (n, size) uint8.
-        sequence: where it is.
     """
     word = _words(payload, sequence)
     if sequence.mask is not None:
@@ -41,11 +40,7 @@ def _words(payload: Bytes, where: SequenceNumber | DeviceTime) -> npt.NDArray[An
 
 
 class Sequences:
-    """The last sequence number of every module.
-
-    Args:
-        structure: the skin.
-    """
+    """The last sequence number of every module."""
 
     def __init__(self, structure: Structure) -> None:
         self._module_patch = structure.module_patch.astype(np.intp)
@@ -56,7 +51,6 @@ class Sequences:
         """Compare the numbers of frames with those before them.
 
         Args:
-            sequence: where the numbers are.
             payload: (n, size) uint8.
             module: (n,) module of each.
 
@@ -86,10 +80,6 @@ class Sequences:
 
 class DeviceStamps:
     """The clocks of all patches; a patch is one device.
-
-    Args:
-        frames: all kinds of frame.
-        structure: the skin.
 
     Attributes:
         clocks: by patch, of those that have sent a stamp.

@@ -24,7 +24,6 @@ class FrameKind:
     """One kind of frame, compiled.
 
     Attributes:
-        frame: the declaration.
         channels: (width,) int64, channel of each value; -1 = dropped.
         carries: the channels for which its frames can have values.
         module_by_byte: (n_patches, keys) module that a payload byte names; None: the identifier names it.
@@ -209,7 +208,6 @@ class Assembly:
 
     Args:
         kinds: the frames, in the order of the cycle.
-        tables: the skin.
         width: values of every update, whatever it is made of; at least the sum over ``kinds``.
         groups: (n_modules + 1, most) update groups that an update of each module belongs to.
     """
@@ -243,7 +241,6 @@ class Assembly:
         """Read the values and flags of n updates.
 
         Args:
-            wire: the batch.
             rows: (n, members) rows of it.
             module: (n,) module of each.
             orphans: those of the n that are not whole: their values have no sensor and no flag.

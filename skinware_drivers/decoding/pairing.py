@@ -58,9 +58,7 @@ class Punctuality:
     all must come in time: there, the end of a cycle and the beginning of the next look like one.)
 
     Args:
-        cycle: of the frames.
         period_s: nominal time from one cycle of a module to the next; a module may always be slower.
-        n_modules: number of modules.
     """
 
     def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
@@ -133,7 +131,6 @@ class Pairing:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: its declaration.
         places: (256,) place in the cycle of each kind of frame; ``n`` = not a member.
         punctuality: separates cycles without a counter; None: only order and age do.
     """
@@ -282,16 +279,10 @@ class CompiledCycle:
     """Finds the cycles of one layout.
 
     Args:
-        cycle: its declaration.
-        frames: all kinds of frame.
         members: the numbers of its members among them, in order.
-        assembly: reads them.
-        tables: the skin.
         period_s: nominal time from one cycle to the next; None: not known.
 
     Attributes:
-        members: as given.
-        assembly: as given.
         sequence: the member whose sequence numbers are compared, and their place; None: there are none.
     """
 

@@ -219,8 +219,6 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
     """Examine everything that runs or is plugged in.
 
     Args:
-        namespace: of the drivers.
-        seconds: duration of the look.
         progress: called now and then with the seconds that have passed.
     """
     machine, readers = MachineWatch(), ReadersWatch(namespace)

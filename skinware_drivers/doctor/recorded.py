@@ -43,7 +43,6 @@ def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: N
     """Examine a whole recording.
 
     Args:
-        file: the recording.
         progress: called now and then with the seconds of it that were read.
 
     Raises:
@@ -122,8 +121,6 @@ class _DriverTrack:
         """Add a snapshot.
 
         Args:
-            frame: the snapshot.
-            tables: static columns of its generation.
             time_s: when it was published, since the recording began.
         """
         before, self._newest = self._newest, frame

@@ -114,8 +114,6 @@ def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None 
     """Return the report.
 
     Args:
-        evidence: everything that was seen.
-        found: the findings.
         secrets: to be left out; default: those of this machine.
     """
     text = "\n".join(map(printable, _lines(evidence, found))) + "\n"

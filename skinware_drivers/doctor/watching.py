@@ -33,8 +33,6 @@ def watch(namespace: Namespace, seconds: float, progress: Callable[[float], obje
     """Read all drivers of a namespace.
 
     Args:
-        namespace: of the drivers.
-        seconds: duration.
         progress: called now and then with the seconds that have passed.
 
     Raises:

@@ -40,8 +40,6 @@ class Drawing:
     """A drawing of skinGui.
 
     Attributes:
-        path: of the file.
-        part: the body part.
         shapes: kinds of triangles, by number (16 per board, in the count of the body part); None: unknown.
     """
 
@@ -118,7 +116,6 @@ class Body:
     """The kinds and places of a part's triangles.
 
     Attributes:
-        shapes: known kinds of triangles.
         bare: triangles without a taxel.
         drawn: triangles in a drawing, by name of the body part; only for parts without positions.
         groups: places of sensors, by triangle; their uid lack the bus.
@@ -244,10 +241,7 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
     """Note triangles that are drawn but off, or on but not drawn.
 
     Args:
-        body: of the part.
         triangles: all triangles of each body part.
-        enabled: triangles that are switched on.
-        notes: takes the remarks.
     """
     for name, drawn in body.drawn.items():
         on = triangles.get(name, set()) & enabled
@@ -274,9 +268,7 @@ def regions_of(
     """Return a region for each body part with a triangle that is switched on.
 
     Args:
-        driver: name of the driver of the device.
         places: the triangles of each body part, by its name.
-        enabled: triangles that are switched on.
         patches: the device's patches, in the order of the driver's buses.
     """
     boards = Counter(board for _, board in {(patch, board) for patch, board, _ in enabled})

@@ -47,13 +47,9 @@ class ImportedPart:
 
     Attributes:
         name: of the skin; a name that a service can have.
-        part: as the files describe it.
         ports: body parts in its index.
         buses: in the order of the configuration.
-        yarp: its ports.
         groups: places of its sensors, with those that are switched off.
-        regions: its body parts.
-        triangles: number of triangles that are switched on.
         placed: number of sensors that are switched on and have a place.
     """
 
@@ -133,12 +129,7 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """The result of an import.
-
-    Attributes:
-        parts: translated skin devices.
-        files: files that were read.
-    """
+    """The result of an import."""
 
     parts: list[ImportedPart]
     files: list[Path]

@@ -22,11 +22,7 @@ class Note(msgspec.Struct, frozen=True, order=True):
     """A remark.
 
     Attributes:
-        level: its kind.
-        file: its file.
         line: counted from 1; 0: the whole file.
-        element: its subject.
-        text: the remark.
     """
 
     level: Level
@@ -89,11 +85,7 @@ def number(text: str) -> int:
 
 
 class ValueReader:
-    """Read values of elements; note those that cannot be read, which count as not given.
-
-    Args:
-        notes: takes the remarks.
-    """
+    """Read values of elements; note those that cannot be read, which count as not given."""
 
     def __init__(self, notes: Notes) -> None:
         self.notes = notes
@@ -157,11 +149,8 @@ class Element:
 
     Attributes:
         tag: with its prefix, if any.
-        attributes: by name.
-        file: of the element.
         line: counted from 1.
         children: in order.
-        text: all text directly within, stripped.
         understood: a reader has used it.
     """
 

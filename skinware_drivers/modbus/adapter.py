@@ -290,7 +290,6 @@ class OrderWatch(ZeroWatch):
     """Also log, once, why values above the greatest value of a taxel are suspect.
 
     Args:
-        tables: of the skin.
         full_scale: the greatest value of a taxel.
     """
 

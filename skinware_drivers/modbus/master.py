@@ -85,12 +85,9 @@ class Schedule:
     that is answered by an exception.
 
     Args:
-        reads: of a cycle.
         period_ns: from one cycle to the next.
-        begun_ns: now.
 
     Attributes:
-        questions: of the reads.
         cycle: number of the present cycle; -1 before the first.
         cycle_ns: when it began.
         deadline_ns: when the next one begins.
@@ -150,13 +147,7 @@ class Master(Talk):
     Between two reads that are due, one question of other programs is asked. Those are never repeated.
 
     Args:
-        wanted: the registers.
-        timing: of the device.
-        counters: of the bus.
         over_tcp: the line is a connection, not a serial line.
-        name: of the bus, for messages.
-        begun_ns: now.
-        guests: the other programs.
     """
 
     def __init__(
@@ -352,9 +343,6 @@ class Overheard:
     """Join what another master reads.
 
     When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
-
-    Args:
-        wanted: the registers to look for.
     """
 
     def __init__(self, wanted: Wanted) -> None:
@@ -367,7 +355,6 @@ class Overheard:
         """Take a reply; return the frames that are whole now.
 
         Args:
-            asked: the question.
             registers: bytes of the registers in the reply.
             time_ns: when it came.
         """
@@ -381,10 +368,6 @@ class Listener(Talk):
     """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
     A reply does not say which registers it holds, so a reply is dropped if its question was not heard.
-
-    Args:
-        wanted: the registers to look for.
-        counters: of the bus.
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:

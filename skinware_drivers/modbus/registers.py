@@ -127,7 +127,6 @@ class Wanted:
     """The registers that a driver wants, and how they can be read.
 
     Attributes:
-        blocks: of registers.
         step: from the address of one register to the next: 2 where addresses count bytes.
         largest_gap: unwanted registers that are read along at most, to save a question.
         most: registers of a read.
@@ -209,7 +208,6 @@ class Image:
         wanted: the blocks; the identifier of a frame is the number of its block.
 
     Attributes:
-        areas: the registers.
         told_ns: (n_blocks,) int64, when the frame of each was last whole.
         is_plain: a frame has the bytes of its registers as they come.
     """
@@ -227,7 +225,6 @@ class Image:
         """Store registers that were read; return the frames that are whole now.
 
         Args:
-            area: number of the area.
             first: their first register in it.
             data: their bytes.
             time_ns: when they came.

@@ -102,8 +102,6 @@ def _content(edition: EditionName, unit: int, *, kind: int = 0, with_status: boo
     """Return the content of an edition.
 
     Args:
-        edition: of the hand.
-        unit: its number on the line.
         kind: of the values of the Pressure edition: 0 raw, 1 pressure (kPa), 2 force (mN).
         with_status: read along the status that fingers report.
     """

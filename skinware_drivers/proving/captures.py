@@ -56,9 +56,7 @@ def check_capture(
     then.
 
     Args:
-        capture: a recording of one driver, with its wires.
         driver: default: the recorded driver.
-        options: of the driver, in place of recorded ones.
 
     Returns:
         The comparison, and the values that are decoded now.
@@ -147,10 +145,7 @@ class _ReplayedWire:
     """A recorded wire, and the adapter of the present driver on it.
 
     Args:
-        recording: that holds the wire.
-        wire: the wire.
         listens: the driver sends nothing.
-        clock: the time.
     """
 
     def __init__(self, recording: Recording, wire: WireTrack, listens: bool, clock: HandClock) -> None:

@@ -70,7 +70,6 @@ class Comparison:
     """Two decodings of one wire.
 
     Attributes:
-        compared: number of updates that were compared.
         then, now: number of updates of each decoding.
         difference: the first by time; None: they are equal.
     """
@@ -96,7 +95,6 @@ class Collected:
         """Add snapshots of one structure, in order.
 
         Args:
-            structure: of the driver.
             values: (frames, sensors) raw.
             module_time_ns: (frames, modules) int64; 0: never seen.
         """

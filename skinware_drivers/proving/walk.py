@@ -37,9 +37,7 @@ class Step(NamedTuple):
     """A request to a person.
 
     Attributes:
-        wanted: kind of the step.
         module: name of the module; empty: all.
-        text: the request in words.
     """
 
     wanted: Wanted
@@ -90,12 +88,6 @@ class _Skipped(Exception):
 
 def walk(reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
     """Check all modules, and add the checks to a proof, which is valid also if the walk is interrupted.
-
-    Args:
-        reader: of the driver.
-        person: who presses.
-        manner: the settings.
-        proof: takes the checks.
 
     Raises:
         ServiceTimeout: no snapshot came for 5 s.

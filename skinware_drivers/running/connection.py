@@ -85,8 +85,6 @@ class Connection:
     """The connection to one bus.
 
     Args:
-        name: of the bus, for people.
-        bus: the bus.
         epoll: where the descriptor of the open bus is registered.
         pauses: between attempts to open it again.
 

@@ -62,13 +62,8 @@ class Generation:
 
     Attributes:
         lines: the buses; the list may change, their places do not.
-        decoder: turns frames into updates.
-        watch: marks doubtful modules.
-        publisher: turns updates into snapshots.
         period_s: nominal time between two updates, for the publisher.
-        batch: filled by the buses.
         begun_ns: when it began, CLOCK_MONOTONIC ns.
-        path: decodes and publishes.
         flows: C reads the buses that it can read (see ``running.flow``).
     """
 

@@ -27,7 +27,6 @@ def hook(name: str, *buses: str, of_all: bool = False) -> Iterator[None]:
     """Call a hook of an adapter or of its watch.
 
     Args:
-        name: of the hook.
         buses: names of the buses that it is called for.
         of_all: it concerns all buses of the driver, also if it is called for one.
 

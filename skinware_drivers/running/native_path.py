@@ -44,9 +44,7 @@ class NativePath:
     """Decodes and publishes, on the arrays of a decoder and a publisher.
 
     Args:
-        decoder: compiled layouts, and the state of the skin.
         publisher: the moments of publication, and the columns beside values.
-        batch: filled by the buses.
     """
 
     def __init__(self, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:

@@ -65,12 +65,10 @@ class PathHooks:
     """The hooks of one data path.
 
     Args:
-        decoder, publisher, batch: of the path.
         rows, words: the batch and the state of the path in C.
         exchange: arrays for what changes between two calls.
 
     Attributes:
-        listeners: to be set.
         count_strangers: counts rows of frames that are of no module.
         error: raised by a hook; raised again when C has returned.
     """

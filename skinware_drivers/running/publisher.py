@@ -141,11 +141,8 @@ class Publisher:
 
     Args:
         writer: the driver's service.
-        decoder: the state of the skin.
-        watch: marks doubtful modules.
         period_s: nominal time between two updates of a module.
         by_cycle: see above.
-        desk: requests for snapshots.
         on_request: publish only what a request waits for (beside the very first snapshot).
     """
 

@@ -33,7 +33,6 @@ class Runner:
     """A driver on its buses.
 
     Args:
-        driver_type: name of the driver, for people.
         lines: name, adapter and (unopened) bus of every bus, in order.
         name: the driver's name in the namespace.
         listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.

@@ -82,7 +82,6 @@ class SerialBus(KernelBus):
         """Set the framing. Bytes that were received but not fetched are dropped.
 
         Args:
-            framing: how frames are received.
             commands: how they are sent, if in another way.
             baudrate: unless the name of the bus gives another; takes effect when the bus is opened next.
         """

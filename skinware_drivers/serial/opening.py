@@ -80,7 +80,6 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
 
     Args:
         path: device path or pyserial's URL.
-        options: of the bus.
         baudrate: bits per second.
 
     Raises:

@@ -126,7 +126,6 @@ class Kind:
     """A kind of module.
 
     Attributes:
-        name: for people.
         dtype: of its values as they are sent, a numpy dtype.
         taxels: sensor type of each value of each taxel, by name; None: the value has no meaning.
     """
@@ -149,10 +148,7 @@ class Description:
     """The description of a patch.
 
     Attributes:
-        product, serial_number, firmware: for people.
         period_us: of a cycle, unless another is set; with the shortest and the longest possible.
-        types: the sensor types.
-        kinds: the kinds of module.
         modules: kind of each module.
     """
 

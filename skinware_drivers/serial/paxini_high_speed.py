@@ -109,7 +109,6 @@ class HighSpeedBoard(Board):
     """One board: a patch with a module for each connected slot.
 
     Args:
-        hand: the hand with the modules, for their places.
         how: see :class:`Board`.
     """
 

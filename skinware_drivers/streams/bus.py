@@ -65,7 +65,6 @@ def parse_address(scheme: str, channel: str, *, default_port: int | None = None,
 
     Args:
         scheme: for messages, such as ``tcp``.
-        channel: of the bus' name.
         default_port: used if none is given; None: one must be given.
         needs_host: a host must be given, too.
 
@@ -125,7 +124,6 @@ class NetworkBus(SerialBus):
 
     Attributes:
         scheme: with which its name begins.
-        options_class: of its options.
         needs_host: a host must be given.
     """
 
@@ -168,7 +166,6 @@ class ServerBus(SerialBus):
     """A program that sends by itself, perhaps to others as well, and is only read.
 
     Args:
-        channel: of the bus' name.
         options: see :class:`ServerOptions`.
 
     Raises:

@@ -37,7 +37,6 @@ class TcpPort(DescriptorPort):
     """A connection.
 
     Args:
-        name: for messages.
         connection: stays the owner of the descriptor.
         patience_s: seconds without a sign of the other end until it is given up.
     """
@@ -63,7 +62,6 @@ class ListeningPort(Port):
 
     Attributes:
         caller: the connection; None: there is none.
-        address: at which it listens.
 
     Raises:
         BusNotAvailable: it cannot listen there.

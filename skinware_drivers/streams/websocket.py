@@ -43,7 +43,6 @@ class WebSocketBus(ServerBus):
     connection, or sent no message for ``silence_s``, it is connected to again after growing pauses.
 
     Args:
-        channel: the URL.
         options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
 
     Raises:

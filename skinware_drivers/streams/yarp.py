@@ -54,9 +54,7 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Triangles of a board that have a place in the port's vector.
 
     Attributes:
-        board: its address, for people.
         first: place of the first value of its triangle 0, even if that is missing; below 0: before the vector.
-        triangles: their numbers.
         kind: ``triangle``, ``fingertip`` or ``palm``.
         thermal: channels that feel no touch, unless they are those of the kind.
     """

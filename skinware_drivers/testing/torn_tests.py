@@ -98,7 +98,6 @@ class Delivery(NamedTuple):
     """Frames that a bus delivered at once.
 
     Attributes:
-        now_ns: time of the delivery.
         wire: (n,) as in a batch.
         time_ns: (n,) int64, stamps.
     """
@@ -113,7 +112,6 @@ class FrameLog:
 
     Attributes:
         takes: deliveries in order, without empty ones.
-        tables: the skin.
     """
 
     def __init__(self, rig: Running) -> None:
@@ -150,8 +148,6 @@ class Bursts(NamedTuple):
     """Some bursts of one patch.
 
     Attributes:
-        layout: of its frames.
-        tables: the skin.
         period_s: time between two bursts.
         size: number of frames of a burst.
         wire: (bursts * size,) frames, as in a batch.
@@ -172,7 +168,6 @@ class Trouble:
 
     Attributes:
         first: the first lost frame.
-        lost: number of lost frames.
         held: the first frame that is held back until ``until_ns``, with all that follow; None: none is.
         until_ns: time at which the sender continues.
     """
@@ -195,7 +190,6 @@ class Outcome:
     """The result of all troubles.
 
     Attributes:
-        tried: number of troubles.
         shown: number of updates that were shown as fresh.
         torn: number of those that mix different bursts.
         first: the first trouble that tore an update.
@@ -213,12 +207,9 @@ def record(
     """Return bursts of the first patch among the frames of a bus; None if there are too few.
 
     Args:
-        layout: of the bus.
-        tables: the skin.
         period_s: time between two bursts.
         wire: (n,) frames in order, as in a batch.
         time_ns: (n,) int64.
-        bursts: number of bursts.
     """
     # a device's own time would say when frames were sent; bursts must be distinguished without it
     layout = replace(layout, frames=[replace(frame, time=None) for frame in layout.frames])
@@ -254,7 +245,6 @@ def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and count torn updates.
 
     Args:
-        recording: the frames.
         with_period: False: decode without knowing the period of the device.
     """
     outcome = Outcome()
@@ -285,7 +275,6 @@ def find_torn(
     """Return the updates that are shown as fresh when frames of a recording arrive, and which are torn.
 
     Args:
-        recording: the frames.
         rows: (n,) indices of frames, in order of arrival.
         time_ns: (n,) times of arrival.
         with_period: False: decode without knowing the period of the device.

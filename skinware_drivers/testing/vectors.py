@@ -90,7 +90,6 @@ class DirectPath:
 
     Args:
         layout: of the only bus.
-        tables: the skin.
         payload_size: longest payload, bytes.
 
     Attributes:

@@ -107,14 +107,11 @@ class Truth:
     """The source of an emulator's values, which keeps them.
 
     Args:
-        clock: the time.
         n_felt: number of values that each device feels.
-        pattern: the values.
         shown: returns the values that the protocol can send for values that were felt.
 
     Attributes:
         n_values: number of values that each device sends.
-        bursts: the bursts so far, by device.
         remember: keep the bursts.
     """
 
@@ -155,15 +152,12 @@ class Interference:
     """Devices behind a wire with faults.
 
     Attributes:
-        hardware: the devices.
         fault: of some frames; None: none.
         every_ns: mean time between two faults.
         silent: nothing passes in either direction.
         foreign: identifiers of frames of other devices beside the data.
         keep: returns whether a frame passes.
         stumbling: holds frames back and loses some in a row; None: nothing does.
-        damages: the faults so far.
-        frames: number of frames that passed.
         foreign_sent: number of frames of other devices among them.
         sent: frames that the driver sent to the devices.
         remember: keep ``sent``.

@@ -88,7 +88,6 @@ class RecordedWire:
     """The devices at the other end of a recorded wire; see :class:`.hardware.EmulatedHardware`.
 
     Args:
-        items: of the recording, by time.
         first_ns: time of the recording, in its CLOCK_MONOTONIC, at which it begins.
         speed: 2.0: twice as fast.
         waits: for the questions that were asked in the recording.
@@ -224,7 +223,6 @@ class RecordedPort(Port):
     """A port that returns the bytes of the recording, read by read.
 
     Args:
-        wire: of the recording.
         clock: returns CLOCK_MONOTONIC ns.
         make_timer: makes the timer that wakes the reader; another clock needs another timer.
 

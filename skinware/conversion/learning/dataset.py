@@ -67,8 +67,6 @@ class DatasetWriter:
         """Write an episode.
 
         Args:
-            task: description of the episode.
-            length: number of its rows.
             batches: its rows, some at a time.
 
         Raises:
@@ -218,8 +216,6 @@ class _FeatureStatistics:
     """Statistics of all features.
 
     Args:
-        features: by name.
-        lengths: of the episodes to come.
         most_bytes: bytes of rows kept for the quantiles of a feature.
     """
 

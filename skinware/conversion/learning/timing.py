@@ -29,13 +29,7 @@ Times = npt.NDArray[np.int64]
 class TimedTable:
     """The times of a driver's samples, as long as its structure stayed the same.
 
-    Args:
-        table: of a driver.
-        structure: of the driver.
-
     Attributes:
-        name: of the table.
-        structure: as given.
         period_ns: the driver's nominal period, 0 if it has none.
         recorded_ns: (f,) time of publication of each sample, wall clock, as recorded.
         times_ns: (f,) the same, never going back.
@@ -78,7 +72,6 @@ class Piece:
 
     Attributes:
         begin_ns, end_ns: wall clock, both in it.
-        tables: by driver.
     """
 
     begin_ns: int
@@ -95,10 +88,7 @@ class Episode:
     """Rows of a learning set that follow each other.
 
     Attributes:
-        recording: number of the recording.
-        task: its description.
         times_ns: (t,) of each row, wall clock.
-        piece: the drivers.
         frames: by driver, (t,) number of the newest sample at each row.
         joined: by joined feature, (t,) its row.
     """
@@ -118,9 +108,6 @@ class Planner:
     """Makes episodes of one recording.
 
     Args:
-        number: of the recording.
-        source: the recording, reduced to the selected drivers.
-        wanted: definition of the set.
         joined: joined data, each with its times, wall clock.
         structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 

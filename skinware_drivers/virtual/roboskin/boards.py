@@ -37,17 +37,11 @@ class Board(Device):
 
     Args:
         address: on the bus, the ``number`` of the device, which commands can change.
-        stage: the emulator.
-        transmitter: its place on the wire.
         now_ns: time of power-up.
         phase: 0-1, when in its period a started board sends its first burst.
 
     Attributes:
-        stage: the emulator.
-        touch: of its skin.
-        faults: of its triangles.
         last_cycle: bursts after which it dies; None: it lives on.
-        inertial: its inertial sensors.
     """
 
     is_mtb3: ClassVar[bool]

@@ -35,7 +35,6 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
-        options: of the boards and their faults.
         log: receives the :mod:`skinware_drivers.virtual.events`, for example a list.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
             0-255 go on the wire instead of felt ones. Flags stay true.

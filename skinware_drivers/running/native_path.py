@@ -66,6 +66,7 @@ class NativePath:
             raise MemoryError("no memory for the data path of a driver")
         self._path = path = ctypes.c_void_p(made)
         count = self._quick.skinware_path_count_strangers
+        self.named = self._hooks.named
         self._hooks.count_strangers = lambda rows, n: count(path, ctypes.c_void_p(rows), ctypes.c_int64(n))
 
     def __del__(self) -> None:

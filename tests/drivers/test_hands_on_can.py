@@ -208,6 +208,7 @@ def test_what_a_hand_has_is_heard(touch: str) -> None:
     assert patches == expected.patches
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("touch", ["10x4", "fingers"])
 @pytest.mark.parametrize("program_ms", [15, 40, 300])
 def test_how_often_a_hand_is_asked_is_learnt(touch: str, program_ms: int) -> None:
@@ -273,6 +274,7 @@ def asked(emulated: dict[str, Any], **options: Any) -> list[Patch]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("touch", TOUCH)
 @pytest.mark.parametrize("mute", [(), (0xB0,)])
 def test_what_a_hand_has_is_asked(touch: str, mute: Sequence[int]) -> None:

@@ -111,6 +111,7 @@ def test_29_bits_are_one_kind_or_another_by_a_byte_and_lengths_are_checked() -> 
     assert decoder.state.bus_counters[0, :3].tolist() == [0, 1, 1]
 
 
+@pytest.mark.thorough
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=8, unique=True), st.data())
 def test_29_bit_look_up_is_what_the_fields_say(keys: list[int], data: st.DataObject) -> None:
     tables = tables_of(patches(*keys, modules=(0, 5, 15)))

@@ -41,6 +41,7 @@ def payload(value: int, stamp_ms: int, sequence: int) -> bytes:
     return np.array([value, value, stamp_ms & 0xFFFF], "<u2").tobytes() + bytes([sequence & 0xFF, 0])
 
 
+@pytest.mark.thorough
 def test_late_frames_have_the_time_of_their_values_and_gaps_are_counted_too() -> None:
     compiled = decoder(Layout([frame("one", 1, 0), frame("two", 2, 2)]), n_buses=2)
     batch = FrameBatch(64, 8, compiled.compiled.headroom)

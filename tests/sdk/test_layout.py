@@ -117,6 +117,7 @@ def rows(module: int, count: int) -> tuple[list[Frame], Cycle]:
     return frames, Cycle([frame.name for frame in frames], maximum_age_s=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lost", [None, 0, 50, 120])
 def test_modules_whose_cycles_are_of_other_frames_and_long(lost: int | None) -> None:
     (short, first), (long, second) = rows(1, 3), rows(2, 100)

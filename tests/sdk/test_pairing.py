@@ -278,6 +278,7 @@ def every_run(device: Device) -> list[tuple[int, int]]:
 ORDERS: tuple[Order, ...] = ("given", "ends_with", "any")
 
 
+@pytest.mark.thorough
 def test_without_a_counter_no_lost_run_joins_halves_whether_the_sender_catches_up_or_not() -> None:
     for order in ORDERS:
         device = Device(2, order, "module", 1, PERIOD_NS // (4 if order == "any" else 2))

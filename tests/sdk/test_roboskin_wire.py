@@ -217,6 +217,7 @@ def reference_pairs(wire: Sequence[Wire]) -> list[tuple[int, int]]:
     return pairs
 
 
+@pytest.mark.thorough
 @settings(max_examples=200, deadline=None)
 @given(
     frames=st.lists(st.tuples(st.integers(0, 2**32 - 1), st.binary(max_size=8), st.integers(0, 10**12)), max_size=40)

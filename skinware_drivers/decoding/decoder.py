@@ -27,7 +27,7 @@ Indices = npt.NDArray[np.int64]
 
 
 class Decoder:
-    """What the layouts of a driver's buses compile to, and the state of its skin.
+    """The compiled layouts of a driver's buses, and the state of its skin.
 
     Nothing on the wire raises. Frames that cannot be used are counted.
 

@@ -203,6 +203,9 @@ class Marked(NamedTuple):
     marks: Indices
     flagged: npt.NDArray[np.bool_]
 
+    def take(self, which: npt.NDArray[np.bool_]) -> Marked:
+        return Marked(self.module[which], self.oldest_ns[which], self.marks[which], self.flagged[which])
+
 
 @dataclass
 class Outcome:
@@ -301,7 +304,7 @@ def find_torn(
     """
     known = _decode(recording, recording.wire, recording.time_ns, None)
     shown = _decode(recording, recording.wire[rows], time_ns, recording.period_s if with_period else None)
-    fresh = Marked(*(each[~shown.flagged] for each in shown))
+    fresh = shown.take(~shown.flagged)
     return fresh, ~np.isin(fresh.marks, known.marks)
 
 
@@ -345,7 +348,7 @@ def _decode(recording: Bursts, wire: npt.NDArray[Any], time_ns: Indices, period_
     log = _UpdateLog(tables)
     with closing(DirectPath(layout, tables, size, period_s=period_s, rows=len(wire), watch=log)) as path:
         path.feed_rows(wire, time_ns)
-    return Marked(*(np.concatenate(parts) for parts in zip(*log.seen, strict=True)))
+    return log.all
 
 
 class _UpdateLog(Watch):
@@ -356,13 +359,17 @@ class _UpdateLog(Watch):
     def __init__(self, tables: SkinTables) -> None:
         super().__init__(tables)
         none = np.zeros(0, np.int64)
-        self.seen = [Marked(none, none, none, none > 0)]
+        self.all = Marked(none, none, none, none > 0)
 
     def look(self, updates: Updates) -> None:
         whole, sink = np.flatnonzero(updates.whole), self.tables.structure.n_sensors
         values = np.where(updates.sensors == sink, 0, updates.values).astype(updates.values.dtype)[whole]
         data = np.ascontiguousarray(values).view(np.uint8).reshape(len(whole), -1).astype(np.int64)
         factors = np.random.default_rng(3).integers(1, 1 << 62, data.shape[1])
-        module = updates.module[whole]
-        marks = data @ factors + module * 0x9E37_79B9_7F4A_7C1
-        self.seen.append(Marked(module, updates.oldest_ns[whole], marks, updates.status[whole].any(axis=1)))
+        marks = data @ factors + updates.module[whole] * 0x9E37_79B9_7F4A_7C1
+        self.all = Marked(
+            np.append(self.all.module, updates.module[whole]),
+            np.append(self.all.oldest_ns, updates.oldest_ns[whole]),
+            np.append(self.all.marks, marks),
+            np.append(self.all.flagged, (updates.status[whole] != 0).any(axis=1)),
+        )

@@ -59,9 +59,6 @@ class Cut:
     Args:
         positions: (n,) of the sensors that stay, in a frame, ascending.
 
-    Attributes:
-        generation: of the same number, with what stays.
-
     Raises:
         StructureError: it is not a driver, or no sensor stays.
     """

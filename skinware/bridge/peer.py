@@ -133,7 +133,6 @@ class Peer:
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
-        since_ns: when that began.
         guard: counts its messages that cannot be read.
     """
 

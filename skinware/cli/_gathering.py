@@ -105,12 +105,7 @@ class Gathering:
     """Take the snapshots of a driver into a session, and report the progress.
 
     Args:
-        poses: of the presses; None: the session needs none.
         fresh: begin with nothing, and ignore that file.
-        as_json: print JSON, not text.
-
-    Attributes:
-        restored: whether it continues with the data of the state file.
 
     Raises:
         ConfigurationError: the data of the state file do not fit.
@@ -141,7 +136,6 @@ class Gathering:
         Gathered data are in the state file afterwards, also after Ctrl-C.
 
         Args:
-            what_to_do: for the person.
             share: part of the sensors that is enough, 0 to 1.
             duration_s: longest time after the baselines are known; None: no limit.
 

@@ -40,9 +40,6 @@ def change_levels(
 
     Args:
         change: (n,) physical, 0 or more.
-        noise: nothing is shown up to here.
-        span: change of the highest level.
-        before: the levels drawn so far.
     """
     felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
     return levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before), (0.0, span / 4, span)

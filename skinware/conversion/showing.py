@@ -276,7 +276,6 @@ class Viewers:
     """Messages for viewers, beside the frames that they are made of.
 
     Args:
-        json_state: as for :class:`Showing`.
         rate_hz: of each driver, at most.
     """
 

@@ -151,11 +151,7 @@ class Source(Protocol):
 
 
 class DerivedSource:
-    """A source with other tables than the one that it stands for.
-
-    Args:
-        tables: made of the source's.
-    """
+    """A source with other tables than the one that it stands for."""
 
     def __init__(self, source: Source, tables: Sequence[Table]) -> None:
         self._source = source

@@ -317,8 +317,6 @@ class Recovered:
     """The result of a recovery.
 
     Attributes:
-        messages: number in the new file, by topic.
-        damaged: number of damaged chunks.
         was_whole: the file had its summary, and no chunk was damaged.
     """
 
@@ -331,7 +329,6 @@ def recover(source: Path, target: Path) -> Recovered:
     """Copy the undamaged chunks of a recording into a new file, which appears when it is complete.
 
     Args:
-        source: the recording; it is only read.
         target: the new file; it may replace the old one, but no other.
 
     Raises:

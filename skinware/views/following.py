@@ -98,7 +98,6 @@ class ShownDriver:
         newest: its newest snapshot; None before the first.
         status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
-        past: its values of the last seconds.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
@@ -182,12 +181,10 @@ class Follower:
     """All drivers of a namespace, and what services publish about them.
 
     Args:
-        names: of those to follow; default: all.
         calm: namespace of calmed drivers; None: without it.
 
     Attributes:
         edition: changes whenever drivers or structures change.
-        problem: why nothing can be seen; None: all is well.
     """
 
     def __init__(

@@ -101,8 +101,6 @@ class Carrier(NamedTuple):
     """A kind of frame by itself, or a cycle: it makes one update.
 
     Attributes:
-        modules: that it can fill.
-        channels: for which it has values.
         period_s: nominal time between two of them; None: the driver's.
     """
 
@@ -181,16 +179,13 @@ class CompiledLayouts:
     """The layouts of all buses of a driver, compiled for one set of tables.
 
     Args:
-        layouts: of each bus; None for a bus whose layout is not known yet.
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 
     Attributes:
         tables: what is attached, with the update groups that follow from the layouts.
-        kinds: the same, compiled.
         payload_names: (n_sets,) bool, sets of kinds of which one is named by its payload.
         alone: by number of its kind, what reads a frame that is an update by itself.
-        width: number of values of every update.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
         header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.
 

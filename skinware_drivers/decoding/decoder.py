@@ -31,14 +31,9 @@ class Decoder:
 
     Nothing on the wire raises. Frames that cannot be used are counted.
 
-    Args:
-        layouts, tables, periods_s: as for :class:`CompiledLayouts`.
-
     Attributes:
-        tables: what is attached to the buses, with update groups.
         samples: for each bus, some of the frames that could not be used.
         last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
-        device_stamps: the clocks of the devices.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
 

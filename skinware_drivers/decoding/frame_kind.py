@@ -109,7 +109,6 @@ class Assembly:
     """The frames that together make one update of a module, and the sensors of their values.
 
     Args:
-        kinds: the frames, in the order of the cycle.
         width: values of every update, whatever it is made of; at least the sum over ``kinds``.
         groups: (n_modules + 1, most) update groups that an update of each module belongs to.
     """

@@ -50,11 +50,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Looked:
-    """Something that was examined.
-
-    Attributes:
-        area: as in :class:`Finding`.
-    """
+    """Something that was examined."""
 
     area: str = field(default="", kw_only=True)
     what: str

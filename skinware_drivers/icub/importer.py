@@ -156,7 +156,6 @@ def import_files(
     Args:
         paths: XML of robots-configuration, position files and drawings of skinGui, and folders of them.
         notes: takes the remarks, also if this raises.
-        only: devices to translate, by name; all if empty.
         positions: position file of a body part, if the names of the files are ambiguous.
         bus_names: bus of each patch; only for one device.
         wants_buses: their buses will be connected to this computer.

@@ -147,8 +147,6 @@ class Element:
 
     Attributes:
         tag: with its prefix, if any.
-        line: counted from 1.
-        children: in order.
         understood: a reader has used it.
     """
 

@@ -72,7 +72,6 @@ class _Edition(NamedTuple):
 
     Attributes:
         switches: switch its sensors on.
-        calibration: take the present values as untouched.
         reset: set the sensors' channels up again; None: it has no such registers.
     """
 

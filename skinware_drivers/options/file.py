@@ -115,7 +115,6 @@ class ConfigFile:
         Args:
             struct: the driver's ``Options``.
             given: texts by name of option, as of a command line.
-            usual: values that replace the defaults.
 
         Raises:
             ConfigurationError: an unknown option or a wrong value.

@@ -41,11 +41,7 @@ def _library() -> skinware.native.Library:
 
 
 class NativePath:
-    """Decodes and publishes, on the arrays of a decoder and a publisher.
-
-    Args:
-        publisher: the moments of publication, and the columns beside values.
-    """
+    """Decodes and publishes, on the arrays of a decoder and a publisher."""
 
     def __init__(self, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch

@@ -151,8 +151,6 @@ class Bursts(NamedTuple):
     """Some bursts of one patch.
 
     Attributes:
-        period_s: time between two bursts.
-        size: number of frames of a burst.
         wire: (bursts * size,) frames, as in a batch.
         time_ns: (bursts * size,) int64.
     """
@@ -212,8 +210,6 @@ class Outcome:
     """The result of all troubles.
 
     Attributes:
-        shown: number of updates that were shown as fresh.
-        torn: number of those that mix different bursts.
         first: the first trouble that tore an update.
     """
 
@@ -229,7 +225,6 @@ def record(
     """Return bursts of the first patch among the frames of a bus; None if there are too few.
 
     Args:
-        period_s: time between two bursts.
         wire: (n,) frames in order, as in a batch.
         time_ns: (n,) int64.
     """

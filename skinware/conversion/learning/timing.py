@@ -89,7 +89,6 @@ class Episode:
     Attributes:
         times_ns: (t,) of each row, wall clock.
         frames: by driver, (t,) number of the newest sample at each row.
-        joined: by joined feature, (t,) its row.
     """
 
     recording: int
@@ -107,7 +106,6 @@ class Planner:
     """Makes episodes of one recording.
 
     Args:
-        joined: joined data, each with its times, wall clock.
         structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:

@@ -49,7 +49,6 @@ def name_in_module(type_name: str, number: int, is_only: bool) -> str:
 
     Args:
         number: its uid, counted from the lowest in the module.
-        is_only: the module has no other of that type.
     """
     by_type = type_name.startswith(_BY_TYPE)
     if is_only:

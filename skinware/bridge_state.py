@@ -124,8 +124,6 @@ def service_name(robot: str) -> str:
 
 
 class BridgeSample(Sample):
-    """State of a bridge at one moment."""
-
     __slots__ = ()
 
     @property

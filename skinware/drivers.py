@@ -78,9 +78,6 @@ class Drivers(Generic[ReaderT]):
     def look(self, *, at_once: bool = False) -> bool:
         """Find services that came or went, if a look is due.
 
-        Args:
-            at_once: look although it is not due.
-
         Returns:
             False if no look was due, or all services are followed and every file is that of the look before.
 
@@ -134,9 +131,6 @@ class Drivers(Generic[ReaderT]):
 
     def newest(self, name: str, *, newer_than: Sample | None = None) -> Any:
         """Return the newest sample of a service; never wait.
-
-        Args:
-            newer_than: a sample that is not wanted again.
 
         Returns:
             None if there is no newer one, the service has just restarted, or is not followed any more.

@@ -145,12 +145,7 @@ class Geometry:
         return self.at([type_name] * len(uid), uid)
 
     def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """Return the places of n sensors; not known where this geometry does not have them.
-
-        Args:
-            type_name: name of each one's type.
-            uid: (n,) of each.
-        """
+        """Return the places of n sensors; not known where this geometry does not have them."""
         rows = {pair: row for row, pair in enumerate(zip(self.type_name.tolist(), self.uid.tolist(), strict=True))}
         found = [rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)]
         return self._take(np.array(found, np.int64), type_name, uid)
@@ -265,7 +260,6 @@ def geometry_of(text: TomlText) -> Geometry:
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
-    """Return the text of a geometry file."""
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]

@@ -133,7 +133,6 @@ def report_of(
     """Return the report of a driver.
 
     Args:
-        frame: its newest snapshot.
         patch_rates_hz: updates per second of each patch as measured; ignored unless there is one for each patch.
         life: what it is doing; default: what :func:`life_of` returns.
         status: (n_sensors,) uint8, status of its sensors now; default: what :func:`status_now` returns.
@@ -187,9 +186,6 @@ def report_of(
 
 def life_of(service: ServiceReader[Any], newest: Sample | None) -> str:
     """Return what a service is doing.
-
-    Args:
-        newest: its newest sample.
 
     Returns:
         ``live``; ``silent``: its process runs but has published nothing for a second and for five of its periods (it

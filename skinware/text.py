@@ -94,7 +94,6 @@ def table(
 
     Args:
         titles: one for each column.
-        rows: one text for each column.
         left: the first so many columns are aligned left, the others right.
         width: columns of a line; wider tables continue in a table below with the same first column.
     """

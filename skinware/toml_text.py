@@ -58,8 +58,6 @@ class TomlText:
         Args:
             what: such a file is called, for messages.
             format_name: that it must have.
-            version: that it must have.
-            struct: of all that may be in it, these two included.
 
         Raises:
             ConfigurationError: another format or version, or a value that does not fit; the message says where.

@@ -132,7 +132,6 @@ def candump_line(
 
     Args:
         epoch_us: when, microseconds since 1970.
-        channel: name of the interface (:func:`channel_name`).
         identifier: with the flags of linux/can.h.
         fd_flags: of a CAN FD frame; None of a classic one.
         direction: ``R`` received, ``T`` sent; empty: not known.

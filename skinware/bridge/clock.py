@@ -142,9 +142,6 @@ class Pinger:
 
     ``on_sample`` gets the bounds of a round: in the receiving thread with the last answer, or, if some answers do not
     come, when the next round begins.
-
-    Attributes:
-        asked_ns: when the last round began.
     """
 
     def __init__(self, link: Link, who: str, on_sample: Callable[[Exchange], None], guard: Guard) -> None:

@@ -165,7 +165,6 @@ class ServiceFollower:
         return self.output.traffic.report(state, self._pacing.mode)
 
     def take(self, service: Service) -> None:
-        """Take a new state of the service."""
         before, self.service = self.service, service
         if service.generation and (self._generation is None or self._generation.generation != service.generation):
             self._ask_generation(service.generation)

@@ -80,9 +80,6 @@ class Pacing:
         period_ns: of the writer, 0 if it has none.
         fixed: ``push`` or ``pull`` if a person chose it; None: the mode follows the link.
         size: of a frame as it would be pushed, bytes.
-
-    Attributes:
-        open: how many questions are open at once.
     """
 
     def __init__(self, period_ns: int, fixed: str | None = None, size: int = 0) -> None:

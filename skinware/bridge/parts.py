@@ -59,9 +59,6 @@ class Cut:
     Args:
         positions: (n,) of the sensors that stay, in a frame, ascending.
 
-    Attributes:
-        generation: of the same number, with what stays.
-
     Raises:
         StructureError: it is not a driver, or no sensor stays.
     """
@@ -170,7 +167,6 @@ class RobotPart:
             self._streams[name].take(frame)
 
     def find(self, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of this part of a driver."""
         _, cut = self._cuts.get(name, (None, None))
         return None if cut is None else (cut.file, self._streams[name])
 
@@ -214,7 +210,6 @@ class Parts:
             return part
 
     def find(self, number: str, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of a driver's part."""
         part = self._parts.get(number)
         return None if part is None else part.find(name)
 

@@ -65,7 +65,6 @@ class Jobs:
                 os.eventfd_write(self.fd, 1)
 
     def run(self) -> None:
-        """Do all jobs that wait."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         for _ in range(len(self._jobs)):
@@ -134,7 +133,6 @@ class Peer:
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
-        since_ns: when that began.
         guard: counts its messages that cannot be read.
     """
 

@@ -112,7 +112,6 @@ class Seen:
     """A robot that is reached.
 
     Attributes:
-        summary: the last one; None: none so far.
         heard_ns: when that came; 0: never.
         guard: counts its messages that cannot be read.
         pinger: asks for its clock; None: not asked yet.

@@ -63,7 +63,6 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
 
 
 def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict[str, Any]:
-    """Return a finding for programs."""
     return {
         "kind": finding.kind,
         "modules": [structure.module_names[number] for number in finding.modules],
@@ -106,12 +105,7 @@ class Gathering:
     """Take the snapshots of a driver into a session, and report the progress.
 
     Args:
-        poses: of the presses; None: the session needs none.
         fresh: begin with nothing, and ignore that file.
-        as_json: print JSON, not text.
-
-    Attributes:
-        restored: whether it continues with the data of the state file.
 
     Raises:
         ConfigurationError: the data of the state file do not fit.
@@ -142,7 +136,6 @@ class Gathering:
         Gathered data are in the state file afterwards, also after Ctrl-C.
 
         Args:
-            what_to_do: for the person.
             share: part of the sensors that is enough, 0 to 1.
             duration_s: longest time after the baselines are known; None: no limit.
 

@@ -93,7 +93,6 @@ class Label:
     """A word at a column of the terminal.
 
     Attributes:
-        column: of its first character.
         is_mark: it stands over sensors and marks something there; otherwise it stands beside or above them.
     """
 

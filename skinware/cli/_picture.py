@@ -40,9 +40,6 @@ def change_levels(
 
     Args:
         change: (n,) physical, 0 or more.
-        noise: nothing is shown up to here.
-        span: change of the highest level.
-        before: the levels drawn so far.
     """
     felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
     return levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before), (0.0, span / 4, span)
@@ -106,7 +103,6 @@ class Picture:
         self._region = names[(names.index(self._region) + 1) % len(names)]
 
     def regions_of(self, driver: str, position: int) -> list[str]:
-        """Return the names of the regions of a sensor."""
         structure = self._memories[driver].structure
         in_regions = self._in_regions(driver, structure, _type_of(structure, position).name)
         return [name for name, is_inside in in_regions.items() if is_inside[position]]

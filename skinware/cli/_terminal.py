@@ -121,7 +121,6 @@ class PatientStream(io.TextIOBase):
             os.close(fd)
 
     def _write(self, data: bytes) -> int:
-        """Write without waiting, and return the number of bytes."""
         if self._own_fd is not None:
             try:
                 return os.write(self._own_fd, data)

@@ -203,7 +203,6 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def action_save_list(self) -> None:
-        """Save the list of the sensors that never moved."""
         row = self._chosen
         try:
             path = self._picture.save_wipe(row.key.driver, Path.cwd()) if row else None

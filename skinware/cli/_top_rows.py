@@ -31,8 +31,6 @@ class RowKey(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row of the list."""
-
     key: RowKey
     cells: tuple[str, ...]
     """One text for each column."""

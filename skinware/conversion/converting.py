@@ -148,7 +148,6 @@ class _WatchedTable(Table):
         self._table, self._frames, self._is_stopped = table, frames, is_stopped
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         self._frames[self.name] = 0
         for block in self._table.blocks(names):
             if self._is_stopped():

@@ -111,8 +111,6 @@ def _timed_json(topic: str, entries: list[dict[str, Any]]) -> Iterator[_TimedJso
 
 @dataclass
 class _Stream:
-    """The frames of one service as they are coded."""
-
     head: Head
     generation: Generation
     encoder: Encoder

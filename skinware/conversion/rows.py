@@ -134,8 +134,6 @@ def _file_part(output: Output) -> str:
 
 
 class _Text:
-    """The file of one array."""
-
     def __init__(self, open_files: ExitStack, path: Path, labels: Sequence[str], output: Output) -> None:
         self.output = output
         self._leaves = leaves(output.format)

@@ -38,8 +38,6 @@ _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Message(NamedTuple):
-    """A message for viewers."""
-
     topic: str
     encoding: str
     schema: Schema
@@ -278,7 +276,6 @@ class Viewers:
     """Messages for viewers, beside the frames that they are made of.
 
     Args:
-        json_state: as for :class:`Showing`.
         rate_hz: of each driver, at most.
     """
 

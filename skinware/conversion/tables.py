@@ -151,11 +151,7 @@ class Source(Protocol):
 
 
 class DerivedSource:
-    """A source with other tables than the one that it stands for.
-
-    Args:
-        tables: made of the source's.
-    """
+    """A source with other tables than the one that it stands for."""
 
     def __init__(self, source: Source, tables: Sequence[Table]) -> None:
         self._source = source
@@ -165,7 +161,6 @@ class DerivedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`Source`."""
         return self._source.events
 
     @property
@@ -286,7 +281,6 @@ class RecordedTable(Table):
         self._part, self._start_ns, self._span = part, recording.start_ns, span
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         columns = [name.removeprefix(COLUMNS) for name in names if name.startswith(COLUMNS)]
         start_s = (self._span.begin_ns - self._start_ns) / NS_PER_S
         end_s = (self._span.end_ns - self._start_ns) / NS_PER_S

@@ -34,8 +34,6 @@ class Turns(NamedTuple):
     """The turns that C took since they were last settled.
 
     Attributes:
-        frames: samples taken.
-        lost: samples missed.
         last: sequence of the last sample taken.
     """
 

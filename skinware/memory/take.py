@@ -35,9 +35,6 @@ class Turn(NamedTuple):
     """One turn of a loop that takes samples.
 
     Attributes:
-        acquired_ns: ``acquired_ns`` of its sample.
-        taken_ns: when the sample was handed out.
-        ended_ns: when the loop came back.
         cpu_ns: CPU time of the thread at the end; 0 if it was not asked for.
     """
 

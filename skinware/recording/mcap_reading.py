@@ -82,11 +82,7 @@ class ChunkPlace:
 
 @dataclass
 class ChunkContents:
-    """The contents of a chunk.
-
-    Attributes:
-        messages: in the order in which they were written.
-    """
+    """The contents of a chunk."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)

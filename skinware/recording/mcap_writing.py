@@ -48,9 +48,7 @@ class ClosedChunk:
     """A finished chunk, ready for any file.
 
     Attributes:
-        record: bytes of the chunk and of its message indexes.
         index: its entry in the summary, for a chunk at offset 0.
-        counts: messages of each channel.
     """
 
     record: bytes
@@ -164,9 +162,6 @@ class McapFile:
     Args:
         path: of the file, which must not exist.
         profile: MCAP's name for the kind of its channels.
-
-    Attributes:
-        size: bytes in it so far.
 
     Raises:
         OSError: it cannot be made.

@@ -85,7 +85,6 @@ class Recorder:
 
     Args:
         target: destination of the recording; the recorder completes it.
-        names: of services; None: all, also those that appear later.
         with_wires: also record the frames and bytes on the wires of the drivers.
         disguise: replaces names of buses and texts of options; None: they are written as they are.
         renderer: makes messages for viewers, recorded beside the samples.
@@ -192,8 +191,6 @@ class Recorder:
 
 @dataclass
 class _Stream:
-    """Codes the samples of one service."""
-
     head: Head
     encoder: Encoder
     generation: Generation | None

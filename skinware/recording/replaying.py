@@ -30,12 +30,9 @@ class _Tape:
     """Moves along the moments of a recording, and publishes what was newest at each place.
 
     Args:
-        names: of services; None: all.
-        ahead: decodes in the background.
         start_s, end_s: the part to publish, s since the recording began.
 
     Attributes:
-        next: the moment that is due next; None: not taken yet, or the end.
         reached_s: time of the last published moment.
     """
 
@@ -138,7 +135,6 @@ class Replayer:
     that runs the replay.
 
     Args:
-        names: of services; None: all.
         speed: 2.0 is twice as fast as recorded.
         start_s: begin at this time, s since the recording began.
         end_s: end before this time; None: at the end of the recording.
@@ -252,7 +248,6 @@ class Replayer:
         self._republisher.watch(fd, call)
 
     def unwatch(self, fd: int) -> None:
-        """End a watch."""
         self._republisher.unwatch(fd)
 
     # -- operations -----------------------------------------------------------------------------------------------

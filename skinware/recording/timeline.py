@@ -21,7 +21,6 @@ class Moment(NamedTuple):
 
     Attributes:
         time_s: since the recording began.
-        frame: the sample; None for an event.
         event: ``paused``, ``live``, ``closed`` or ``dead``; empty for a sample.
     """
 

@@ -131,8 +131,6 @@ _FOR_DRIVERS = ("values", "status", "module_time_ns")
 
 
 class ChunkSource(Protocol):
-    """A recording that has chunks."""
-
     path: Path
     start_ns: int
 

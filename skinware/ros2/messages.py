@@ -18,8 +18,6 @@ _AT_ITS_ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class DiagnosticLevel(IntEnum):
-    """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-
     OK = 0
     WARN = 1
     ERROR = 2
@@ -56,7 +54,6 @@ def transforms(parent: str, children: Collection[str], time_ns: int) -> bytes:
 
 
 def trigger_response(success: bool, message: str) -> bytes:
-    """Return a ``std_srvs/srv/Trigger_Response``."""
     return Cdr().numbers("?", success).text(message).done()
 
 

@@ -93,7 +93,6 @@ class Ros2Server:
     """Publishes drivers in a ROS 2 graph; nothing there can hold them up.
 
     Args:
-        names: of drivers; empty: all, also later ones.
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.
         root_frame: parent of all coordinate frames in ``/tf_static``; empty: no such topic.

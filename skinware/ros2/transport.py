@@ -86,11 +86,7 @@ class MessageType:
 
 @dataclass(frozen=True)
 class ServiceType(MessageType):
-    """A type of services; its hash is that of both messages and the event together.
-
-    Attributes:
-        request: type of the question: ``std_srvs/srv/Trigger_Request``.
-    """
+    """A type of services; its hash is that of both messages and the event together."""
 
     request: MessageType
     response: MessageType

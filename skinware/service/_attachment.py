@@ -117,7 +117,6 @@ class Attachment(Generic[SampleT]):
         """Have the writer do something that it declares (see ``operations``), and wait for the result.
 
         Args:
-            timeout_s: longest wait.
             arguments: of the operation, by name; anything that JSON can hold.
 
         Raises:

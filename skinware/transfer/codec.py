@@ -155,9 +155,6 @@ def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
 class Run:
     """Messages of frames of one generation: a key frame, and frames that are each coded after the one before.
 
-    Args:
-        columns: of the generation's slots.
-
     Attributes:
         headers: (n,) of :data:`HEADER`.
 

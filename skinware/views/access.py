@@ -94,7 +94,6 @@ class Access:
 
         Args:
             peer: address and port of that end.
-            here: those of this end.
 
         Raises:
             Refused: it may not look.

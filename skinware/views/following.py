@@ -98,7 +98,6 @@ class ShownDriver:
         newest: its newest snapshot; None before the first.
         status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
-        past: its values of the last seconds.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
@@ -134,7 +133,6 @@ class ShownDriver:
         return report_of(live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status)
 
     def take(self, frame: DriverSnapshot, services: TactileServices) -> None:
-        """Go on to a newer snapshot."""
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)
@@ -183,12 +181,10 @@ class Follower:
     """All drivers of a namespace, and what services publish about them.
 
     Args:
-        names: of those to follow; default: all.
         calm: namespace of calmed drivers; None: without it.
 
     Attributes:
         edition: changes whenever drivers or structures change.
-        problem: why nothing can be seen; None: all is well.
     """
 
     def __init__(

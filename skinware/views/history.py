@@ -238,11 +238,7 @@ def threshold(noise: float) -> float:
 
 
 class Memory:
-    """Everything that a picture of one driver remembers from snapshot to snapshot.
-
-    Args:
-        rest: its values at rest, if others follow them too; default: its own.
-    """
+    """Everything that a picture of one driver remembers from snapshot to snapshot."""
 
     def __init__(self, structure: Structure, rest: Rest | None = None) -> None:
         self.structure = structure

@@ -41,7 +41,6 @@ class Mesh:
 
     Attributes:
         frame: the link's coordinate frame.
-        file: of the mesh (STL).
         pose: (4, 4) of the mesh in that frame, with its scale.
     """
 

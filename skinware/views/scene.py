@@ -280,9 +280,6 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
 def on_shelves(sizes: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
     """Return the upper left corners of boxes that stand in lines in their order, so that all fit into a small window.
 
-    Args:
-        sizes: width and height of each.
-
     Returns:
         The distance of each to the right and up; the first is at 0, 0, and lower ones have negative heights.
     """

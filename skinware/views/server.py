@@ -51,7 +51,6 @@ class ViewServer:
     Args:
         follower: of the drivers; used in the event loop's thread only.
         recording: that viewers may begin and end; None: they may not record.
-        page: folder of the page's files.
     """
 
     def __init__(

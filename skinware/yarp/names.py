@@ -32,7 +32,6 @@ class PortAddress(NamedTuple):
 
     Attributes:
         port: of TCP, 1 to 65535.
-        carrier: that begins a connection; ``tcp`` for all ordinary ports.
     """
 
     name: str

@@ -46,10 +46,8 @@ class Settings:
     """Settings of the ports.
 
     Attributes:
-        names: of drivers; empty: all, also later ones.
         prefix: before the names of all ports.
         full_scale: physical value that becomes 255; None: the maximum of the type.
-        regions: that have a port each.
         yarp: major version of the YARP of binary readers, 3 or 4; None: they are refused.
     """
 

@@ -71,7 +71,6 @@ def vectors_of(
 
     Args:
         full_scale: physical value that becomes 255; None: the maximum of the type.
-        regions: that have a port each.
 
     Raises:
         ConfigurationError: it has no such sensors, or their full scale is not known.

@@ -75,8 +75,6 @@ _TWICE = 1.5
 
 
 class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     model: Annotated[
         Literal["auto", "tips", "sense"],
         Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: by the frames"),

@@ -72,8 +72,6 @@ _TOP_10 = Frame(
 
 
 class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     nodes: Annotated[tuple[int, ...], Meta(description="nodes with tactile cells, 11-14")] = (11, 12, 13, 14)
     format: Annotated[
         Literal["full", "top10"], Meta(description="all cells in 12 bits, or the ten strongest in four")

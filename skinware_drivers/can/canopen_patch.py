@@ -40,8 +40,6 @@ _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
 
 class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     eds: Annotated[str, Meta(description="EDS or DCF file of the patches; default: the example's")] = ""
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127; default: all that answer")] = ()
     period_ms: Annotated[int, Meta(description="time between two updates, ms", ge=1, le=60_000)] = 20

@@ -29,8 +29,6 @@ QUARTERS = tuple(
 
 
 class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     period_ms: Annotated[int, Meta(description="nominal time between two sets, ms", ge=1)] = 20
 
     def __post_init__(self) -> None:

@@ -57,8 +57,6 @@ _FEWEST_ROUNDS, _SHORTEST_ROUND_S, _LONGEST_ROUND_S = 3, 0.01, 2.0
 
 
 class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     hands: Annotated[
         tuple[int, ...], Meta(description="identifiers of the hands; default: 0x27 and 0x28, if present")
     ] = ()

@@ -58,7 +58,6 @@ class PythonCanBus(Bus):
 
     Args:
         interface: python-can's name of the interface.
-        channel, options, payload_size, listen_only: as for :class:`skinware_drivers.bus.Bus`.
     """
 
     medium: ClassVar[str] = "can"

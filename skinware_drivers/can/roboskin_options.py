@@ -73,9 +73,6 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         period_ms: time between two updates.
-        skin_type: type of skin that is sent to them.
-        no_load: value of an idle taxel.
-        inertial: inertial sensors that they send.
     """
 
     boards: tuple[int, ...]

@@ -64,7 +64,6 @@ class DriverCommand(HardwareCommand):
         return short_name(name), load_driver(name).Options
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse; explain a word that is not an option."""
         ctx.allow_extra_args = True
         left = super().parse_args(ctx, args)
         if left:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,37 +55,6 @@ class Updates:
         """(n,) int64, the update group that stands for each."""
         return self.groups[:, 0]
 
-    def take(self, which: slice | npt.NDArray[Any]) -> Updates:
-        """Return some of the updates."""
-        return Updates(
-            self.module[which],
-            self.groups[which],
-            self.whole[which],
-            self.sensors[which],
-            self.values[which],
-            self.status[which],
-            self.oldest_ns[which],
-            self.newest_ns[which],
-            self.flagged,
-        )
-
-    @staticmethod
-    def join(parts: Sequence[Updates]) -> Updates:
-        """Return the updates of several objects, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return Updates(
-            np.concatenate([p.module for p in parts]),
-            np.concatenate([p.groups for p in parts]),
-            np.concatenate([p.whole for p in parts]),
-            np.concatenate([p.sensors for p in parts]),
-            np.concatenate([p.values for p in parts]),
-            np.concatenate([p.status for p in parts]),
-            np.concatenate([p.oldest_ns for p in parts]),
-            np.concatenate([p.newest_ns for p in parts]),
-            any(p.flagged for p in parts),
-        )
-
 
 class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.
@@ -103,7 +71,6 @@ class SkinState:
         all_patch_time_ns: (n_patches + 1,) int64, newest stamp of a complete update of a prompt group; 0: never.
         group_patch: (n_groups,) the patch of each group.
         is_prompt: (n_groups,) bool: updated in every period, so that frames wait for it.
-        newest_ns: newest stamp of all.
         bus_counters: (n_buses, len(BUS_COUNTERS)) int64.
         patch_counters: (n_patches, len(PATCH_COUNTERS)) int64.
     """
@@ -117,12 +84,9 @@ class SkinState:
         self.all_touched = np.zeros(structure.n_groups + 1, bool)
         self.all_patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
         self.group_patch = structure.group_patch.astype(np.intp)
-        self._prompt_patch = np.append(self.group_patch, structure.n_patches)
         self.is_prompt: npt.NDArray[np.bool_] = np.ones(structure.n_groups, bool)
-        self.newest_ns: int = 0
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
-        self._status_is_zero = False
 
     @property
     def values(self) -> npt.NDArray[Any]:
@@ -163,19 +127,3 @@ class SkinState:
     def settle_pace(self, period_ns: int) -> None:
         """Count groups whose own period is much longer than the driver's as not prompt."""
         self.is_prompt[:] = self._structure.group_period_ns <= period_ns * _PROMPT
-        self._prompt_patch[:-1] = np.where(self.is_prompt, self.group_patch, self._structure.n_patches)
-
-    def show(self, updates: Updates) -> None:
-        """Show updates; if there are several of one module, the last one stays."""
-        if not len(updates):
-            return
-        shown = np.where(updates.whole[:, None], updates.groups, self._structure.n_groups)
-        self.all_values[updates.sensors] = updates.values
-        if updates.flagged or not self._status_is_zero:
-            self.all_status[updates.sensors] = updates.status
-            self._status_is_zero = not updates.flagged and not self.status.any()
-        self.all_group_time_ns[shown] = updates.oldest_ns[:, None]
-        self.all_updated[shown] = True
-        self.all_touched[updates.groups] = True
-        self.all_patch_time_ns[self._prompt_patch[shown[:, 0]]] = updates.newest_ns
-        self.newest_ns = max(self.newest_ns, int(updates.newest_ns[-1]))

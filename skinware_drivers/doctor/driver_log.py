@@ -70,7 +70,6 @@ class DriverLog:
 
     Attributes:
         newest: the last one; None before the first.
-        future_ns, backwards, longest_gap_s: see :class:`skinware_drivers.doctor.evidence.DriverTiming`.
     """
 
     structure: Structure
@@ -93,11 +92,7 @@ class DriverLog:
         self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
 
     def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
-        """Add a snapshot.
-
-        Args:
-            time_s: when it was published, since the look began.
-        """
+        """Add a snapshot."""
         bus_names, bus_counts = counters_of(frame, tables, "bus", len(self.structure.buses))
         patch_names, patch_counts = counters_of(frame, tables, "patch", self.structure.n_patches)
         before = self.newest

@@ -230,7 +230,6 @@ class MachineSeen:
     Attributes:
         versions: of skinware, Python, numpy ..., by name.
         kernel: release and processor architecture.
-        cpus: number of processors that this process may use.
         load: number of processes that are ready to run, mean of the last minute.
         governors: of the processors, each once; empty: none, or unknown.
         memory_bytes, memory_available_bytes: of the machine; 0: unknown.
@@ -266,7 +265,6 @@ class ClockSet:
     """A jump of the wall clock in a recording, because it was set or the machine slept.
 
     Attributes:
-        time_s: since the recording began.
         by_s: size of the jump, forward or back.
     """
 

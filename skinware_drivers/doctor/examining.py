@@ -39,7 +39,6 @@ class Examination:
 
     Attributes:
         findings: the worst first, then in the order in which data travels.
-        not_looked: what could not be examined.
     """
 
     findings: tuple[Finding, ...]

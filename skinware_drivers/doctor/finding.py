@@ -16,8 +16,6 @@ from skinware_drivers.registry import load_driver
 
 
 class Severity(enum.IntEnum):
-    """How bad something is."""
-
     NOTE = 1
     """It costs no data now."""
     WARNING = 2
@@ -52,11 +50,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Looked:
-    """Something that was examined.
-
-    Attributes:
-        area: as in :class:`Finding`.
-    """
+    """Something that was examined."""
 
     area: str = field(default="", kw_only=True)
     what: str

@@ -158,7 +158,6 @@ async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list
 
     Args:
         bus: the bus; only its name is used.
-        adapter: the driver's adapter.
     """
     match = _match(type(adapter).__name__, adapter, traffic.wire())
     if match is None:

@@ -201,12 +201,7 @@ class Detection:
 
 
 def detect_adapters(timeout_s: float, command: list[str] | None = None) -> Detection:
-    """Search with all interfaces of python-can that can.
-
-    Args:
-        timeout_s: longest time for all of them.
-        command: the process to start, for tests.
-    """
+    """Search with all interfaces of python-can that can."""
     process = subprocess.Popen(
         command or [sys.executable, "-m", __name__],
         stdin=subprocess.DEVNULL,

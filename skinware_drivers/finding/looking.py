@@ -68,9 +68,6 @@ class ProbeAnswer:
 async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
     """Listen to a CAN bus. Nothing is sent.
 
-    Args:
-        bus_name: as for ``--bus``.
-
     Raises:
         ConfigurationError: this is not the name of a bus.
     """

@@ -101,13 +101,7 @@ class SerialPort:
 
 @dataclass(frozen=True)
 class Machine:
-    """The roots of the file systems to read, which tests replace.
-
-    Attributes:
-        sys: sysfs.
-        dev: device files.
-        proc: procfs.
-    """
+    """The roots of the file systems to read, which tests replace."""
 
     sys: Path = Path("/sys")
     dev: Path = Path("/dev")

@@ -238,11 +238,7 @@ def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Plac
 
 
 def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:
-    """Note triangles that are drawn but off, or on but not drawn.
-
-    Args:
-        triangles: all triangles of each body part.
-    """
+    """Note triangles that are drawn but off, or on but not drawn."""
     for name, drawn in body.drawn.items():
         on = triangles.get(name, set()) & enabled
         for which, what in ((drawn - on, "drawn, but off"), (on - drawn, "on, but not drawn")):

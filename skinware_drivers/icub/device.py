@@ -24,7 +24,6 @@ class Group:
 
     Attributes:
         lists: by name, the elements ``elem`` of each.
-        actions: elements ``action``.
         others: elements that do not belong in a device.
     """
 

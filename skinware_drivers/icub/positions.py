@@ -51,7 +51,6 @@ class Positions:
 
 
 def is_positions(text: str) -> bool:
-    """Return whether a text looks like a position file."""
     return _CALIBRATION in text and "taxel2Repr" in text
 
 

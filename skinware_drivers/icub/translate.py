@@ -34,11 +34,7 @@ _TABLES = ("special_boards", "modules", "triangles")
 
 
 def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, geometry: str = "") -> str:
-    """Return the text of a file for ``skin-driver --config``.
-
-    Args:
-        geometry: name of the file with the places of the sensors.
-    """
+    """Return the text of a file for ``skin-driver --config``."""
     each = [(bus.name, bus.comment, bus.options) for bus in buses]
     return _text("roboskin", name, each, comment, geometry)
 
@@ -50,7 +46,6 @@ def yarp_configuration_text(
 
     Args:
         buses: name and options of each port.
-        geometry: name of the file with the places of the sensors.
     """
     return _text("yarp", name, [(bus, "", options) for bus, options in buses], comment, geometry)
 

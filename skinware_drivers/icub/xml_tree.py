@@ -46,8 +46,6 @@ def shown(text: object) -> str:
 
 
 class Notes:
-    """Remarks in order, each once."""
-
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
 
@@ -149,8 +147,6 @@ class Element:
 
     Attributes:
         tag: with its prefix, if any.
-        line: counted from 1.
-        children: in order.
         understood: a reader has used it.
     """
 
@@ -168,7 +164,6 @@ class Element:
 
     @property
     def label(self) -> str:
-        """Return it for messages: ``param "period"``."""
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:

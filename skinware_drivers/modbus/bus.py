@@ -83,8 +83,6 @@ class ModbusBus(KernelBus):
 
     Args:
         channel: ``tcp://HOST[:PORT]``, or the path of a port.
-        options: see :class:`ModbusOptions`.
-        payload_size: longest frame.
 
     Raises:
         ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
@@ -153,8 +151,6 @@ class ModbusBus(KernelBus):
         """Set what to ask for, now and after each opening. Options of the bus override these arguments.
 
         Args:
-            period_s: time from one cycle to the next.
-            timeout_s: longest wait for a reply.
             turnaround_s: pause after a reply; None: that of the standard on a serial line, none over TCP.
 
         Raises:

@@ -95,8 +95,6 @@ class DfrobotWatch(OrderWatch):
 
 
 class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
-    """The arrays on one line, each a patch."""
-
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))

@@ -82,7 +82,6 @@ class Gateway:
 
     Args:
         places: ``PORT`` or ``HOST:PORT`` for Modbus TCP, or a path for a serial port, separated by commas.
-        guests: takes the questions.
         is_public: other machines may reach it.
 
     Raises:

@@ -64,8 +64,6 @@ _MATRICES = (
 
 
 class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; the manual has 255 over TCP")] = 1
     period_ms: Annotated[
@@ -81,8 +79,6 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InspireDriver(ModbusAdapter[InspireOptions]):
-    """One hand."""
-
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))

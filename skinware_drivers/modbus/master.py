@@ -84,14 +84,9 @@ class Schedule:
     A unit that has not answered three times in a row is asked more and more rarely if there are others; so is a read
     that is answered by an exception.
 
-    Args:
-        period_ns: from one cycle to the next.
-
     Attributes:
         cycle: number of the present cycle; -1 before the first.
         cycle_ns: when it began.
-        deadline_ns: when the next one begins.
-        next: position of the next read in this cycle.
         retries: of units ("unit", unit) and reads ("read", position) that fail.
     """
 

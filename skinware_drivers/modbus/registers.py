@@ -105,7 +105,6 @@ class Read:
     """One question of a cycle.
 
     Attributes:
-        area: number of its area in the image.
         first: its first register in that area.
     """
 

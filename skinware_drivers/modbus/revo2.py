@@ -72,7 +72,6 @@ class _Edition(NamedTuple):
 
     Attributes:
         switches: switch its sensors on.
-        calibration: take the present values as untouched.
         reset: set the sensors' channels up again; None: it has no such registers.
     """
 
@@ -189,8 +188,6 @@ def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
 
 
 class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
@@ -234,8 +231,6 @@ class _Said(NamedTuple):
 
 
 class Revo2Driver(ModbusAdapter[Revo2Options]):
-    """One hand."""
-
     dtype: npt.DTypeLike = np.float32
     baudrate = 460_800
     timeout_s = 0.03

@@ -115,7 +115,6 @@ class ConfigFile:
         Args:
             struct: the driver's ``Options``.
             given: texts by name of option, as of a command line.
-            usual: values that replace the defaults.
 
         Raises:
             ConfigurationError: an unknown option or a wrong value.
@@ -150,8 +149,6 @@ class ConfigFile:
 
 
 class _Wrong(Exception):
-    """A mistake, and the key that has it."""
-
     def __init__(self, text: str, keys: Keys) -> None:
         super().__init__(text)
         self.keys = keys

@@ -47,7 +47,6 @@ class Proof:
 
     Attributes:
         about: facts on the device, the driver and this machine's programs.
-        checks: in order.
     """
 
     driver: str

@@ -28,7 +28,6 @@ class ModuleUpdates:
     """The updates of one module, in order.
 
     Attributes:
-        sensors: (n,) names.
         time_ns: (k,) int64, since the recording began.
         values: (k, n) raw.
     """
@@ -50,8 +49,6 @@ class Difference:
     """A difference between two decodings.
 
     Attributes:
-        time_s: since the recording began.
-        sensor: name of the first sensor that differs.
         then, now: its raw values; None: there is no such update.
     """
 

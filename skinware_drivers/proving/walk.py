@@ -34,11 +34,7 @@ _UNUSABLE = int(Status.NEVER_SEEN | Status.STALE | Status.MASKED)
 
 
 class Step(NamedTuple):
-    """A request to a person.
-
-    Attributes:
-        module: name of the module; empty: all.
-    """
+    """A request to a person."""
 
     wanted: Wanted
     module: str
@@ -60,10 +56,7 @@ class Manner:
     """Settings of a walk.
 
     Attributes:
-        type_name: type of the sensors; None: pressure, force, or the first type.
         only: press the modules with one of these words in their names; empty: all.
-        patience_s: longest time of a step.
-        rest_s: duration of the rest at the beginning.
         with_tare: let the driver tare at the end, if it can.
     """
 

@@ -185,7 +185,6 @@ class Builder:
                         generation.watch.forget(number)
 
     async def close(self) -> None:
-        """Take no more requests."""
         if self.desk is not None and self.writer is not None:
             asyncio.get_running_loop().remove_reader(self.writer.request_server().fileno())
             await self.desk.close()

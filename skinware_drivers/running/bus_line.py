@@ -32,13 +32,10 @@ class BusCondition:
     """The state of a bus; changes are logged.
 
     Attributes:
-        state: live, silent, down ...
-        reason: of the state, or of trouble although frames come.
         since_ns: when both became so, CLOCK_MONOTONIC ns.
         heard_ns: when the bus last delivered frames.
         checked_ns: when the bus was last asked whether it is still there.
         speaks_from_ns: from when on its devices send of themselves; before, they only answer.
-        news: logs changes.
     """
 
     def __init__(self, name: str, bus: Bus) -> None:
@@ -105,12 +102,9 @@ class BusLine:
 
     Args:
         ordinal: its place among the driver's buses.
-        adapter: the driver's object for this bus.
         bus: the bus itself, not open.
-        epoll: where the descriptor of the open bus is registered.
 
     Attributes:
-        connection: whether it is open.
         patches: found on it, None until it was asked.
         patch_news: logs which of its patches fell silent, or are live again.
         suspects: keys of the patches that report errors.

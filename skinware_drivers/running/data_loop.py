@@ -75,9 +75,6 @@ class DataLoop:
 
     Args:
         on_patches: called with patches that fell silent, or are live again.
-
-    Attributes:
-        machine: counts what this machine drops.
     """
 
     def __init__(

@@ -27,8 +27,6 @@ class RequestDesk:
     """Carries out operations on the buses, and answers requests for new snapshots.
 
     Args:
-        lines: the driver's buses.
-        listen_only: nothing may be sent: operations are refused.
         changed: called after an operation with its bus, its patches, and whether it set them up again.
         ending: of the driver; errors outside of an operation end it.
     """

@@ -70,8 +70,6 @@ class Flow:
 
     Args:
         latency_s: the longest rest.
-        take: called in the loop when Python must read a bus.
-        fail: called with errors.
     """
 
     def __init__(

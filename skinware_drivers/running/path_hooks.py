@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +59,18 @@ class Listeners:
     lose: Callable[[int, int], None] = lambda _bus, _error: None
     heard: Callable[[], None] = lambda: None
     damaged: Callable[[int, bytes], None] = lambda _bus, _chunk: None
+
+
+class Named(NamedTuple):
+    """The frames of some rows.
+
+    Attributes:
+        module: (n,) module of each; from ``n_modules`` on: none.
+        kind: (n,) number of its kind; 255: none.
+    """
+
+    module: Rows
+    kind: npt.NDArray[np.uint8]
 
 
 class PathHooks:
@@ -115,6 +127,14 @@ class PathHooks:
         exchange.module_status[:], exchange.module_untouched[:] = watch.module_status, watch.module_untouched
         self._words.sees_all = watch.sees_all
 
+    def named(self, rows: slice) -> Named:
+        """Return what the frames of these rows are, of the batch that was decoded last."""
+        capacity = self._batch.capacity
+        return Named(
+            _view(self._words.entry, capacity, np.int64)[rows].copy(),
+            _view(self._words.kind, capacity, np.uint8)[rows].copy(),
+        )
+
     def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
         """Return a hook that keeps its exception until C has returned: an exception cannot go through C."""
 
@@ -150,9 +170,8 @@ class PathHooks:
     def _on_times(self) -> None:
         batch = self._batch
         new = slice(max(batch.start, batch.headroom), batch.stop)
-        entry = _view(self._words.entry, batch.capacity, np.int64)[new]
-        kind = _view(self._words.kind, batch.capacity, np.uint8)[new]
-        self._decoder.device_stamps.apply(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
+        module, kind = self.named(new)
+        self._decoder.device_stamps.apply(kind, module, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
         left = self.listeners.offer(_view(at, n, np.int64).copy())

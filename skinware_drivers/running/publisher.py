@@ -140,9 +140,6 @@ class Publisher:
     Otherwise it is published at the driver's rate; without new values four times a second, so that readers see states.
 
     Args:
-        writer: the driver's service.
-        period_s: nominal time between two updates of a module.
-        by_cycle: see above.
         on_request: publish only what a request waits for (beside the very first snapshot).
     """
 

@@ -29,8 +29,6 @@ class Serving:
     """Serves buses one by one.
 
     Args:
-        lines: all buses of the driver; the list may change.
-        builder: builds a structure from what is attached to the buses.
         be_ready: called whenever a bus delivers for the first time.
     """
 

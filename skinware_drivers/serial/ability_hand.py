@@ -51,8 +51,6 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     address: Annotated[int, Meta(ge=0, le=0xFF, description="of the hand")] = 0x50
     period_ms: Annotated[int, Meta(ge=2, description="time from question to question, ms")] = 10
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for views")] = "right"

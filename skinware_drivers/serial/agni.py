@@ -80,8 +80,6 @@ def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEG
 
 
 class AgniDriver(SerialAdapter[AgniOptions]):
-    """One device on a serial line."""
-
     framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
     commands = Unframed(1024)
     payload_size = _MOST_BYTES + 8

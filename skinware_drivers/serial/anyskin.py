@@ -24,8 +24,6 @@ from skinware_drivers.serial import Packet, SerialAdapter
 
 
 class AnySkinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     mags: Annotated[int, Meta(description="magnetometers of the board", ge=1, le=64)] = 5
     period_ms: Annotated[int, Meta(description="nominal time between two messages, ms", ge=1)] = 10
 

@@ -37,9 +37,7 @@ class SerialBus(KernelBus):
 
     Args:
         channel: path or URL; empty if the options name a USB device.
-        options: see :class:`skinware_drivers.serial.opening.SerialOptions`.
         payload_size: bytes of the longest body that fits into a batch; longer ones are counted as refused.
-        listen_only: refuse every ``send``.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.

@@ -156,7 +156,6 @@ class NativeStream(Stream):
 
     Args:
         framing: of the line; ``can_compile`` must be true for it.
-        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
     """
 
     def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:

@@ -169,10 +169,8 @@ class Board(ABC):
         framing: of its frames, as far as it is known.
         layout: of its frames, once it was described.
         geometry: nominal places of its modules; None: unknown.
-        period_s: time between two updates.
 
     Args:
-        period_s: time between two updates, as far as it is known.
         use: called with a framing for the line; bytes that are no whole frame yet are dropped.
         report: called with the notices of patches.
     """

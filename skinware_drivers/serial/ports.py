@@ -121,11 +121,7 @@ class DescriptorPort(Port):
 
 
 class ThreadedPort(Port):
-    """A port without a descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it.
-
-    Args:
-        serial: pyserial's object, with short timeouts.
-    """
+    """A port without a descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it."""
 
     def __init__(self, name: str, serial: Any) -> None:
         self._name = name

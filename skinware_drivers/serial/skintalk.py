@@ -27,8 +27,6 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
     cells: Annotated[int, Meta(description="cells of each patch", ge=1, le=16)] = 16
     negative: Annotated[

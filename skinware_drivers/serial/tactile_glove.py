@@ -25,8 +25,6 @@ _MOST = 64
 
 
 class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     taxels: Annotated[int, Meta(description="number of taxels, counted from 0", ge=1, le=_MOST)] = _MOST
     period_ms: Annotated[int, Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
 

@@ -72,8 +72,6 @@ class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
-    """One WTS on a serial line."""
-
     packet = weiss_packet(_HEADER + 2 * _MOST_CELLS)
     answers = Answers("sensor", _REASONS, dtype="<u2")
     timeout_s, tries = 0.5, 3

@@ -56,8 +56,6 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
-    """One board on a serial line."""
-
     framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),

@@ -117,13 +117,11 @@ class NetworkBus(SerialBus):
 
     Args:
         channel: ``HOST:PORT``, in the form of its scheme.
-        options: of the class ``options_class``.
 
     Raises:
         ConfigurationError: no such address, or an option is unknown or has a bad value.
 
     Attributes:
-        scheme: with which its name begins.
         needs_host: a host must be given.
     """
 
@@ -164,9 +162,6 @@ class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ServerBus(SerialBus):
     """A program that sends by itself, perhaps to others as well, and is only read.
-
-    Args:
-        options: see :class:`ServerOptions`.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.

@@ -26,8 +26,6 @@ _WAITING_CALLERS = 4
 
 
 class TcpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a bus over TCP."""
-
     patience_s: Annotated[
         int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
     ] = 5

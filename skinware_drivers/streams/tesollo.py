@@ -107,8 +107,6 @@ _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
 
 
 class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two questions, ms")] = 10
     timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
     ask: Annotated[
@@ -128,8 +126,6 @@ class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Hand(NamedTuple):
-    """The hand, as it reports itself."""
-
     model: int
     firmware: bytes
     sensors: int

@@ -173,8 +173,6 @@ _PITCH_M = 0.0047
 
 
 class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     period_ms: Annotated[
         float, Meta(ge=1, le=10_000, description="nominal time between two messages of the server, ms")
     ] = 10

@@ -36,11 +36,7 @@ class Update:
 
 
 class ShownUpdates:
-    """The updates that a driver showed, each with its burst.
-
-    Attributes:
-        updates: in order.
-    """
+    """The updates that a driver showed, each with its burst."""
 
     def __init__(self, rig: Running) -> None:
         self.rig = rig

@@ -31,11 +31,7 @@ class Stumbling:
     """A sender that loses runs of frames, stands still and catches up; all chance comes from one seed.
 
     Args:
-        period_ns: time between two bursts.
         frames: number of frames of a burst; up to twice as many are lost in a row.
-
-    Attributes:
-        stumbles: number of stumbles so far.
     """
 
     def __init__(self, period_ns: int, frames: int) -> None:
@@ -111,7 +107,6 @@ class Truth:
         shown: returns the values that the protocol can send for values that were felt.
 
     Attributes:
-        n_values: number of values that each device sends.
         remember: keep the bursts.
     """
 
@@ -158,7 +153,6 @@ class Interference:
         foreign: identifiers of frames of other devices beside the data.
         keep: returns whether a frame passes.
         stumbling: holds frames back and loses some in a row; None: nothing does.
-        foreign_sent: number of frames of other devices among them.
         sent: frames that the driver sent to the devices.
         remember: keep ``sent``.
         identifiers: of the frames that passed, with their numbers.

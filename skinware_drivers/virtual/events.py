@@ -110,7 +110,6 @@ class JsonLinesLog:
             raise ConfigurationError(f"cannot write the log {path}: {error.strerror}") from error
 
     def append(self, event: Event) -> None:
-        """Write one event."""
         self._file.write(self._encoder.encode(event) + b"\n")
 
     def close(self) -> None:

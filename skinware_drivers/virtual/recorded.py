@@ -131,7 +131,6 @@ class Conversation(Listener):
         self._waiting: list[Message] = []
 
     def take(self, chunk: bytes, time_ns: int, *, is_sent: bool) -> None:
-        """Take recorded bytes."""
         if not self._over_tcp:
             self.heard(chunk, time_ns)
             return

@@ -138,7 +138,6 @@ class RecordedWire:
         return asked[0][0] if is_early else max(due_ns, asked[0][0])
 
     def emit(self, now_ns: int) -> list[WireFrame]:
-        """Return the items that are due."""
         found: list[WireFrame] = []
         self._looked_ns = now_ns
         while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._hurry(item, now_ns)):

@@ -37,6 +37,7 @@ def test_every_option_stands_in_the_table() -> None:
     assert options <= named
 
 
+@pytest.mark.thorough
 def test_the_snippet_of_the_how_to_finds_the_load(
     made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

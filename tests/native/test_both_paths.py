@@ -92,6 +92,7 @@ def test_bursts(
         player.play_senders(senders, cuts, is_watched)
 
 
+@pytest.mark.thorough
 @examples(100)
 @given(
     design=cycled_skins(),

@@ -352,6 +352,7 @@ def test_two_recorded_buses_are_two_places() -> None:
     assert places[0] == places[1] != places[2] == places[3]
 
 
+@pytest.mark.thorough
 def test_skin_driver_runs_on_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "walk.mcap"
     kind = load_driver("roboskin")

@@ -60,6 +60,7 @@ def message(of: Running, topic: str, name: str, condition: Callable[[Any], bool]
     return found[0]
 
 
+@pytest.mark.thorough
 def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namespace, domain: int) -> None:
     skin = FakeSkin("arm", placed(fake_structure(2, 8)))
     skin.break_some()
@@ -88,6 +89,7 @@ def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namesp
         ours.wait_for("status", lambda event: event["drivers"]["arm"]["messages"] > 10)
 
 
+@pytest.mark.thorough
 def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, domain: int) -> None:
     info = ("ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo")
     with FakeSkin("arm", placed(fake_structure(1, 2))) as skin, bridge() as ours:
@@ -110,6 +112,7 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
             assert of_node.node_namespace + of_node.node_name == node
 
 
+@pytest.mark.thorough
 def test_a_service_tares(namespace: Namespace, domain: int) -> None:
     with tareable(namespace), bridge("--tare") as ours:
         ours.wait_for("ready")
@@ -147,6 +150,7 @@ def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: 
             theirs.wait_for("message")
 
 
+@pytest.mark.thorough
 def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
     monkeypatch.setattr(dds, "_write_bytes", None)
     node = dds.DdsNode(NodeIdentity("skin", domain=domain))

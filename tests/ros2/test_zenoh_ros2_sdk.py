@@ -174,6 +174,7 @@ def wait_for_live(ros2: Running) -> None:
     ros2.wait_for("status", lambda event: event["drivers"].get("arm", {}).get("state") == "live")
 
 
+@pytest.mark.thorough
 def test_the_router_comes_after_the_bridge_and_is_told_of(tmp_path: Path) -> None:
     at = Router()
     with driver([]), bridge(at) as ros2:

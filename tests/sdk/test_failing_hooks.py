@@ -128,6 +128,7 @@ def test_on_the_only_bus_it_ends_the_driver_with_bus_hook_and_cause(fault: str, 
         provoke(running, bus, fault)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fault", HOOKS)
 def test_one_bus_is_set_aside_and_tried_again_and_the_others_go_on(
     fault: str, caplog: pytest.LogCaptureFixture

@@ -72,6 +72,7 @@ def test_fewer_filters_let_the_same_through(filters: list[Filter]) -> None:
     assert fewest(less) == less
 
 
+@pytest.mark.thorough
 def test_neighbours_become_one() -> None:
     assert fewest(Filter(identifier, 0x7FF) for identifier in range(0x400, 0x480)) == [Filter(0x400, 0x780)]
 

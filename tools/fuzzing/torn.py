@@ -120,7 +120,8 @@ def run(recording: Bursts, cycles: int, most: int, seed: int) -> tuple[int, int,
         rows = np.concatenate([rows for rows, _ in parts])
         time_ns = np.concatenate([time_ns + number * span_ns for number, (_, time_ns) in enumerate(parts)])
         fresh, is_torn = find_torn(recording, rows, time_ns)
-        sent, shown, torn = sent + VARIANTS_AT_ONCE * BURSTS * modules, shown + len(fresh), torn + int(is_torn.sum())
+        sent, shown = sent + VARIANTS_AT_ONCE * BURSTS * modules, shown + len(fresh.module)
+        torn += int(is_torn.sum())
     return sent, shown, torn
 
 

@@ -43,8 +43,6 @@ class DatasetWriter:
     Args:
         folder: of the dataset; it must not exist.
         fps: rows a second.
-        features: of a row, by name, besides those that all datasets have.
-        lengths: number of rows of each episode to come.
 
     Raises:
         MissingExtra: pyarrow is not installed.
@@ -65,9 +63,6 @@ class DatasetWriter:
 
     def add_episode(self, task: str, length: int, batches: Iterable[Batch]) -> None:
         """Write an episode.
-
-        Args:
-            batches: its rows, some at a time.
 
         Raises:
             OSError: it cannot be written.

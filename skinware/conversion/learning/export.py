@@ -173,8 +173,6 @@ def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval
 
 
 class _Set:
-    """A dataset that is written."""
-
     def __init__(
         self, recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], episodes: Sequence[Episode]
     ) -> None:

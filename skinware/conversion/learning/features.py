@@ -336,7 +336,6 @@ class Statistics:
 
     Args:
         most_bytes: of the rows kept for quantiles.
-        per_item: rows that count as one: pixels of an image.
     """
 
     def __init__(

@@ -30,7 +30,6 @@ class Joined:
     """Data for a feature: rows of numbers, or paths of images, each with its time.
 
     Attributes:
-        names: of the numbers in a row, or of the one column of paths.
         rows: (m, n) float32; (m,) text for paths.
 
     Raises:
@@ -147,7 +146,6 @@ def matched(
         times_ns: (m,) in order.
         at_ns: (t,) the moments.
         match: the newest time at or before a moment, or the nearest one (the earlier of two).
-        limit_ns: greatest distance.
     """
     found: npt.NDArray[np.int64] = np.searchsorted(times_ns, at_ns, "right") - 1
     if match == "nearest":

@@ -55,7 +55,6 @@ class TimedTable:
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
     def window(self, wanted: LearningSet) -> int:
-        """Return the number of samples in a row."""
         return wanted.window or max(1, int(np.ceil(self.rate_hz / wanted.fps - 1e-3)))
 
     def runs(self, gap_s: float | None) -> Iterator[tuple[int, int]]:
@@ -90,7 +89,6 @@ class Episode:
     Attributes:
         times_ns: (t,) of each row, wall clock.
         frames: by driver, (t,) number of the newest sample at each row.
-        joined: by joined feature, (t,) its row.
     """
 
     recording: int
@@ -108,7 +106,6 @@ class Planner:
     """Makes episodes of one recording.
 
     Args:
-        joined: joined data, each with its times, wall clock.
         structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:

@@ -89,7 +89,6 @@ class Board(Device):
         self._log_triangle(now_ns, triangle, fault)
 
     def on_timer(self, name: str, time_ns: int) -> None:
-        """Send what is due."""
         if name == _INERTIAL:
             for low, payload in self.inertial.messages(time_ns):
                 self._send(time_ns, INERTIAL, low, payload)

@@ -101,8 +101,6 @@ class TriangleFaults:
 
 
 class Acquisition(NamedTuple):
-    """The result of one acquisition."""
-
     time_ns: int
     payloads: list[bytes]
     """HEAD, TAIL, HEAD ... of all 16 triangles."""

@@ -98,7 +98,6 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
         self._set_triangle(address, triangle, "unplugged", now_ns)
 
     def plug_in(self, address: int, triangle: int, now_ns: int) -> None:
-        """Plug a triangle in."""
         self._set_triangle(address, triangle, "plugged_in", now_ns)
 
     def acknowledge(self, address: int, triangle: int, now_ns: int, *, on: bool) -> None:

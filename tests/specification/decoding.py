@@ -21,8 +21,8 @@ from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import Byte, Layout
+from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.layout import Layout
 from tests.specification.pairing import Pairing
 from tests.specification.reading import name_modules, read_updates
 

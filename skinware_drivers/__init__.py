@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     )
     from skinware_drivers.link import Link, Match
     from skinware_drivers.operations import operation
-    from skinware_drivers.options import NoOptions, check_options
+    from skinware_drivers.options import NoOptions, Options
     from skinware_drivers.polling import Notice, Poll, Watch
 
 __all__ = [
@@ -49,6 +49,7 @@ __all__ = [
     "Module",
     "NoOptions",
     "Notice",
+    "Options",
     "Packed",
     "Patch",
     "Poll",
@@ -59,7 +60,6 @@ __all__ = [
     "Updates",
     "Values",
     "Watch",
-    "check_options",
     "get_include",
     "operation",
     "taxels",

@@ -15,7 +15,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -32,7 +31,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -46,7 +45,7 @@ _GRIDS: Mapping[Shape, Grid] = {"4x8": Grid(4, 8), "6x6": Grid(6, 6)}
 _MODELS: Mapping[int, Shape] = {0: "4x8", 1: "6x6"}
 
 
-class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DfrobotOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -67,7 +66,7 @@ class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if len(set(self.units)) < len(self.units):
             raise ConfigurationError("option units: name each array once")
         if len(self.shapes) not in (0, 1, len(self.units)):

@@ -19,7 +19,6 @@ import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -37,7 +36,7 @@ from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -187,7 +186,7 @@ def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
     return _Content(types, modules, registers)
 
 
-class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Revo2Options(Options, frozen=True):
     side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
@@ -203,9 +202,6 @@ class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     enable: Annotated[
         bool, Meta(description="switch touch on, at the beginning and when the hand has restarted: writes registers")
     ] = False
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class Revo2Watch(ZeroWatch):

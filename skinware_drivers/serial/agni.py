@@ -23,13 +23,12 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Link, Match, Module, Notice, Patch, Sensor, check_options, operation
+from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
 
@@ -46,7 +45,7 @@ _TIMEOUT_S, _TRIES = 0.5, 3
 _ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unknown sensor"}
 
 
-class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AgniOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -64,9 +63,6 @@ class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<f4"], Meta(description="numpy dtype of the values")
     ] = "<u2"
     time_unit_us: Annotated[float, Meta(ge=0, description="unit of the device's time; 0: the time of receipt")] = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def command(number: int, arguments: bytes = b"") -> bytes:

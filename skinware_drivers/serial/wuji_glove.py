@@ -16,14 +16,13 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Patch, Sensor, check_options, operation
+from skinware_drivers import Link, Match, Module, Options, Patch, Sensor, operation
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
 from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
@@ -42,7 +41,7 @@ _ANSWERS = Answers(
 )
 
 
-class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WujiGloveOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -50,9 +49,6 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: leave the board's own")] = 0
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):

@@ -29,7 +29,7 @@ from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGL
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
@@ -72,7 +72,7 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return NON_TACTILE[self.kind] if self.thermal is None else self.thermal
 
 
-class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class YarpOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -93,7 +93,7 @@ class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         taken: set[int] = set()
         for run in self.triangles:
             for triangle, place in run.places():

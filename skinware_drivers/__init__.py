@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skinware_drivers.bus import EXTENDED_FLAG
-    from skinware_drivers.decoding.skin_state import Updates
+    from skinware_drivers.decoding.decoder import Updates
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.fields import (
         Above,

@@ -16,7 +16,7 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.status import Status
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import AnyFlag, Identifier
 from skinware_drivers.layout import Frame, Layout

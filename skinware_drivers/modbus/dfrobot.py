@@ -23,7 +23,7 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.fields import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid

@@ -16,10 +16,9 @@ from skinware.samples import Unused
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Field, Form
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
-from skinware_drivers.decoding.decoder import NONE_YET, Decoder
+from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates
 from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
-from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Byte, SequenceNumber
 from skinware_drivers.layout import Layout

@@ -172,13 +172,20 @@ class Contacts:
         self._tracker = Tracker(self._position_m, median_m, tracking)
 
     @classmethod
-    def of(cls, structure: Structure, type_name: str, neighbours: npt.NDArray[Any] | None = None) -> Self:
+    def of(
+        cls,
+        structure: Structure,
+        type_name: str,
+        neighbours: npt.NDArray[Any] | None = None,
+        tracking: TrackingSettings | None = None,
+    ) -> Self:
         """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
         Args:
             structure: structure of the driver.
             type_name: which sensors.
             neighbours: default: from their places, as far as they are known.
+            tracking: settings of the tracking.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -188,7 +195,8 @@ class Contacts:
         geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
         if neighbours is None and geometry is not None:
             neighbours = neighbours_of(geometry)
-        return cls(len(module), neighbours, geometry, module=module, unit=structure.type(type_name).unit)
+        unit = structure.type(type_name).unit
+        return cls(len(module), neighbours, geometry, module=module, unit=unit, tracking=tracking)
 
     def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
         """Return the contacts of the next frame.

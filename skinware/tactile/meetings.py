@@ -12,7 +12,7 @@ from skinware.realtime import NS_PER_S
 Floats = npt.NDArray[np.float64]
 Tracks = npt.NDArray[np.void]
 
-_STEPS = 5
+_STEPS = 4
 _LOG_PEAK = 0.3
 """Spread of the logarithm of a peak from frame to frame."""
 _MISFIT = 0.1
@@ -29,7 +29,9 @@ _LOG_RATIO = 0.3
 """Spread of the logarithm of the ratio of two peaks, of contacts wider than a pitch."""
 _MOST_OF_LOAD = 2.0
 """The most that a comparison of loads counts, as a log of odds."""
-_EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
+_MOST_PAIRS = 16
+"""Pairs that meet in a frame; more of them are noise."""
+EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
 """Fields that belong to an identity, and not to a place."""
 
 
@@ -96,6 +98,8 @@ class _Meeting(NamedTuple):
     drift_m2_s2: float
     log_ratio: float
     """Logarithm of the ratio of their peaks."""
+    pace: Floats
+    """(2, 3) m/s, their velocities."""
 
 
 class Meetings:
@@ -114,20 +118,27 @@ class Meetings:
 
     def begin(self, tracks: Tracks, expected: Floats, time_ns: int) -> None:
         """Note the pairs of tracks that come too near each other, on their way to where they are expected."""
-        rows = np.flatnonzero((tracks["frames"] > 1) & np.isfinite(tracks["place"][:, 0]))
+        rows = np.flatnonzero((tracks["id"] > 0) & np.isfinite(tracks["place"][:, 0]))
         if len(rows) < 2:
             return
         place, width = tracks["place"][rows], tracks["width"][rows]
         way = expected[rows] - place
-        one, other = np.triu_indices(len(rows), 1)
-        apart, moves = place[one] - place[other], way[one] - way[other]
+        between = place[:, None] - place
+        least_m = np.maximum(_CLOSE_WIDTHS / 2 * width, _CLOSE_PITCHES / 2 * self._pitch_m)
+        least_m += (1 + _CLOSE_WAYS) * np.sqrt((way**2).sum(axis=1))
+        near = np.einsum("ijk,ijk->ij", between, between) < (least_m[:, None] + least_m) ** 2
+        one, other = np.nonzero(np.triu(near, 1))
+        if not len(one):
+            return
+        apart, moves = between[one, other], way[one] - way[other]
         squares = (moves**2).sum(axis=1)
         when = np.clip(-(apart * moves).sum(axis=1) / np.maximum(squares, 1e-12), 0, 1)
         nearest = apart + when[:, None] * moves
         close_m = np.maximum(self._close_m(width[one], width[other]), _CLOSE_WAYS * np.sqrt(squares))
         is_close = (nearest**2).sum(axis=1) < close_m**2
         is_close &= tracks["frame"][rows][one] == tracks["frame"][rows][other]
-        for pair in np.flatnonzero(is_close).tolist():
+        pairs = np.flatnonzero(is_close).tolist()
+        for pair in pairs if len(pairs) <= _MOST_PAIRS else []:
             self._note(tracks[rows[one[pair]]], tracks[rows[other[pair]]], float(close_m[pair]), time_ns)
 
     def _close_m(self, width: Floats, of_other: Floats) -> Floats:
@@ -150,6 +161,7 @@ class Meetings:
             float(one["spread"][0] + other["spread"][0]),
             drift,
             float(np.log(one["peak"] / other["peak"])),
+            np.array([one["pace"], other["pace"]]),
         )
 
     def end(self, tracks: Tracks, time_ns: int) -> None:
@@ -170,8 +182,9 @@ class Meetings:
                 continue
             del self._open[pair]
             if self._turned(meeting, apart, tracks[[one, other]], time_ns):
-                for name in _EXCHANGED:
+                for name in EXCHANGED:
                     tracks[name][[one, other]] = tracks[name][[other, one]]
+                tracks["pace"][[one, other]] = meeting.pace  # as if they had exchanged their velocities
 
     def _turned(self, meeting: _Meeting, apart: Floats, pair: Tracks, time_ns: int) -> bool:
         """Whether the two are rather those that turned round."""

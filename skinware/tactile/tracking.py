@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.meetings import Meetings, Tracks, fit_bells
+from skinware.tactile.meetings import EXCHANGED, Meetings, Tracks, fit_bells
 
 Gains = npt.NDArray[np.float64]
 
@@ -81,8 +81,11 @@ Floats = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-_STRONG, _WEAK, _NEAR = 5.0, 1.5, 0.1
-"""Gains of a pair that shares half of the smaller one's taxels, any, or is near: one outweighs two of the next."""
+_STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
+"""Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
+first two outweighs two of the next."""
+_REST = 0.2
+"""Share of its load below which a contact may be what a faster one left behind."""
 _PREFERENCE = 0.2
 """Gain of the oldest track, and of the largest contact. All pairs of a track have it, so it only decides which is left
 out: the younger identity where contacts merge, the smaller part where one splits."""
@@ -99,8 +102,9 @@ _CALM = 3.0
 """Time constant of the motion that is judged as sliding, in multiples of ``velocity_s``."""
 _NOISE_PITCHES = 0.3
 """Pitches: standard deviation of the centre of a contact of one taxel."""
-_NEW_M_S, _MOST_NEW = 1.0, 8
-"""m/s: spread of the velocity of a new contact. Where more begin in a frame, none of them is taken to be fast."""
+_NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
+"""m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is so
+fast."""
 _ACCELERATION_M_S2, _MANOEUVRE_S = 0.5, 0.1
 """m/s2: spread of the acceleration of a slow contact. That of a fast one changes its velocity in this time, s."""
 _MOST_WITHIN, _MOST_TAXELS = 4, 400
@@ -112,6 +116,11 @@ _PITCH_M = 0.0065
 _REACH_PITCHES, _GATE = 2.3, 2.5
 """Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
 a bit more than the second ring of neighbours."""
+_SETS_OFF_M_S, _FROM_PITCHES = 0.2, 1.5
+"""m/s, and pitches: a new contact at least so fast that comes from so near where one has just gone is the same."""
+_SURPRISE = 3.0
+"""Standard deviations of a miss that is a change of the velocity."""
+_SHORTEST_S = 1e-3
 _NARROWEST_PITCHES = 0.35
 """Pitches: width of a contact that only one taxel feels."""
 _LAST_ID = (1 << 32) - 1
@@ -198,6 +207,7 @@ _TRACK = np.dtype(
         ("load", "f8"),  # smoothed
         ("peak", "f8"),  # smoothed
         ("width", "f8"),  # smoothed
+        ("shared", "?"),  # its blob has other tracks, too
         ("jumps", "?"),  # its centre may have moved because contacts merged or split
         ("noise", "f8"),  # variance of the place that was found
     ]
@@ -218,6 +228,9 @@ class Tracked(NamedTuple):
     age_s: Floats
     velocity_m_s: Floats
     kind: Whole
+
+
+_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
 class Tracker:
@@ -251,6 +264,8 @@ class Tracker:
         """Return the identities of the blobs of the next frame, and how they move."""
         self._forget(time_ns)
         before, size = self._tracks, np.bincount(blobs.blob, minlength=len(blobs.load))
+        if not len(before) and not len(size):
+            return _NOTHING
         expected = _expected(before, time_ns)
         overlap = self._overlap(blobs, size)
         home = np.full(len(before), -1)
@@ -262,11 +277,13 @@ class Tracker:
         expected["jumps"] = is_joined.sum(axis=1) > 1
         expected["jumps"][home >= 0] |= is_joined.sum(axis=0)[home[home >= 0]] > 1
         expected["home"] = home
-        tracks = np.concatenate([expected, self._begun(home, blobs, time_ns)])
+        tracks = self._with_new(expected, blobs, time_ns)
+        tracks["shared"] = _is_shared(tracks["home"])
         self._find(tracks, blobs, size, time_ns)
         self._move(tracks, before)
         self._judge(tracks, before, time_ns)
         self._meetings.end(tracks, time_ns)
+        self._resume(tracks)
         self._keep(tracks, blobs, time_ns)
         return self._tracked(tracks, time_ns)
 
@@ -298,14 +315,15 @@ class Tracker:
         away = expected["place"][:, None] - blobs.cop_m
         squares = np.einsum("ijk,ijk->ij", away, away)
         way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
-        reach_m = (
-            _REACH_PITCHES * self._pitch_m + _DOUBT * np.nan_to_num(way_m) + _GATE * np.sqrt(expected["spread"][:, 0])
-        )
+        reach_m = _DOUBT * _known(way_m) + _REACH_PITCHES * self._pitch_m
+        if len(tracks) <= _MOST_FAST:
+            reach_m = np.fmax(reach_m, _DOUBT * way_m + _GATE * np.sqrt(expected["spread"][:, 0]))
         misses = squares / (reach_m**2)[:, None]
         is_near = (misses <= 1) & (tracks["frame"][:, None] == blobs.frame)
-        by_place = (way_m > self._pitch_m) | _is_shared(tracks["home"])
-        is_sharing = (overlap > 0) & ~(by_place[:, None] & is_near)
-        sharing = np.where(overlap >= 0.5, _STRONG, _WEAK) + _CLOSENESS * overlap
+        by_place = (way_m > self._pitch_m) | tracks["shared"]
+        is_sharing = (overlap > 0) & ~(by_place & is_near.any(axis=1))[:, None]
+        is_rest = blobs.load < _REST * tracks["load"][:, None]
+        sharing = np.where(is_rest, _LEFT, np.where(overlap >= 0.5, _STRONG, _WEAK)) + _CLOSENESS * overlap
         sharing += _PREFERENCE * (1 - _rank(tracks["born_ns"])[:, None] + _rank(blobs.load))
         near = _NEAR + _NEARNESS * (1 - misses) + _PRESENCE * (tracks["gone_ns"] == 0)[:, None]
         return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
@@ -333,11 +351,13 @@ class Tracker:
                 home[track] = blob
                 within[blob] += 1
 
-    def _begun(self, home: Whole, blobs: Blobs, time_ns: int) -> Tracks:
-        """Tracks of the blobs that have none."""
-        is_new = np.ones(len(blobs.load), bool)
-        is_new[home[home >= 0]] = False
-        new = np.flatnonzero(is_new)
+    def _with_new(self, tracks: Tracks, blobs: Blobs, time_ns: int) -> Tracks:
+        """The tracks, and new ones of the blobs that have none."""
+        has_track = np.zeros(len(blobs.load), bool)
+        has_track[tracks["home"][tracks["home"] >= 0]] = True
+        if has_track.all():
+            return tracks
+        new = np.flatnonzero(~has_track)
         begun = np.zeros(len(new), _TRACK)
         begun["key"] = self._last_key + 1 + np.arange(len(new))
         self._last_key += len(new)
@@ -345,14 +365,12 @@ class Tracker:
         begun["place"], begun["kind"] = blobs.cop_m[new], int(ContactKind.TOUCH)
         begun["velocity"] = np.where(np.isnan(blobs.cop_m[new]), np.nan, 0.0)
         begun["spread"] = np.inf, 0.0, (_NEW_M_S if len(new) <= _MOST_NEW else 0.0) ** 2
-        return begun
+        return np.concatenate([tracks, begun])
 
     def _find(self, tracks: Tracks, blobs: Blobs, size: Whole, time_ns: int) -> None:
         """Measure where each track is in this frame, and correct what was expected of it."""
         pitch_m, home = self._pitch_m, tracks["home"]
-        is_shared = _is_shared(home)
-        shared_by = np.unique(home[is_shared]).tolist()
-        alone = np.flatnonzero((home >= 0) & ~is_shared)
+        alone = np.flatnonzero((home >= 0) & ~tracks["shared"])
         blob = home[alone]
         tracks["found"][alone], tracks["noise"][alone] = blobs.cop_m[blob], (_NOISE_PITCHES * pitch_m) ** 2 / size[blob]
         tracks["now"][alone], tracks["height"][alone] = blobs.load[blob], blobs.peak[blob]
@@ -361,19 +379,14 @@ class Tracker:
         tracks["frame"][alone], tracks["size"][alone] = blobs.frame[blob], size[blob]
         jumping = alone[tracks["jumps"][alone]]
         tracks["place"][jumping] = tracks["found"][jumping]
-        variance = tracks["spread"][alone, 0]
-        gain = np.where(
-            np.isinf(variance), 1.0, variance / (np.where(np.isinf(variance), 0, variance) + tracks["noise"][alone])
-        )
-        miss = tracks["found"][alone] - tracks["place"][alone]
-        _correct(tracks, alone, tracks["place"][alone] + gain[:, None] * miss, gain * tracks["noise"][alone])
-        for one in shared_by:
-            self._tell_apart(tracks, np.flatnonzero(home == one), blobs)
+        _correct(tracks, alone, time_ns)
+        for one in set(home[tracks["shared"]].tolist()):
+            self._tell_apart(tracks, np.flatnonzero(home == one), blobs, time_ns)
         here = np.flatnonzero(tracks["home"] >= 0)
         tracks["seen_ns"][here], tracks["gone_ns"][here] = time_ns, 0
         tracks["frames"][here] += 1
 
-    def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: Blobs) -> None:
+    def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: Blobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
         within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
         fitted = fit_bells(
@@ -389,7 +402,8 @@ class Tracker:
         share = fitted.peak * tracks["width"][rows] ** 2
         tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
         tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
-        _correct(tracks, rows, fitted.place, fitted.variance_m2)
+        tracks["jumps"][rows] = False
+        _correct(tracks, rows, time_ns)
         is_faint = fitted.peak < _FAINT * tracks["peak"][rows]
         is_faint[fitted.peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
@@ -398,14 +412,13 @@ class Tracker:
         """Update the velocities that are published; they stay where contacts merge or split, as their centres jump."""
         known = np.arange(len(before))
         passed_s = (tracks["seen_ns"][known] - before["seen_ns"]) / NS_PER_S
-        is_shared = _is_shared(tracks["home"])[known]
         moved = (tracks["home"][known] >= 0) & (passed_s > 0) & (tracks["frame"][known] == before["frame"])
-        moved &= np.where(is_shared, _is_shared(before["home"]), ~tracks["jumps"][known] & ~_is_shared(before["home"]))
+        moved &= (tracks["shared"][known] == before["shared"]) & ~tracks["jumps"][known]
         known, passed_s = known[moved], passed_s[moved]
         velocity = (tracks["found"][known] - before["found"][known]) / passed_s[:, None]
         tracks["steps"][known] += 1
         weight = np.maximum(-np.expm1(-passed_s / self._settings.velocity_s), 1 / tracks["steps"][known])[:, None]
-        was = np.nan_to_num(tracks["velocity"][known])
+        was = _known(tracks["velocity"][known])
         tracks["velocity"][known] = was + weight * (velocity - was)
 
     def _judge(self, tracks: Tracks, before: Tracks, time_ns: int) -> None:
@@ -419,18 +432,36 @@ class Tracker:
         is_new = now["frames"] == 1
         weight = np.where(is_new, 1.0, -np.expm1(-passed_s / settings.velocity_s))
         now["load"] += weight * (now["now"] - now["load"])
-        alone = np.maximum(weight, 1 / now["frames"]) * ~_is_shared(now["home"])
+        alone = np.maximum(weight, 1 / now["frames"]) * ~now["shared"]
         now["peak"] += alone * (now["height"] - now["peak"])
         width = pitch_m * np.sqrt(now["now"] / (2 * np.pi * np.maximum(now["height"], 1e-9)))
         now["width"] += alone * (np.maximum(width, _NARROWEST_PITCHES * pitch_m) - now["width"])
         calm = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
-        now["motion"] += calm * (np.nan_to_num(now["velocity"]) - now["motion"])
+        now["motion"] += calm * (_known(now["velocity"]) - now["motion"])
         is_steady = abs(now["now"] - now["load"]) <= settings.steady * now["load"]
         slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
         is_sliding = is_steady & (np.linalg.norm(now["motion"], axis=1) >= slowest)
         is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
         now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
         tracks[here] = now
+
+    def _resume(self, tracks: Tracks) -> None:
+        """Give a contact that begins at speed the identity of one that has just gone where it comes from."""
+        enough = self._settings.frames
+        new = np.flatnonzero((tracks["home"] >= 0) & (tracks["id"] == 0) & (tracks["frames"] == max(enough, 2)))
+        gone = np.flatnonzero((tracks["home"] < 0) & (tracks["id"] > 0))
+        if not 0 < len(new) * len(gone) <= _MOST_NEW**2:
+            return
+        pace, away = tracks["pace"][new][:, None], tracks["found"][new][:, None] - tracks["found"][gone]
+        speed = (pace**2).sum(axis=2)
+        since_s = np.clip((away * pace).sum(axis=2) / np.maximum(speed, 1e-12), 0, _LONGEST_GUESS_S)
+        miss_m = np.linalg.norm(away - since_s[..., None] * pace, axis=2)
+        close_m = _FROM_PITCHES * self._pitch_m
+        could = (speed > _SETS_OFF_M_S**2) & (tracks["frame"][new][:, None] == tracks["frame"][gone])
+        one, other = assign(np.where(could, close_m - miss_m, 0.0))
+        for name in EXCHANGED:
+            tracks[name][new[one]] = tracks[name][gone[other]]
+        tracks["id"][gone[other]] = 0
 
     def _keep(self, tracks: Tracks, blobs: Blobs, time_ns: int) -> None:
         """Remember this frame, and the tracks whose contacts are gone."""
@@ -439,7 +470,7 @@ class Tracker:
         owner = np.full(len(blobs.load), -1)
         owner[tracks["home"][~is_gone]] = np.flatnonzero(~is_gone)
         of_taxel = owner[blobs.blob]
-        shared = np.flatnonzero(_is_shared(tracks["home"]))
+        shared = np.flatnonzero(tracks["shared"] & ~is_gone)
         if len(shared):
             within = np.flatnonzero(np.isin(blobs.blob, tracks["home"][shared]))
             away = self._position_m[blobs.taxels[within], None] - tracks["place"][shared]
@@ -465,7 +496,7 @@ class Tracker:
         tracks["id"][new] = (self._last_id + np.arange(len(new))) % _LAST_ID + 1
         self._last_id = (self._last_id + len(new) - 1) % _LAST_ID + 1 if len(new) else self._last_id
         velocity = tracks["velocity"][first]
-        for blob in np.unique(home[np.flatnonzero(np.diff(home) == 0)]).tolist():
+        for blob in set(home[1:][np.diff(home) == 0].tolist()):
             rows = here[home == blob]
             velocity[blob] = np.average(tracks["velocity"][rows], axis=0, weights=np.maximum(tracks["now"][rows], 1e-9))
         return Tracked(
@@ -485,31 +516,43 @@ def _expected(tracks: Tracks, time_ns: int) -> Tracks:
     """The tracks as they are expected at a time: places and spreads go on with the velocities."""
     expected = tracks.copy()
     passed_s = np.clip((time_ns - tracks["seen_ns"]) / NS_PER_S, 0, _LONGEST_GUESS_S)
-    expected["place"] += passed_s[:, None] * tracks["pace"]
-    way_m = passed_s * (_ACCELERATION_M_S2 + np.linalg.norm(tracks["pace"], axis=1) / _MANOEUVRE_S) * passed_s
-    _, both, pace = tracks["spread"].T
-    expected["spread"][:, 0] += passed_s * (2 * both + passed_s * pace) + way_m**2 / 4
-    with np.errstate(invalid="ignore", divide="ignore"):
-        expected["spread"][:, 1] += passed_s * pace + np.where(passed_s > 0, way_m**2 / (2 * passed_s), 0)
-        expected["spread"][:, 2] += np.where(passed_s > 0, (way_m / passed_s) ** 2, 0)
+    pace = tracks["pace"]
+    expected["place"] += passed_s[:, None] * pace
+    change = (_ACCELERATION_M_S2 + np.sqrt((pace**2).sum(axis=1)) / _MANOEUVRE_S) * passed_s
+    _, both, variance = tracks["spread"].T
+    expected["spread"][:, 0] += passed_s * (2 * both + passed_s * (variance + change**2 / 4))
+    expected["spread"][:, 1] += passed_s * (variance + change**2 / 2)
+    expected["spread"][:, 2] += change**2
     return expected
 
 
-def _correct(tracks: Tracks, rows: Whole, place: Floats, variance: Floats) -> None:
-    """Take in where tracks are, in place of where they were expected."""
-    expected, both, _ = tracks["spread"][rows].T
-    gain = np.where(np.isinf(expected), 1.0, 1 - variance / expected)
-    pull = both / expected
-    miss = place - tracks["place"][rows]
-    tracks["pace"][rows] += np.where(tracks["jumps"][rows], 0.0, pull)[:, None] * np.nan_to_num(miss)
-    tracks["spread"][rows, 0] = variance
-    tracks["spread"][rows, 1] = both * (1 - gain)
-    tracks["spread"][rows, 2] -= pull * both * gain
-    tracks["place"][rows] = place
+def _known(numbers: Floats) -> Floats:
+    """The numbers, 0 in place of NaN."""
+    return np.where(np.isnan(numbers), 0.0, numbers)
+
+
+def _correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
+    """Take in where tracks were found, instead of where they were expected."""
+    now = tracks[rows]
+    passed_s = np.maximum((time_ns - now["seen_ns"]) / NS_PER_S, _SHORTEST_S)
+    miss = now["found"] - now["place"]
+    variance, both, pace = now["spread"].T
+    is_new = np.isinf(variance)
+    variance = np.where(is_new, 1.0, variance)  # m2: nothing is known
+    squares = (miss**2).sum(axis=1)
+    surprise = np.where((squares > _SURPRISE**2 * (variance + now["noise"])) & ~now["jumps"], squares, 0.0)
+    variance, both, pace = variance + surprise, both + surprise / passed_s, pace + surprise / passed_s**2
+    gain = variance / (variance + now["noise"])
+    pull = np.where(now["jumps"], 0.0, both / (variance + now["noise"]))
+    now["place"] += gain[:, None] * miss
+    now["pace"] += pull[:, None] * _known(miss)
+    pace += surprise / passed_s**2 - pull * both  # what changed once changes again
+    now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
+    tracks[rows] = now
 
 
 def _rank(numbers: Floats | Whole) -> Floats:
     """0 for the smallest to 1 for the largest."""
-    rank = np.zeros(len(numbers))
-    rank[np.argsort(numbers, kind="stable")] = np.linspace(0, 1, len(numbers)) if len(numbers) else 0.0
+    rank = np.empty(len(numbers))
+    rank[np.argsort(numbers, kind="stable")] = np.arange(len(numbers)) / max(len(numbers) - 1, 1)
     return rank

@@ -26,8 +26,8 @@ BRAKE_M_S2 = 20.0
 """Deceleration of a finger that meets another: two times gravity."""
 REST_S = 0.3
 """For how long it stays there."""
-WIDTHS_APART = 3.0
-"""Sigmas between the centres of two fingers in one lane that meet: their skins touch, and they cannot be nearer."""
+WIDTHS_APART, FINGER_M = 3.0, 0.01
+"""Sigmas, and m, between the centres of two fingers in one lane that meet: they touch, and cannot be nearer."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,11 @@ class Pass:
             away_m = from_m - step_m * np.arange(round(2 * from_m / step_m) + 1)
             return away_m if self.way == "cross" else np.abs(away_m)
         brake_m = self.speed_m_s**2 / (2 * BRAKE_M_S2)
-        nearest_m = WIDTHS_APART * self.sigma_m / 2 if self.lane * PITCH_M < WIDTHS_APART * self.sigma_m / 2 else 0.0
-        before = np.arange(from_m + brake_m, brake_m, -step_m)
-        time_s = np.arange(0, self.speed_m_s / BRAKE_M_S2, 1 / RATE_HZ)
-        braking = brake_m - self.speed_m_s * time_s + BRAKE_M_S2 * time_s**2 / 2
-        coming = np.concatenate([before, braking]) + nearest_m
+        nearest_m = 0.0 if self.lane else max(WIDTHS_APART * self.sigma_m, FINGER_M) / 2
+        begin_s, brake_s = from_m / self.speed_m_s, self.speed_m_s / BRAKE_M_S2
+        time_s = np.arange(0, begin_s + brake_s, 1 / RATE_HZ)
+        braking_s = np.clip(time_s - begin_s, 0, brake_s)
+        coming = nearest_m + from_m + brake_m - self.speed_m_s * time_s + BRAKE_M_S2 * braking_s**2 / 2
         return np.concatenate([coming, np.full(round(REST_S * RATE_HZ), nearest_m), coming[::-1]])
 
 
@@ -104,13 +104,11 @@ def told(one: Pass, contacts: Contacts | None = None) -> Told:
         now = _identities(found, at_m, one.sigma_m)
         if 0 not in now and now[0] != now[1]:
             first, last = first if first[0] else now, now
-    if len(seen) > 2 or not first[0]:
-        return Told("new" if set(last) != set(first) or not first[0] else _moved(first, last), len(seen))
     return Told(_moved(first, last), len(seen))
 
 
 def _moved(first: tuple[int, int], last: tuple[int, int]) -> Outcome:
-    return "kept" if first == last else "swapped" if first == last[::-1] else "new"
+    return "new" if not first[0] else "kept" if first == last else "swapped" if first == last[::-1] else "new"
 
 
 def _identities(found: ContactSet, at_m: npt.NDArray[np.float64], sigma_m: float) -> tuple[int, int]:

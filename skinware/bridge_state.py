@@ -92,13 +92,10 @@ class BridgeState:
     """State of a bridge.
 
     Attributes:
-        robot: its name.
-        is_up: its bridge is heard.
         since_ns: since when that is so, CLOCK_MONOTONIC.
         clock_offset_ns: our clock minus the robot's; None: not known.
         clock_error_ns: largest error of the offset; None: not known.
         round_trip_ns: the shortest lately.
-        services: by name.
         instance: number of the bridge that is followed; empty: none so far.
         host: name of its machine; empty: not known.
         namesakes: other bridges that serve a robot of this name.
@@ -127,8 +124,6 @@ def service_name(robot: str) -> str:
 
 
 class BridgeSample(Sample):
-    """State of a bridge at one moment."""
-
     __slots__ = ()
 
     @property
@@ -180,7 +175,6 @@ class BridgeStateWriter:
     """Publish the state of a bridge.
 
     Args:
-        robot: its name.
         namespace: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
     """
 

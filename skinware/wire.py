@@ -132,10 +132,8 @@ def candump_line(
 
     Args:
         epoch_us: when, microseconds since 1970.
-        channel: name of the interface (:func:`channel_name`).
         identifier: with the flags of linux/can.h.
         fd_flags: of a CAN FD frame; None of a classic one.
-        payload: its data.
         direction: ``R`` received, ``T`` sent; empty: not known.
     """
     seconds, microseconds = divmod(epoch_us, 1_000_000)

@@ -180,7 +180,6 @@ class Bus(ABC):
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
         device_end: makes the end to which emulated devices are attached; None: both ends are alike.
-        counters: counts what happens on the bus.
         samples: some of the frames that could not be used.
         tap: keeps what goes over the wire, in both directions, while a program records it.
         narrows: it can leave out unwanted frames, see ``narrow``.
@@ -343,7 +342,6 @@ class KernelBus(Bus):
         """Describe the bus to C, which then reads it in place of ``receive``.
 
         Args:
-            batch: gets the frames.
             source: filled in: the descriptor, and the stream of a line; for a socket, the memory of ancillary data, the
                 clocks and the counts so far.
 

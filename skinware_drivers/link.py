@@ -72,7 +72,6 @@ class _Overdue(NamedTuple):
     """A question in lock step whose timeout has passed.
 
     Attributes:
-        answer: to it.
         due_ns: when the answer should have come.
         until_ns: until when the answer may still come.
         on_late: called with the delay of the answer, s.

@@ -27,7 +27,6 @@ class NamedBus:
         driver: the driver whose devices the bus ``virtual`` emulates, if ``text`` names none; registered, or a file.
 
     Attributes:
-        text: as given.
         name: the same in its parts.
 
     Raises:
@@ -60,7 +59,6 @@ class NamedBus:
 
         Args:
             payload_size: longest payload that the layout knows.
-            listen_only: refuse to send.
             for_devices: the end to which emulated devices are attached, where that is another.
 
         Raises:

@@ -127,7 +127,6 @@ class WireTap:
         Args:
             time_ns: when it was received or sent.
             identifier: with the flags of linux/can.h.
-            payload: of the frame.
             flags: of CAN FD; more than 8 bytes are always FD.
             is_sent: whether the driver sent it.
         """

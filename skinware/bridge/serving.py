@@ -97,8 +97,6 @@ class _Workers:
 
 @dataclass
 class _ServedService:
-    """A service, its present generation, and its state."""
-
     stream: FrameStream
     file: ServiceFile
     service: Service

@@ -68,7 +68,6 @@ class Summaries:
 
         Args:
             drivers: by name: state, present generation with its structure, and newest frame.
-            services: number of other services.
             lost: frames that the bridge missed in their rings.
         """
         summaries = {name: _summary(self._rates_hz.get(name, 0.0), *driver) for name, driver in drivers.items()}
@@ -113,10 +112,7 @@ class Seen:
     """A robot that is reached.
 
     Attributes:
-        instance, version: of the bridge that serves it.
-        summary: the last one; None: none so far.
         heard_ns: when that came; 0: never.
-        bytes: of all summaries so far.
         guard: counts its messages that cannot be read.
         pinger: asks for its clock; None: not asked yet.
     """

@@ -93,8 +93,6 @@ class Label:
     """A word at a column of the terminal.
 
     Attributes:
-        column: of its first character.
-        text: the word.
         is_mark: it stands over sensors and marks something there; otherwise it stands beside or above them.
     """
 
@@ -165,11 +163,7 @@ def arrange(
     A picture that does not fit at the smallest size is higher than ``height``, and is scrolled.
 
     Args:
-        structure: of the driver.
         patches: to draw; several are drawn below each other with their names.
-        type_name: of the sensors.
-        width: columns of the terminal.
-        height: lines of the terminal.
         smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
         only: (n_sensors,) bool, sensors of a region; other sensors are left out, and modules without any of these.
 

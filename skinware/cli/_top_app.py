@@ -64,7 +64,6 @@ class SkinTop(App[None]):
     """Show drivers, buses and patches, and a picture of the sensors under the cursor.
 
     Args:
-        namespace: to show.
         type_name: type of sensors to draw first; default: each driver's first.
         duration_s: end after this time; None: only by a key or signal.
         scale_name: the first meaning of the colours: ``change``, ``range`` or ``raw``.
@@ -204,7 +203,6 @@ class SkinTop(App[None]):
         self._must_draw = True
 
     def action_save_list(self) -> None:
-        """Save the list of the sensors that never moved."""
         row = self._chosen
         try:
             path = self._picture.save_wipe(row.key.driver, Path.cwd()) if row else None

@@ -31,8 +31,6 @@ class RowKey(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row of the list."""
-
     key: RowKey
     cells: tuple[str, ...]
     """One text for each column."""
@@ -96,11 +94,8 @@ def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: s
     """Return the title of a picture.
 
     Args:
-        key: of the row.
         structure: of its driver now, which may have changed since the list was made.
         patches: that :func:`patches_of` returned.
-        type_name: the type of sensors that are drawn.
-        sensors: their number.
     """
     if not patches:
         return "no patches here"

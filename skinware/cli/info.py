@@ -103,7 +103,6 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     """Return the report for people, as lines with colours; on a terminal no line is wider than it.
 
     Args:
-        found: the report.
         brief: patches of a bus without problems share a line.
     """
     drivers, services = found["drivers"], found["services"]

@@ -111,13 +111,7 @@ def paint(
 
 
 class _Painter:
-    """Collect the sensors that are touched.
-
-    Args:
-        reader: of the driver.
-        type_name: of the sensors; None: the driver's first type.
-        as_json: print JSON, not text.
-    """
+    """Collect the sensors that are touched."""
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         from skinware.views.history import Rest

@@ -66,13 +66,7 @@ def command(
 
 
 class _Wipe:
-    """Run a wipe test and report it.
-
-    Args:
-        reader: of the driver.
-        type_name: of the sensors; None: the driver's first type.
-        as_json: print JSON, not text.
-    """
+    """Run a wipe test and report it."""
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np

@@ -76,9 +76,6 @@ _CHUNK_BYTES = 256 << 10
 class _File:
     """A file for HDF5 that keeps errors to itself, because the library does not survive a full disk.
 
-    Args:
-        path: of the file.
-
     Attributes:
         failure: the first error; nothing is written after it.
     """

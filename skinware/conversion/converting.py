@@ -26,7 +26,6 @@ class Format(NamedTuple):
     """A format of files or folders.
 
     Attributes:
-        suffix: of its files or folders.
         write: writes a source to a path that does not exist.
         without: returns a line for each thing of a source that the format cannot hold.
     """
@@ -149,7 +148,6 @@ class _WatchedTable(Table):
         self._table, self._frames, self._is_stopped = table, frames, is_stopped
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         self._frames[self.name] = 0
         for block in self._table.blocks(names):
             if self._is_stopped():

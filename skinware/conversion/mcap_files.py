@@ -31,9 +31,6 @@ class TimedFrame(NamedTuple):
 
     Attributes:
         time_ns: when it was published, on the axis of the recording.
-        service: whose it is.
-        generation: of it.
-        frame: it.
     """
 
     time_ns: int
@@ -73,8 +70,6 @@ class _TimedJson(NamedTuple):
 
     Attributes:
         time_ns: on the axis of the recording.
-        topic: of which.
-        data: as JSON has it.
     """
 
     time_ns: int
@@ -116,19 +111,13 @@ def _timed_json(topic: str, entries: list[dict[str, Any]]) -> Iterator[_TimedJso
 
 @dataclass
 class _Stream:
-    """The frames of one service as they are coded."""
-
     head: Head
     generation: Generation
     encoder: Encoder
 
 
 class _RecordingWriter:
-    """Codes frames and fills chunks.
-
-    Args:
-        file: where they go.
-    """
+    """Codes frames and fills chunks."""
 
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
@@ -248,12 +237,7 @@ def _sensors(timed: TimedFrame, table: Table) -> Message:
 
 
 class _MessageWriter:
-    """An MCAP file of messages in any order.
-
-    Args:
-        path: of the file.
-        profile: of it.
-    """
+    """An MCAP file of messages in any order."""
 
     def __init__(self, path: Path, profile: str) -> None:
         self._file = McapFile(path, profile)

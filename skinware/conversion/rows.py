@@ -35,7 +35,6 @@ class Leaf(NamedTuple):
 
     Attributes:
         path: names of the fields that lead to them; empty: the rows are plain.
-        shape: of them in a row.
         dtype: of them: no structure.
     """
 
@@ -135,15 +134,6 @@ def _file_part(output: Output) -> str:
 
 
 class _Text:
-    """The file of one array.
-
-    Args:
-        open_files: where it is closed.
-        path: of the file.
-        labels: of its columns.
-        output: the array.
-    """
-
     def __init__(self, open_files: ExitStack, path: Path, labels: Sequence[str], output: Output) -> None:
         self.output = output
         self._leaves = leaves(output.format)

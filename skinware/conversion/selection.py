@@ -67,12 +67,7 @@ def _narrowed(table: Table, sensors: SensorChoice) -> Iterator[Table]:
 
 
 class NarrowedTable(Table):
-    """A driver's table with some of its sensors.
-
-    Args:
-        table: with all sensors.
-        positions: (n,) positions of the sensors to keep.
-    """
+    """A driver's table with some of its sensors."""
 
     def __init__(self, table: Table, positions: npt.NDArray[np.int64]) -> None:
         self._table, self._index = table, as_index(positions)
@@ -80,7 +75,6 @@ class NarrowedTable(Table):
         self.sensor_names = [table.sensor_names[position] for position in positions.tolist()]
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         for block in self._table.blocks(names):
             for name in PER_SENSOR:
                 if COLUMNS + name in block:

@@ -38,13 +38,6 @@ _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Message(NamedTuple):
-    """A message for viewers.
-
-    Attributes:
-        topic, encoding, schema: of its channel.
-        data: contents.
-    """
-
     topic: str
     encoding: str
     schema: Schema
@@ -55,8 +48,6 @@ class Showing:
     """Makes messages for viewers from the samples of one generation of a driver.
 
     Args:
-        name: of the driver.
-        structure: of the generation.
         json_state: write the state as JSON; False: in a ``std_msgs/String``, for ROS 2.
 
     Attributes:
@@ -77,7 +68,6 @@ class Showing:
         """Yield the pictures and the state of a sample.
 
         Args:
-            frame: the sample.
             time_ns: time of publication, wall clock.
         """
         yield from self.pictures(frame, time_ns)
@@ -94,7 +84,6 @@ class Showing:
         """Yield the point clouds and images of a sample.
 
         Args:
-            frame: the sample.
             time_ns: time of publication, wall clock.
             status: (n_sensors,) status of the sensors; default: that of the sample.
             wanted: says for a topic whether to make its message.
@@ -275,8 +264,6 @@ class _Driver:
     """One that is shown.
 
     Attributes:
-        generation: that is shown.
-        showing: of it.
         due_ns: when the next frame is due, wall clock.
     """
 
@@ -289,7 +276,6 @@ class Viewers:
     """Messages for viewers, beside the frames that they are made of.
 
     Args:
-        json_state: as for :class:`Showing`.
         rate_hz: of each driver, at most.
     """
 
@@ -301,9 +287,6 @@ class Viewers:
         """Yield the messages of a sample if the next ones of its driver are due.
 
         Args:
-            service: name of the service.
-            generation: of the sample.
-            frame: the sample.
             time_ns: time of publication, wall clock.
         """
         if not isinstance(generation.context, Structure):

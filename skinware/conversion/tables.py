@@ -69,7 +69,6 @@ class ArrayFormat(NamedTuple):
 
     Attributes:
         shape: () for one number.
-        dtype: of its numbers.
     """
 
     shape: tuple[int, ...]
@@ -85,11 +84,7 @@ class Table(ABC):
 
     Args:
         name: of the table: the service's, with ``@2`` for its second part.
-        service: name of the service.
         generations: of its samples, by number; all have the same columns and tables.
-
-    Attributes:
-        name, service, generations: as given.
     """
 
     def __init__(self, name: str, service: str, generations: Sequence[Generation]) -> None:
@@ -156,12 +151,7 @@ class Source(Protocol):
 
 
 class DerivedSource:
-    """A source with other tables than the one that it stands for.
-
-    Args:
-        source: everything but the tables.
-        tables: made of the source's.
-    """
+    """A source with other tables than the one that it stands for."""
 
     def __init__(self, source: Source, tables: Sequence[Table]) -> None:
         self._source = source
@@ -171,7 +161,6 @@ class DerivedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`Source`."""
         return self._source.events
 
     @property
@@ -191,9 +180,6 @@ class Output:
     """An array to write: one of a table's, or computed from them.
 
     Attributes:
-        name: in the file.
-        format: of a row.
-        unit: of its numbers, for people.
         needs: names of the table's arrays that it is computed from.
         of: computes it from a block of these.
     """
@@ -295,7 +281,6 @@ class RecordedTable(Table):
         self._part, self._start_ns, self._span = part, recording.start_ns, span
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         columns = [name.removeprefix(COLUMNS) for name in names if name.startswith(COLUMNS)]
         start_s = (self._span.begin_ns - self._start_ns) / NS_PER_S
         end_s = (self._span.end_ns - self._start_ns) / NS_PER_S
@@ -316,7 +301,6 @@ class RecordedSource:
     """A recording.
 
     Args:
-        path: of the file.
         start_s, end_s: part of its time, s since it began; None: to its end.
 
     Raises:

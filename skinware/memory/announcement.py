@@ -31,11 +31,8 @@ class ReaderRecord(msgspec.Struct):
     """The figures that a reader publishes.
 
     Attributes:
-        service: which service it reads.
         pid: its process (as seen in its own pid namespace).
-        program: the process' name.
         kind: how it reads: ``asap``, ``in order``, ``periodic 30 Hz``, ``on demand``.
-        frames: samples taken so far.
         lost: samples that were published since its first one and that it did not take.
         overruns: how often the writer was too fast for a copy.
         missed_periods: periods that passed unused (periodic readers).

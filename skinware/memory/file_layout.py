@@ -190,7 +190,6 @@ def plan(
     """Lay out a new file.
 
     Args:
-        static: contents of the static columns.
         slot: (dtype, count) of the columns of a slot.
         slot_count: 2 to 64; None: as many as the period asks for.
         period_ns: the writer's nominal period. Slots then hold a second, but take at most 16 MiB; there are at least 8.
@@ -252,8 +251,6 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
 
     Args:
         head: at least the header and the column table: the first bytes of the file.
-        path: for messages.
-        file_size: what the file system says.
 
     Returns:
         The header row, and a layout in which every column lies inside the file.

@@ -34,10 +34,7 @@ class Turns(NamedTuple):
     """The turns that C took since they were last settled.
 
     Attributes:
-        frames: samples taken.
-        lost: samples missed.
         last: sequence of the last sample taken.
-        over: the turns that are over.
     """
 
     frames: int
@@ -50,8 +47,6 @@ class RingReader(Generic[SampleT]):
     """The reader's end of one generation: it reads only, takes no lock, and the writer does not know it.
 
     Args:
-        segment: the attached generation.
-        frame_class: class of the samples it hands out.
         context: what every sample carries as ``context``.
     """
 

@@ -35,9 +35,7 @@ class Segment:
     """A mapped generation. Arrays keep the map alive; it is never unmapped under them.
 
     Attributes:
-        path: file name, for messages.
         header: header row (:data:`file_layout.HEADER`).
-        layout: where the columns are.
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
         maker: answers a reader whether the process that made it has ended.
@@ -261,7 +259,6 @@ def recorded(head: bytes, name: str) -> Segment:
 
     Args:
         head: its bytes.
-        name: for messages.
 
     Raises:
         BadServiceFile: they are not a head that can be read safely.
@@ -278,11 +275,6 @@ def recorded(head: bytes, name: str) -> Segment:
 
 def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray[Any]]) -> bytes:
     """Return the head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
-
-    Args:
-        segment: the generation.
-        schema: of the columns of its slots.
-        static: its tables.
 
     Raises:
         ConfigurationError: the format cannot hold them.

@@ -45,10 +45,7 @@ class Message(NamedTuple):
     """One message.
 
     Attributes:
-        channel_id: number of its channel.
-        sequence: number of the message.
         time_ns: time of publication, on the axis that orders the file (``log_time``).
-        data: contents.
     """
 
     channel_id: int
@@ -62,7 +59,6 @@ class ChunkPlace:
     """The place of a chunk in its file.
 
     Attributes:
-        offset: of its record.
         start_ns, end_ns: times of its first and last message.
         size: bytes of its contents.
         compressed_at, compressed_size: place of its compressed contents.
@@ -86,12 +82,7 @@ class ChunkPlace:
 
 @dataclass
 class ChunkContents:
-    """The contents of a chunk.
-
-    Attributes:
-        channels, schemas: by id.
-        messages: in the order in which they were written.
-    """
+    """The contents of a chunk."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -101,14 +92,9 @@ class ChunkContents:
 class McapSource:
     """An open MCAP file.
 
-    Args:
-        path: of the file.
-        limits: bounds for the size of its chunks.
-
     Attributes:
         is_whole: it ends with a summary that fits it.
         chunks: places of its chunks, in the order of the file; without a summary only those that are whole.
-        channels: by id.
         damaged: number of damaged chunks found so far.
         refused: a line for each chunk that claims more bytes than the limits allow.
 

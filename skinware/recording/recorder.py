@@ -76,9 +76,6 @@ class Renderer(Protocol):
         """Return (topic, encoding, schema, data) of each message.
 
         Args:
-            service: name of the service.
-            generation: of the sample.
-            frame: the sample.
             time_ns: time of publication, ns since 1970, on the axis of the recording.
         """
 
@@ -88,12 +85,9 @@ class Recorder:
 
     Args:
         target: destination of the recording; the recorder completes it.
-        names: of services; None: all, also those that appear later.
-        namespace: of the services.
         with_wires: also record the frames and bytes on the wires of the drivers.
         disguise: replaces names of buses and texts of options; None: they are written as they are.
         renderer: makes messages for viewers, recorded beside the samples.
-        clocks: reads the clocks of the machine.
     """
 
     def __init__(
@@ -197,8 +191,6 @@ class Recorder:
 
 @dataclass
 class _Stream:
-    """Codes the samples of one service."""
-
     head: Head
     encoder: Encoder
     generation: Generation | None

@@ -77,7 +77,6 @@ class Channels:
         self._channels: dict[str, Channel] = {}
 
     def of_service(self, name: str, what: str) -> tuple[Channel, Schema]:
-        """Return the channel of a service's samples or generations."""
         return self.of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
 
     def of_all(self, topic: str) -> tuple[Channel, Schema]:

@@ -12,7 +12,7 @@ from skinware.errors import NamespaceError, RequestTimeout
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus, diagnostics, trigger_response
 from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
@@ -45,7 +45,6 @@ class ServedReport:
         rate_hz: frames that it publishes; None: not known yet.
         age_ms: of its newest data; None: no frame so far.
         lost: frames so far that a subscriber wanted and that could not be taken.
-        messages: sent so far.
         left_out: messages that were not sent, because the carrier took no more.
     """
 
@@ -94,9 +93,6 @@ class Ros2Server:
     """Publishes drivers in a ROS 2 graph; nothing there can hold them up.
 
     Args:
-        node: of the graph.
-        namespace: whose drivers.
-        names: of drivers; empty: all, also later ones.
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.
         root_frame: parent of all coordinate frames in ``/tf_static``; empty: no such topic.
@@ -123,7 +119,7 @@ class Ros2Server:
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _ServedDriver] = {}
         self._troubles: set[str] = set()
-        self._diagnostics = node.publisher("/diagnostics", types.DIAGNOSTICS, Qos())
+        self._diagnostics = node.publisher("/diagnostics", messages.DIAGNOSTICS, Qos())
         self._stopping = False
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
@@ -213,7 +209,7 @@ class Ros2Server:
         topics = DriverTopics(self._node, self._prefix, name)
         self._served[name] = served = _ServedDriver(topics)
         if self._with_tare:
-            served.end_tare = self._node.service(f"{topics.base}/tare", types.TRIGGER, lambda _: self._tare(name))
+            served.end_tare = self._node.service(f"{topics.base}/tare", messages.TRIGGER, lambda _: self._tare(name))
         return served
 
     def _report_once(self, text: str) -> None:

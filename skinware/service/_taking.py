@@ -28,7 +28,6 @@ class Accounts:
     With more readers than processors, what one does before it sleeps makes the next one's sample older.
 
     Args:
-        namespace, service: what is read.
         announce: let others see it, from its first sample or wait on.
     """
 
@@ -110,7 +109,6 @@ class Taking(Attachment[SampleT]):
 
     Args:
         name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
-        announce: let others see it.
     """
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None, announce: bool) -> None:
@@ -266,9 +264,7 @@ class Taking(Attachment[SampleT]):
 
         Args:
             wanted: ``NEWER`` for the newest, or ``NEXT``.
-            timeout_ns: longest wait.
             max_age_s: as for ``read``.
-            newer_than: position of a sample.
         """
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:

@@ -60,10 +60,8 @@ class CodedColumn:
     """How a column of a slot is coded.
 
     Attributes:
-        name: of the column.
         offset: in the slot, bytes.
         words: dtype of its words, unsigned.
-        count: of words.
         is_integer: differences are those of integers, not exclusive ors.
     """
 
@@ -107,9 +105,7 @@ def encoded(frame: Sample, before: Sample | None, columns: Sequence[CodedColumn]
     """Return the message of a frame.
 
     Args:
-        frame: to be coded.
         before: the frame whose difference to it is coded; None: it becomes a key frame.
-        columns: of the slots of both.
     """
     slot, slot_before = frame.slot, None if before is None else before.slot
     after = 0 if before is None else before.sequence
@@ -159,10 +155,6 @@ def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
 class Run:
     """Messages of frames of one generation: a key frame, and frames that are each coded after the one before.
 
-    Args:
-        messages: of n frames.
-        columns: of the generation's slots.
-
     Attributes:
         headers: (n,) of :data:`HEADER`.
 
@@ -190,7 +182,6 @@ class Run:
         """Write the words of a column.
 
         Args:
-            number: of the column.
             into: (n, count) of its words' dtype; rows may lie apart.
 
         Raises:
@@ -236,7 +227,6 @@ class Decoder:
         """Return (stride,) uint8, the slot of a frame; callers must not change it.
 
         Args:
-            message: of the frame.
             keeps: later frames may be coded after this one.
 
         Raises:

@@ -69,9 +69,7 @@ class Collector:
     """Takes frames as they come; services may come, die, come back changed, and go.
 
     Args:
-        namespace: of the services.
         names: of services; None: all.
-        listener: gets frames and events.
         with_wires: ask drivers to publish the frames of their buses, and take those, too.
     """
 

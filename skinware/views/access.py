@@ -24,7 +24,6 @@ def account_of(peer: tuple[str, int], here: tuple[str, int]) -> int | None:
 
     Args:
         peer: address and port of the other end, on this machine.
-        here: those of this end.
     """
     local, remote = _in_table(peer), _in_table(here)
     try:
@@ -61,7 +60,6 @@ class Access:
     """Decide which requests may be answered.
 
     Args:
-        host: address at which the server listens.
         token: that requests need; None: this account and root may look. Give one where other machines can connect.
     """
 
@@ -73,10 +71,6 @@ class Access:
 
     def check(self, target: str, headers: Mapping[str, str]) -> None:
         """Check that a request may be answered.
-
-        Args:
-            target: path and query of the request.
-            headers: of the request.
 
         Raises:
             Refused: it may not be answered.
@@ -100,7 +94,6 @@ class Access:
 
         Args:
             peer: address and port of that end.
-            here: those of this end.
 
         Raises:
             Refused: it may not look.

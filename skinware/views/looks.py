@@ -31,8 +31,6 @@ class QuantityPicture(NamedTuple):
 
 
 class Wiped(NamedTuple):
-    """Progress of a wipe test."""
-
     touched: int
     of: int
     running: bool

@@ -112,11 +112,7 @@ _PATIENCE_NS = 2 * NS_PER_S
 
 
 class ReplayControl:
-    """Find a driver of a replay, and control the replay for viewers.
-
-    Attributes:
-        state: of the replay; None: no replay is shown.
-    """
+    """Find a driver of a replay, and control the replay for viewers."""
 
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
@@ -150,8 +146,6 @@ class ReplayControl:
         """Call an operation of the replay.
 
         Args:
-            action: name of the operation.
-            value: of its argument; None: its default.
             complain: called with the reason if the operation failed.
 
         Raises:

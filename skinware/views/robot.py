@@ -41,7 +41,6 @@ class Mesh:
 
     Attributes:
         frame: the link's coordinate frame.
-        file: of the mesh (STL).
         pose: (4, 4) of the mesh in that frame, with its scale.
     """
 
@@ -56,7 +55,6 @@ class Robot:
 
     Attributes:
         poses: (4, 4) of each frame, by name.
-        meshes: of links.
         left_out: the parts of the file that could not be used, for people.
     """
 

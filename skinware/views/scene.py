@@ -35,7 +35,6 @@ class Shape:
 
     Attributes:
         cells: one for each sensor, in the order of a snapshot.
-        rows: height.
         halves: width in halves of a sensor.
     """
 
@@ -124,7 +123,6 @@ class Scene:
 
     Args:
         drivers: structure and quantities of each driver, by name.
-        poses: of coordinate frames, by name.
     """
 
     def __init__(
@@ -248,7 +246,6 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
     Modules of a patch are together, in lines; patches stand side by side on shelves. The upper left corner is at 0, 0.
 
     Args:
-        structure: of the driver.
         sensors: (k,) positions in a snapshot.
     """
     position = np.zeros((len(sensors), 3), np.float32)
@@ -282,10 +279,6 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
 
 def on_shelves(sizes: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
     """Return the upper left corners of boxes that stand in lines in their order, so that all fit into a small window.
-
-    Args:
-        sizes: width and height of each.
-        gap: between them.
 
     Returns:
         The distance of each to the right and up; the first is at 0, 0, and lower ones have negative heights.

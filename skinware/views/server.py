@@ -50,9 +50,7 @@ class ViewServer:
 
     Args:
         follower: of the drivers; used in the event loop's thread only.
-        access: decides who may see them.
         recording: that viewers may begin and end; None: they may not record.
-        page: folder of the page's files.
     """
 
     def __init__(
@@ -215,8 +213,6 @@ async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], 
     """Serve until ``stop`` is set.
 
     Args:
-        server: to run.
-        host: address to listen at.
         port: to listen at; 0: any.
         ready: called with the port when browsers can connect.
         stop: set it to end.

@@ -153,7 +153,6 @@ class VectorMessage:
 
     Args:
         values: (n,) numbers.
-        count: number of the message of its port.
         time_s: since 1970.
         yarp: major version of the YARP of binary readers, 3 or 4.
     """

@@ -76,7 +76,6 @@ class Receiver:
     """A reader.
 
     Attributes:
-        sent: messages so far.
         passed_over: messages that it missed because it had not finished the one before.
     """
 
@@ -101,8 +100,6 @@ class OutputPort:
     """An output port; to be used in the event loop in which :meth:`open` was called.
 
     Args:
-        name: of the port.
-        server: knows the ports to which it connects.
         yarp: major version of the YARP of binary readers, 3 or 4; None: not known.
     """
 

@@ -14,8 +14,9 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers import Match, Module, Sensor, taxels
+from skinware_drivers.fields import Bits, Byte, Condition, Identifier, Sentinel
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import Bits, Byte, Condition, Cycle, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 PARTS = (*FINGERS, "palm")
 Beginnings = Mapping[tuple[int, int], int]
@@ -38,7 +39,6 @@ class Question(NamedTuple):
     """A command that asks for touch.
 
     Attributes:
-        payload: of the question.
         last: first bytes of the last frame of the reply.
         shortest: least bytes of that frame: more than other programs' questions have.
         patience_s: how long to wait for the reply.
@@ -58,7 +58,6 @@ class Touch(ABC):
     """One kind of touch.
 
     Attributes:
-        types: of the sensors.
         period_s: a usual time between two updates.
     """
 

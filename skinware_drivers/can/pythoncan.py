@@ -58,7 +58,6 @@ class PythonCanBus(Bus):
 
     Args:
         interface: python-can's name of the interface.
-        channel, options, payload_size, listen_only: as for :class:`skinware_drivers.bus.Bus`.
     """
 
     medium: ClassVar[str] = "can"
@@ -197,11 +196,6 @@ class PythonCanBus(Bus):
 
 class _Messages:
     """The messages of one opened interface. A thread takes them and shuts the interface down, as both may hang.
-
-    Args:
-        bus: the interface.
-        name: of the bus, for messages.
-        counters: of the bus.
 
     Attributes:
         queue: time of arrival, identifier (with its flags), payload and flags of CAN FD of each message.

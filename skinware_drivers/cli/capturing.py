@@ -51,13 +51,7 @@ _END_S = 30.0
 class Capture:
     """A recorder in a process of its own.
 
-    Args:
-        path: of the new file.
-        driver: name of the driver.
-        namespace: of the driver.
-
     Attributes:
-        path: of the file.
         result: ``bytes``, ``lost`` and ``problem``, after the end.
 
     Raises:
@@ -106,9 +100,6 @@ def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture]
     """Capture a driver while a block runs; start the driver inside.
 
     Args:
-        path: of the new file.
-        driver: name of the driver.
-        namespace: of the driver.
         on_end: called with the capture when its file is complete.
 
     Raises:

@@ -216,13 +216,7 @@ def _shared_memory() -> tuple[int, int, str]:
 
 
 def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Examine everything that runs or is plugged in.
-
-    Args:
-        namespace: of the drivers.
-        seconds: duration of the look.
-        progress: called now and then with the seconds that have passed.
-    """
+    """Examine everything that runs or is plugged in."""
     machine, readers = MachineWatch(), ReadersWatch(namespace)
     before = interfaces.can_interfaces()
     namespaces = namespaces_seen(namespace)

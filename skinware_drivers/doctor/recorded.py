@@ -42,10 +42,6 @@ _PartT = TypeVar("_PartT", BusSeen, PatchSeen)
 def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
     """Examine a whole recording.
 
-    Args:
-        file: the recording.
-        progress: called now and then with the seconds of it that were read.
-
     Raises:
         BadRecording: the file is not a recording, or one of a newer version.
         OSError: the file cannot be read.
@@ -119,13 +115,7 @@ class _DriverTrack:
         self._longest_gap_ns = 0
 
     def take(self, frame: RecordedDriverSnapshot, tables: Any, time_s: float) -> None:
-        """Add a snapshot.
-
-        Args:
-            frame: the snapshot.
-            tables: static columns of its generation.
-            time_s: when it was published, since the recording began.
-        """
+        """Add a snapshot."""
         before, self._newest = self._newest, frame
         self._frames += 1
         self._age.add(max(0, frame.published_ns - frame.acquired_ns))

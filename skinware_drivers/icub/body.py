@@ -40,8 +40,6 @@ class Drawing:
     """A drawing of skinGui.
 
     Attributes:
-        path: of the file.
-        part: the body part.
         shapes: kinds of triangles, by number (16 per board, in the count of the body part); None: unknown.
     """
 
@@ -118,7 +116,6 @@ class Body:
     """The kinds and places of a part's triangles.
 
     Attributes:
-        shapes: known kinds of triangles.
         bare: triangles without a taxel.
         drawn: triangles in a drawing, by name of the body part; only for parts without positions.
         groups: places of sensors, by triangle; their uid lack the bus.
@@ -241,14 +238,7 @@ def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Plac
 
 
 def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:
-    """Note triangles that are drawn but off, or on but not drawn.
-
-    Args:
-        body: of the part.
-        triangles: all triangles of each body part.
-        enabled: triangles that are switched on.
-        notes: takes the remarks.
-    """
+    """Note triangles that are drawn but off, or on but not drawn."""
     for name, drawn in body.drawn.items():
         on = triangles.get(name, set()) & enabled
         for which, what in ((drawn - on, "drawn, but off"), (on - drawn, "on, but not drawn")):
@@ -274,9 +264,7 @@ def regions_of(
     """Return a region for each body part with a triangle that is switched on.
 
     Args:
-        driver: name of the driver of the device.
         places: the triangles of each body part, by its name.
-        enabled: triangles that are switched on.
         patches: the device's patches, in the order of the driver's buses.
     """
     boards = Counter(board for _, board in {(patch, board) for patch, board, _ in enabled})

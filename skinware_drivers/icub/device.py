@@ -23,11 +23,7 @@ class Group:
     """Named parameters, groups and lists.
 
     Attributes:
-        element: of the group.
-        params: by name.
-        groups: by name.
         lists: by name, the elements ``elem`` of each.
-        actions: elements ``action``.
         others: elements that do not belong in a device.
     """
 
@@ -40,11 +36,7 @@ class Group:
 
 
 class DeviceReader:
-    """Find the devices of files, each file and device once.
-
-    Args:
-        notes: takes the remarks.
-    """
+    """Find the devices of files, each file and device once."""
 
     def __init__(self, notes: Notes) -> None:
         self._notes = notes
@@ -197,8 +189,6 @@ class Port:
     """A body part in a skin device's index.
 
     Attributes:
-        name: of the body part.
-        element: of the port.
         first, last: indices of its first and last value in the device.
         local_first: index of its first value in the body part, as position files count.
     """
@@ -215,7 +205,6 @@ class Wrapper:
     """The ports of one skin device.
 
     Attributes:
-        device: name of the skin device.
         ports: in the order of the file.
     """
 

@@ -47,13 +47,9 @@ class ImportedPart:
 
     Attributes:
         name: of the skin; a name that a service can have.
-        part: as the files describe it.
         ports: body parts in its index.
         buses: in the order of the configuration.
-        yarp: its ports.
         groups: places of its sensors, with those that are switched off.
-        regions: its body parts.
-        triangles: number of triangles that are switched on.
         placed: number of sensors that are switched on and have a place.
     """
 
@@ -107,7 +103,6 @@ class ImportedPart:
         return geometry_to_toml(groups, lines) if groups else ""
 
     def yarp_regions_text(self) -> str:
-        """Return a file of regions for it: each port is one."""
         regions = [
             Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
             for bus, port in enumerate(self.yarp)
@@ -133,12 +128,7 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """The result of an import.
-
-    Attributes:
-        parts: translated skin devices.
-        files: files that were read.
-    """
+    """The result of an import."""
 
     parts: list[ImportedPart]
     files: list[Path]
@@ -166,7 +156,6 @@ def import_files(
     Args:
         paths: XML of robots-configuration, position files and drawings of skinGui, and folders of them.
         notes: takes the remarks, also if this raises.
-        only: devices to translate, by name; all if empty.
         positions: position file of a body part, if the names of the files are ambiguous.
         bus_names: bus of each patch; only for one device.
         wants_buses: their buses will be connected to this computer.
@@ -300,8 +289,6 @@ def _shared(one: Sequence[str], other: Sequence[str]) -> int:
 
 
 class _BodyFiles:
-    """Position files and drawings, by body part."""
-
     def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
         self._chosen, self._notes = chosen, notes
         self._positions = sources.positions

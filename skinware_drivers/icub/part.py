@@ -30,8 +30,6 @@ _SKIN_TYPES = (0, 1, 2, 3, 7, 8)
 
 @dataclass(frozen=True)
 class BoardSet:
-    """A ``boardSetCfg``."""
-
     element: Element
     patch: int
     boards: tuple[int, ...]
@@ -42,8 +40,6 @@ class BoardSet:
 
 @dataclass(frozen=True)
 class TriangleSet:
-    """A ``triangleSetCfg``."""
-
     element: Element
     patch: int
     board: int

@@ -34,14 +34,7 @@ _TABLES = ("special_boards", "modules", "triangles")
 
 
 def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, geometry: str = "") -> str:
-    """Return the text of a file for ``skin-driver --config``.
-
-    Args:
-        name: of the skin.
-        buses: of the part.
-        comment: lines for its head.
-        geometry: name of the file with the places of the sensors.
-    """
+    """Return the text of a file for ``skin-driver --config``."""
     each = [(bus.name, bus.comment, bus.options) for bus in buses]
     return _text("roboskin", name, each, comment, geometry)
 
@@ -52,10 +45,7 @@ def yarp_configuration_text(
     """Return the text of a file for ``skin-driver --config`` with the driver ``yarp``.
 
     Args:
-        name: of the skin.
         buses: name and options of each port.
-        comment: lines for its head.
-        geometry: name of the file with the places of the sensors.
     """
     return _text("yarp", name, [(bus, "", options) for bus, options in buses], comment, geometry)
 
@@ -118,10 +108,7 @@ class TranslatedBus:
     """One bus of a part.
 
     Attributes:
-        patch: its number in the files.
         name: for ``--bus``; empty: to fill in.
-        comment: what to fill in.
-        options: for this bus.
     """
 
     patch: int
@@ -136,10 +123,6 @@ def translate(
     """Return the buses of a part with triangles that are switched on, in the order of their patches.
 
     Args:
-        part: the part.
-        body: kinds and places of its triangles.
-        bus_names: names of buses from the user, by patch.
-        notes: takes the remarks.
         wants_names: note buses without a name, which the user must fill in.
     """
     buses = []

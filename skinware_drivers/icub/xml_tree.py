@@ -22,11 +22,7 @@ class Note(msgspec.Struct, frozen=True, order=True):
     """A remark.
 
     Attributes:
-        level: its kind.
-        file: its file.
         line: counted from 1; 0: the whole file.
-        element: its subject.
-        text: the remark.
     """
 
     level: Level
@@ -50,8 +46,6 @@ def shown(text: object) -> str:
 
 
 class Notes:
-    """Remarks in order, each once."""
-
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
 
@@ -89,11 +83,7 @@ def number(text: str) -> int:
 
 
 class ValueReader:
-    """Read values of elements; note those that cannot be read, which count as not given.
-
-    Args:
-        notes: takes the remarks.
-    """
+    """Read values of elements; note those that cannot be read, which count as not given."""
 
     def __init__(self, notes: Notes) -> None:
         self.notes = notes
@@ -157,11 +147,6 @@ class Element:
 
     Attributes:
         tag: with its prefix, if any.
-        attributes: by name.
-        file: of the element.
-        line: counted from 1.
-        children: in order.
-        text: all text directly within, stripped.
         understood: a reader has used it.
     """
 
@@ -179,7 +164,6 @@ class Element:
 
     @property
     def label(self) -> str:
-        """Return it for messages: ``param "period"``."""
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:

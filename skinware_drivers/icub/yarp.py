@@ -55,11 +55,8 @@ def yarp_ports(
     """Return the ports of a part with a triangle that is switched on, in the order of the port map.
 
     Args:
-        part: the part.
         ports: as its wrapper maps them; several ranges may have one name.
         buses: of the part, with the kinds of its triangles.
-        body: their places.
-        notes: takes the remarks.
     """
     modules = _modules(buses)
     found = []

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -22,12 +21,12 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import Above, AnyFlag, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Watch
 
 _FIRST, _BYTES = 3000, 2
@@ -63,9 +62,7 @@ _MATRICES = (
 )
 
 
-class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class InspireOptions(Options, frozen=True):
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; the manual has 255 over TCP")] = 1
     period_ms: Annotated[
@@ -76,13 +73,8 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bool, Meta(description="read each matrix by itself: 17 questions instead of 9, and no rule about addresses")
     ] = False
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 class InspireDriver(ModbusAdapter[InspireOptions]):
-    """One hand."""
-
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))

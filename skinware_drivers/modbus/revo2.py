@@ -19,7 +19,6 @@ import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -28,16 +27,17 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, taxels
+from skinware_drivers.fields import AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import AnyFlag, Flag, Sentinel, Values
+from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -72,7 +72,6 @@ class _Edition(NamedTuple):
 
     Attributes:
         switches: switch its sensors on.
-        calibration: take the present values as untouched.
         reset: set the sensors' channels up again; None: it has no such registers.
     """
 
@@ -102,8 +101,6 @@ def _content(edition: EditionName, unit: int, *, kind: int = 0, with_status: boo
     """Return the content of an edition.
 
     Args:
-        edition: of the hand.
-        unit: its number on the line.
         kind: of the values of the Pressure edition: 0 raw, 1 pressure (kPa), 2 force (mN).
         with_status: read along the status that fingers report.
     """
@@ -190,9 +187,7 @@ def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
     return _Content(types, modules, registers)
 
 
-class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class Revo2Options(Options, frozen=True):
     side: Annotated[_Side | None, Meta(description="which hand it is; default: the hand is asked")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
@@ -208,9 +203,6 @@ class Revo2Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     enable: Annotated[
         bool, Meta(description="switch touch on, at the beginning and when the hand has restarted: writes registers")
     ] = False
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class Revo2Watch(ZeroWatch):
@@ -236,8 +228,6 @@ class _Said(NamedTuple):
 
 
 class Revo2Driver(ModbusAdapter[Revo2Options]):
-    """One hand."""
-
     dtype: npt.DTypeLike = np.float32
     baudrate = 460_800
     timeout_s = 0.03

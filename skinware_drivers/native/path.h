@@ -1,6 +1,6 @@
 /* A driver's data path: from the rows of a batch to a published slot.
  *
- * The numpy path (decoding/, running/) is its specification: same state, same results, bit by bit. Both work on the same
+ * The numpy path (tests/specification) is its specification: same state, same results, bit by bit. Both work on the same
  * arrays, which Python owns; `struct plan` says where they are. What only Python can do (a driver's own functions,
  * whoever waits for a frame) is called from inside, through `struct hooks`.
  *

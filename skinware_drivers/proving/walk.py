@@ -34,13 +34,7 @@ _UNUSABLE = int(Status.NEVER_SEEN | Status.STALE | Status.MASKED)
 
 
 class Step(NamedTuple):
-    """A request to a person.
-
-    Attributes:
-        wanted: kind of the step.
-        module: name of the module; empty: all.
-        text: the request in words.
-    """
+    """A request to a person."""
 
     wanted: Wanted
     module: str
@@ -62,10 +56,7 @@ class Manner:
     """Settings of a walk.
 
     Attributes:
-        type_name: type of the sensors; None: pressure, force, or the first type.
         only: press the modules with one of these words in their names; empty: all.
-        patience_s: longest time of a step.
-        rest_s: duration of the rest at the beginning.
         with_tare: let the driver tare at the end, if it can.
     """
 
@@ -90,12 +81,6 @@ class _Skipped(Exception):
 
 def walk(reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
     """Check all modules, and add the checks to a proof, which is valid also if the walk is interrupted.
-
-    Args:
-        reader: of the driver.
-        person: who presses.
-        manner: the settings.
-        proof: takes the checks.
 
     Raises:
         ServiceTimeout: no snapshot came for 5 s.

@@ -27,8 +27,6 @@ def hook(name: str, *buses: str, of_all: bool = False) -> Iterator[None]:
     """Call a hook of an adapter or of its watch.
 
     Args:
-        name: of the hook.
-        buses: names of the buses that it is called for.
         of_all: it concerns all buses of the driver, also if it is called for one.
 
     Raises:
@@ -114,8 +112,6 @@ class Backoff:
     """Pauses between attempts, each twice as long as the one before.
 
     Args:
-        first_s: the first pause.
-        longest_s: the longest pause.
         at_once: the first attempt needs no pause.
     """
 

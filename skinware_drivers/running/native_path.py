@@ -41,13 +41,7 @@ def _library() -> skinware.native.Library:
 
 
 class NativePath:
-    """Decodes and publishes, on the arrays of a decoder and a publisher.
-
-    Args:
-        decoder: compiled layouts, and the state of the skin.
-        publisher: the moments of publication, and the columns beside values.
-        batch: filled by the buses.
-    """
+    """Decodes and publishes, on the arrays of a decoder and a publisher."""
 
     def __init__(self, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
@@ -68,6 +62,7 @@ class NativePath:
             raise MemoryError("no memory for the data path of a driver")
         self._path = path = ctypes.c_void_p(made)
         count = self._quick.skinware_path_count_strangers
+        self.named = self._hooks.named
         self._hooks.count_strangers = lambda rows, n: count(path, ctypes.c_void_p(rows), ctypes.c_int64(n))
 
     def __del__(self) -> None:

@@ -27,7 +27,6 @@ class _Place:
     """The polls at one place of the sequence.
 
     Attributes:
-        timer: their deadlines.
         asked_ns: when one was last sent, or would have been.
         silent_until_ns: none is sent before, because answers were missing.
         extra_s: time to wait for an answer beyond its timeout, because answers came late.
@@ -63,7 +62,6 @@ class Poller:
     answers come late.
 
     Args:
-        link: the bus.
         counters: of the bus; ``polls_missed`` and ``polls_unanswered`` are counted in them.
         check: called with the polls before the first question, and when their number or their times have changed.
     """

@@ -35,12 +35,7 @@ _FINDING_S = 0.02
 
 
 class Wires:
-    """The service with the wires of a driver. A sample has what went over one bus since the sample before.
-
-    Args:
-        identity: of the driver.
-        lines: its buses; the list may change.
-    """
+    """The service with the wires of a driver. A sample has what went over one bus since the sample before."""
 
     def __init__(self, identity: Identity, lines: Sequence[BusLine]) -> None:
         self._identity, self._lines, self._namespace = identity, lines, identity.namespace

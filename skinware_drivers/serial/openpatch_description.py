@@ -18,19 +18,8 @@ from skinware.errors import BusError, StructureError
 from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
 from skinware.status import Status
 from skinware_drivers import Module, Patch, Sensor
-from skinware_drivers.layout import (
-    AnyFlag,
-    Bits,
-    DeviceTime,
-    Flag,
-    Frame,
-    Identifier,
-    Layout,
-    Sentinel,
-    SequenceNumber,
-    StatusBytes,
-    Values,
-)
+from skinware_drivers.fields import AnyFlag, Bits, DeviceTime, Flag, Identifier, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Frame, Layout, Values
 
 MAJOR, MINOR = 1, 0
 MOST_PAYLOAD = 1024
@@ -126,7 +115,6 @@ class Kind:
     """A kind of module.
 
     Attributes:
-        name: for people.
         dtype: of its values as they are sent, a numpy dtype.
         taxels: sensor type of each value of each taxel, by name; None: the value has no meaning.
     """
@@ -149,10 +137,7 @@ class Description:
     """The description of a patch.
 
     Attributes:
-        product, serial_number, firmware: for people.
         period_us: of a cycle, unless another is set; with the shortest and the longest possible.
-        types: the sensor types.
-        kinds: the kinds of module.
         modules: kind of each module.
     """
 

@@ -15,12 +15,11 @@ import asyncio
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options, operation
+from skinware_drivers import Link, Match, Notice, Options, Patch, Poll, operation
 from skinware_drivers.hand import Hand
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import (
@@ -53,7 +52,7 @@ _HEADER_OF_HIGH_SPEED = paxini_high_speed.version_request()[:8]
 _VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEADER_OF_HIGH_SPEED[5:])
 
 
-class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PaxiniOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -76,9 +75,6 @@ class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hand: Annotated[
         Literal["right", "left"], Meta(description="high-speed board: the hand with its modules, for their places")
     ] = "right"
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class PaxiniDriver(SerialAdapter[PaxiniOptions]):

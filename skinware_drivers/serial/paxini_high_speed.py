@@ -106,12 +106,7 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 
 
 class HighSpeedBoard(Board):
-    """One board: a patch with a module for each connected slot.
-
-    Args:
-        hand: the hand with the modules, for their places.
-        how: see :class:`Board`.
-    """
+    """One board: a patch with a module for each connected slot."""
 
     def __init__(self, hand: Hand, **how: Any) -> None:
         super().__init__(1 / _USUAL_HZ, **how)

@@ -272,7 +272,6 @@ class YarpBus(ServerBus):
 
     Args:
         channel: ``HOST:PORT/NAME`` or ``/NAME``.
-        options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
 
     Raises:
         ConfigurationError: no such name, or an option is unknown or has a bad value.

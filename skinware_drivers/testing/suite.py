@@ -66,8 +66,6 @@ class Suite:
     """A driver and its emulator.
 
     Attributes:
-        driver: the adapter class.
-        emulator: emulated hardware for it; see :mod:`.conformance`.
         driver_options: options of the driver, as in a configuration file.
         emulator_options: options of the emulator, beside those that the tests set.
     """

@@ -20,8 +20,6 @@ _NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_
 
 
 class ValueTests(Suite):
-    """Values of good data."""
-
     @in_its_time
     async def test_every_value_is_right_and_in_order(self, clock: HandClock) -> None:
         """Each sensor shows its values, every burst is shown once, and no counter of faults grows."""

@@ -48,8 +48,6 @@ class VirtualCanBus(Bus):
     ``skinware.emulators``; ``roboskin`` if empty) and the emulator's options.
 
     Args:
-        channel: name of the emulator.
-        options: of the emulator, as texts.
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.

@@ -37,7 +37,6 @@ class Press:
     """A wandering press on one device.
 
     Args:
-        seed: of the emulation.
         number: of the device; devices with other numbers feel other presses.
         places: (n, 2) of its sensors, 0 to 1.
     """

@@ -101,7 +101,6 @@ class HandClock:
     """CLOCK_MONOTONIC of a test, ns. A call returns the time.
 
     Attributes:
-        now_ns: the time.
         before_passing: called before every jump, when everything of this moment has happened.
         turns: of the event loop so far.
     """
@@ -206,11 +205,7 @@ class _PassingTime(selectors.EpollSelector):
 
 
 class HandLoop(asyncio.SelectorEventLoop):
-    """An event loop in a clock's time.
-
-    Args:
-        clock: the time.
-    """
+    """An event loop in a clock's time."""
 
     def __init__(self, clock: HandClock) -> None:
         self._hand_clock = clock

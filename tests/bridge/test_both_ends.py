@@ -226,6 +226,7 @@ def test_the_network_is_cut_and_heals(ends: Ends) -> None:
     assert events[:3] == ["connected", "disconnected", "connected"]
 
 
+@pytest.mark.thorough
 def test_the_bridge_of_the_robot_ends_and_another_begins(ends: Ends) -> None:
     with driver(ends.there) as writer:
         with serving(ends.net, ends.there):
@@ -313,6 +314,7 @@ def test_operations_are_those_of_the_robot(ends: Ends) -> None:
             thread.join()
 
 
+@pytest.mark.thorough
 def test_a_generation_that_is_asked_for_in_vain_is_asked_for_again(ends: Ends) -> None:
     lost: list[str] = []
 

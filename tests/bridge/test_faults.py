@@ -283,6 +283,7 @@ def test_commands_that_cannot_be_carried_out_say_why_in_a_line(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.thorough
 def test_a_port_that_is_in_use_is_told_in_a_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -76,6 +76,7 @@ def status(join: Running, condition: Callable[[dict[str, Any]], bool]) -> dict[s
     return join.wait_for("status", fulfils)
 
 
+@pytest.mark.thorough
 def test_two_commands_are_enough(namespace: Namespace, here: Namespace) -> None:
     with driver(namespace), serving(port := free_port()) as serve, joining(port, here) as join:
         assert serve.wait_for("ready")["listen"] == [f"tcp/127.0.0.1:{port}"]
@@ -90,6 +91,7 @@ def test_two_commands_are_enough(namespace: Namespace, here: Namespace) -> None:
         assert serve.wait_for("status", lambda event: "arm" in event["services"])["lost"] == 0
 
 
+@pytest.mark.thorough
 def test_the_clock_of_the_same_machine_is_found_to_be_the_same(namespace: Namespace, here: Namespace) -> None:
     with driver(namespace), serving(port := free_port()), joining(port, here) as join:
         told = join.wait_for("status", lambda event: bool(event["clock"]) and event["clock"]["error_ms"] < 5)
@@ -181,6 +183,7 @@ def test_only_who_has_a_certificate_sees_and_only_who_is_named_calls(
             assert "does it want --tls?" in join.wait_for("trouble")["why"]
 
 
+@pytest.mark.thorough
 def test_a_robot_that_is_not_there_is_named(namespace: Namespace, here: Namespace) -> None:
     port = free_port()
     with running("skin-bridge", "join", "eve", "--connect", f"tcp/127.0.0.1:{port}", "--into", here.name) as join:

@@ -77,6 +77,7 @@ class Peers:
         return round(ns - self.offset_ns - self.drift * (ns - self.at_ns))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("offset_ns", [0, 100 * MS, -3 * 3600 * NS_PER_S])
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
 def test_the_other_clock_is_found_and_its_error_told_at_every_moment(offset_ns: float, drift: float) -> None:
@@ -89,6 +90,7 @@ def test_the_other_clock_is_found_and_its_error_told_at_every_moment(offset_ns: 
             assert peers.clock.error_ns < 150_000 + 100_000  # what no clock can know, and some more
 
 
+@pytest.mark.thorough
 def test_the_error_stays_true_when_the_drift_changes() -> None:
     peers = Peers(0, 5e-6)
     for drift in (5e-6, 40e-6, -60e-6, 0):

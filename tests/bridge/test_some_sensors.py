@@ -254,6 +254,7 @@ def test_a_part_vanishes_and_comes_back(net: Net, namespace: Namespace) -> None:
     assert "robot walle: no patch 'thumb'; there are: palm, wrist" in troubles(ends)
 
 
+@pytest.mark.thorough
 def test_another_part_under_the_same_name_is_never_seen_under_the_old_structure(net: Net, namespace: Namespace) -> None:
     """The region has other sensors of each generation; a value tells of which sensor it is."""
     wish = Wish(in_regions=("tips",), regions=(Region("tips", module=("palm, triangle 1",)),))

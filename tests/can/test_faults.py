@@ -215,6 +215,7 @@ def test_bus_off_and_the_way_back(vcan: Callable[[], str], caplog: pytest.LogCap
     assert caplog.text.count("bus-off: ") == 1
 
 
+@pytest.mark.quick
 def test_frames_that_do_not_fit_are_counted_and_disturb_nothing(vcan: Callable[[], str]) -> None:
     name = vcan()
     with skin(name, vcan()) as (driver, _), DriverReader("tip") as reader, sender(name) as out:

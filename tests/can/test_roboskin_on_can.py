@@ -74,7 +74,6 @@ def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
     assert updates >= MINUTE_FRAMES
 
 
-@pytest.mark.quick
 def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], str], tmp_path: Path) -> None:
     bus, log = vcan(), tmp_path / "faults.jsonl"
     options = ("--boards", "7,8", "--pattern", "cycle", "--lose", "0.01", "--log", str(log))

@@ -121,6 +121,7 @@ def test_without_a_name_the_only_driver_is_taken(capsys: pytest.CaptureFixture[s
             assert "has: a, b; give one as NAME" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with fake_process("dead") as process:
         kill(process)
@@ -180,6 +181,7 @@ def test_waits_for_the_driver_to_appear(
     started.pop().close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("more", [[], ["--rate", "100"]])
 def test_silence_fails_after_the_timeout(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a") as skin:
@@ -260,6 +262,7 @@ def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespa
         assert list(namespace.reader_files()) == []  # it took its announcement back
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", ["--json", "--counts"])
 def test_a_reader_of_our_output_may_go_away(form: str) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):
@@ -273,6 +276,7 @@ def test_a_reader_of_our_output_may_go_away(form: str) -> None:
         process.stderr.close()
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_said_in_one_line() -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))), open("/dev/full", "w", encoding="ascii") as full:
         result = subprocess.run([BIN / "skin-dump"], stdout=full, stderr=subprocess.PIPE, timeout=PATIENCE_S)

@@ -112,6 +112,7 @@ def test_json_has_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert frames[0]["data"].startswith("40")
 
 
+@pytest.mark.thorough
 def test_the_log_plays_on_a_bus_of_python_can(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert exit_status(command, ["--raw", STREAMING, "-n", "4"]) == 0
     path = tmp_path / "can.log"

@@ -220,6 +220,7 @@ def test_a_driver_that_has_published_nothing(capsys: pytest.CaptureFixture[str])
         assert "driver a: starting, nothing published yet" in text(capsys)
 
 
+@pytest.mark.thorough
 def test_a_dead_driver_stays_to_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
     with fake_process("a", "--patches", "1", "--modules", "2") as process:
         kill(process)
@@ -404,6 +405,7 @@ def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
     assert "\x1b[31mproblem: \x1b[0mrefused" in map(shown, as_text(report))
 
 
+@pytest.mark.thorough
 def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:
     with FakeSkin("a", fake_structure(1, 1)) as skin:
         skin.publish()
@@ -420,6 +422,7 @@ def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:
             assert (watch.returncode, errors) == (0, b"")
 
 
+@pytest.mark.thorough
 def test_watch_redraws_a_terminal_and_waits_for_who_is_not_there_yet() -> None:
     ours, theirs = pty.openpty()
     watch = subprocess.Popen([BIN / "skin-info", "late", "--watch"], stdin=theirs, stdout=theirs, stderr=theirs)

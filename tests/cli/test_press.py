@@ -29,6 +29,7 @@ def pressed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0
     return told.err if status else told.out
 
 
+@pytest.mark.thorough
 def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.CaptureFixture[str]) -> None:
     with running("skin-driver", "--bus", IDLE) as driver:
         driver.wait_for("ready")
@@ -53,6 +54,7 @@ def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.Capture
         assert told["pressed"][IDLE]["triangle"] == 4
 
 
+@pytest.mark.thorough
 def test_an_emulator_takes_presses_by_a_service_and_tells_where_it_is_pressed(
     capsys: pytest.CaptureFixture[str], namespace: Namespace
 ) -> None:
@@ -83,6 +85,7 @@ def test_it_says_why_nothing_can_be_pressed(capsys: pytest.CaptureFixture[str]) 
         assert "nothing in the namespace" in pressed(capsys, "0", "0", "0", status=1)
 
 
+@pytest.mark.thorough
 def test_of_several_one_must_be_named(capsys: pytest.CaptureFixture[str]) -> None:
     with running("skin-driver", "--bus", IDLE) as one, running("skin-driver", "--bus", IDLE, "--name", "two") as two:
         one.wait_for("ready")

@@ -171,6 +171,7 @@ def test_two_event_loops_do_not_mind_each_other() -> None:
     assert len(seen) >= 2
 
 
+@pytest.mark.thorough
 def test_a_killed_writer_is_told_of_and_its_successor_is_found() -> None:
     async def main() -> None:
         with fake_process("fake") as process:

@@ -104,7 +104,7 @@ def test_a_real_driver_has_the_documented_tables_and_columns() -> None:
 
 @pytest.mark.parametrize(("number", "kind"), [(2, Status), (3, PatchState), (4, BusState), (5, BusReason)])
 def test_status_bits_and_states_are_as_documented(number: int, kind: type[enum.IntEnum]) -> None:
-    assert {name: int(value) for value, name, _ in tables("Drivers")[number]} == {
+    assert {name: int(value) for value, name, *_ in tables("Drivers")[number]} == {
         name: member.value for name, member in kind.__members__.items()
     }
 

@@ -325,6 +325,7 @@ class Lifecycle(RuleBasedStateMachine):
                 assert reading.reader.paused == self.services[reading.name].paused
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(600)
 def test_lifecycle(request: pytest.FixtureRequest) -> None:
     run_state_machine_as_test(

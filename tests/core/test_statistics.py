@@ -200,6 +200,7 @@ def test_a_rate_is_that_of_the_data_where_it_was_held_up(
         assert reader.rate_hz() == pytest.approx(rate_hz)
 
 
+@pytest.mark.thorough
 def test_a_rate_after_a_pause_of_the_device() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         for number in range(20):

@@ -150,6 +150,7 @@ def test_every_status_of_a_sensor_is_told(status: Status) -> None:
     assert finding.evidence.startswith(f"status {str(status.name).lower().replace('_', ' ')}: board 7, triangle 1")
 
 
+@pytest.mark.thorough
 def test_frames_without_partners_and_foreign_ones(skins: Skins) -> None:
     skin = skins("roboskin", boards=(7, 8), lose=0.1, wrong_length=0.1, foreign_hz=500.0)
     lost = found_until(of("patches", "without their partners"))
@@ -262,6 +263,7 @@ def test_two_drivers_on_one_bus(alone: Path, namespace: Namespace) -> None:
 # -- programs -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_driver_that_was_killed_stopped_or_restarted() -> None:
     with fake_process("torso") as process:
         os.kill(process.pid, signal.SIGSTOP)

@@ -101,6 +101,7 @@ def test_losses_states_and_silent_patches_over_time(tmp_path: Path) -> None:
     assert not any(command.startswith("skin-info") for finding in findings.values() for command in finding.commands)
 
 
+@pytest.mark.thorough
 def test_losses_by_the_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver_log, "_HOUR_S", 0.1)
     skin = FakeSkin("torso", fake_structure(1))
@@ -138,6 +139,7 @@ def test_restarts_with_the_same_and_with_other_sensors(tmp_path: Path) -> None:
     assert len(driver.patches) == 3
 
 
+@pytest.mark.thorough
 def test_a_driver_that_died_while_it_was_recorded(tmp_path: Path) -> None:
     file = tmp_path / "walk.mcap"
     with fake_process("torso") as process, recording(file) as recorder:
@@ -148,6 +150,7 @@ def test_a_driver_that_died_while_it_was_recorded(tmp_path: Path) -> None:
     assert findings["the driver was killed"].severity == Severity.ERROR
 
 
+@pytest.mark.thorough
 def test_one_that_was_cut_or_damaged(tmp_path: Path) -> None:
     file = tmp_path / "walk.mcap"
     record(file, FakeSkin("torso"), *[lambda: None] * 8)
@@ -161,6 +164,7 @@ def test_one_that_was_cut_or_damaged(tmp_path: Path) -> None:
     assert "1 chunk damaged and left out" in findings["the recording is damaged"].evidence
 
 
+@pytest.mark.thorough
 def test_no_damage_is_too_much(tmp_path: Path) -> None:
     """Hostile files: each is examined or refused with one line."""
     file = tmp_path / "walk.mcap"
@@ -202,6 +206,7 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
     assert "a service could not be recorded" in findings
 
 
+@pytest.mark.thorough
 def test_taxels_that_are_noisy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the file alone: one taxel of a quiet skin is noisy for 25 s, recorded in one."""
     monkeypatch.setattr(recorded, "_LOOK_EVERY_NS", 0)

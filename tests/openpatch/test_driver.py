@@ -54,6 +54,7 @@ def values_of(module: int, n: int, sample: int) -> npt.NDArray[np.int64]:
     return 5 * module + 3 * np.arange(n) + sample
 
 
+@pytest.mark.thorough
 def test_a_hand_with_all_it_says_of_itself(firmware: Path) -> None:
     with Microcontroller(firmware, "hand", "0042") as patch, driven(patch) as (_, reader):
         frame = read_until(reader, is_fresh)

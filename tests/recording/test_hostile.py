@@ -109,6 +109,7 @@ def test_generations_that_ask_for_too_much_are_left_out_and_said(
         assert [problem for problem in opened.problems if says in problem]
 
 
+@pytest.mark.thorough
 def test_frames_of_a_chunk_that_become_too_much_are_left_out_and_said(path: Path) -> None:
     of_frames(path, head(30 << 20), 5)
     with skinware.recording.open(path) as opened:
@@ -185,6 +186,7 @@ def test_a_chunk_that_claims_too_much_is_named(path: Path) -> None:
         assert (len(source.chunks), source.damaged) == (1, 1)
 
 
+@pytest.mark.thorough
 def test_a_chunk_that_becomes_more_than_it_claims_costs_no_memory(path: Path) -> None:
     bomb = zstandard.compress(bytes(1 << 30))
     file, channels = McapFile(path), Channels()

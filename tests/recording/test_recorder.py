@@ -100,6 +100,7 @@ def test_restarts_and_another_structure_are_followed(path: Path) -> None:
         assert [layout.structures[0].n_patches for layout in layouts][-1] == 2
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_is_told(path: Path) -> None:
     with recording(path) as recorder:
         with fake_process("torso", "--rate", "50") as process:
@@ -112,6 +113,7 @@ def test_a_killed_driver_is_told(path: Path) -> None:
         assert list(opened.snapshots())[-1].layout.drivers == ("torso",)
 
 
+@pytest.mark.thorough
 def test_what_could_not_be_taken_is_told(path: Path) -> None:
     with FakeSkin("torso", slots=4) as skin, recording(path) as recorder:
         skin.publish()
@@ -155,6 +157,7 @@ def test_the_past_is_kept_and_saved_when_it_is_wanted(path: Path) -> None:
             assert (np.diff(sequence) == 1).all()
 
 
+@pytest.mark.thorough
 def test_files_of_a_size_each_complete_and_the_oldest_removed(path: Path) -> None:
     target = Files(path, split_size=30_000, max_size=100_000)
     with FakeSkin("torso") as skin, recording(path, target) as recorder:
@@ -286,6 +289,7 @@ def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pyt
         assert sequence.tolist() == list(range(sequence[0], sequence[-1] + 1))  # from the recorder's beginning on
 
 
+@pytest.mark.thorough
 def test_a_long_file_needs_no_more_memory_than_a_short_one(path: Path) -> None:
     file, channels = McapFile(path), Channels()
     for number in range(2000):
@@ -315,6 +319,7 @@ def test_a_summary_that_cannot_wait_on_the_disk_ends_the_recording(path: Path, m
         assert opened.is_whole
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="only root may mount a small disk")
 def test_a_real_full_disk(path: Path) -> None:
     disk = path.parent / "disk"

@@ -54,6 +54,7 @@ def values_of(opened: Recording, name: str) -> list[dict[str, bytes]]:
     return found
 
 
+@pytest.mark.thorough
 def test_record_replay_record_is_the_same(tmp_path: Path, namespace: Namespace) -> None:
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     record_two_lives(first)
@@ -125,6 +126,7 @@ def test_a_name_that_is_in_use_is_refused(tmp_path: Path) -> None:
         replayer.close()
 
 
+@pytest.mark.thorough
 def test_frames_that_the_recording_lost_are_lost_in_the_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     published = 0

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 
 from skinware import DriverReader, DriverWriter, Namespace, Status
 from skinware.conversion.ros_messages import Cdr
@@ -133,6 +134,7 @@ def last_status(graph: Graph) -> Any:
     return graph.heard(FRAMES)[-1].status
 
 
+@pytest.mark.thorough
 def test_what_a_killed_driver_leaves_is_stale_and_it_may_come_back(namespace: Namespace) -> None:
     with served(namespace) as (graph, server):
         graph.wanted = {FRAMES, "/diagnostics"}
@@ -153,6 +155,7 @@ def test_what_a_killed_driver_leaves_is_stale_and_it_may_come_back(namespace: Na
             wait_until(lambda: server.drivers()["arm"].state == "live")
 
 
+@pytest.mark.thorough
 def test_a_driver_that_hangs_is_stale_until_it_goes_on(namespace: Namespace) -> None:
     with fake_process("arm") as process, served(namespace) as (graph, server):
         graph.wanted = {FRAMES}

@@ -249,6 +249,7 @@ class Talkative(RoboskinDriver):
             await link.send(0x7E0, number.to_bytes(4, "little"))
 
 
+@pytest.mark.thorough
 def test_a_set_up_of_thousands_of_frames_starves_no_reception() -> None:
     """By conditions, not by time: whatever the machine does, few frames are sent between two looks at the buses."""
     bus = troubled(boards=(7,))

@@ -185,6 +185,7 @@ specials = st.builds(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(
     modules=st.lists(modules, max_size=4).map(tuple),

@@ -125,6 +125,7 @@ def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
             assert len(skin.read().physical("pressure")) == 2 * 16 * 10
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("hurry")
 def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> None:
     log: list[Event] = []

@@ -102,6 +102,7 @@ def test_a_hand_behind_tcp(tips: str, dtype: type, kind: str, count: int, namesp
                     skin.reader.call("tare")
 
 
+@pytest.mark.thorough
 def test_a_hand_is_asked_for_its_model_over_tcp_only(namespace: object) -> None:
     port = free_port()
     device = make_bus(f"tcp://{LOCAL}:{port}", payload_size=4096, for_devices=True)

@@ -18,6 +18,7 @@ from tests.tactile.test_contacts_service import structure
 SOURCE = Path(__file__).parents[2] / "examples" / "contacts.c"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", ["c99", "c++11"])
 def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
     language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory

@@ -241,6 +241,7 @@ def test_time_that_stands_still_or_goes_back_is_borne() -> None:
     assert np.isfinite(found.velocity_m_s).all()
 
 
+@pytest.mark.thorough
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, share: float) -> None:

@@ -56,6 +56,7 @@ def changing(generator: np.random.Generator, dtype: np.dtype[Any], count: int, f
     return [generator.bytes(count * dtype.itemsize) if step else bytes(count * dtype.itemsize) for _ in range(frames)]
 
 
+@pytest.mark.thorough
 @given(
     st.lists(st.tuples(st.sampled_from(DTYPES), st.sampled_from([0, 1, 3, 4, 700, 5000])), min_size=1, max_size=4),
     st.integers(1, 6),

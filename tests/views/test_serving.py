@@ -88,6 +88,7 @@ def test_status_is_sent_when_it_changes(serving: Serve) -> None:
         assert picture["levels"][7] == 255
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_is_shown_and_one_that_comes_back_too(serving: Serve) -> None:
     with serving() as url, page_of(url) as page:
         with fake_process("torso", "--patches", "1") as process:

@@ -367,6 +367,7 @@ def test_exit_status(arguments: tuple[str, ...], status: int, message: str, caps
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_command_with_status_0(number: signal.Signals, tmp_path: Path) -> None:
     """The whole command in a process of its own, on a bus that needs no kernel support."""

@@ -108,6 +108,7 @@ def test_a_press_is_felt_from_the_next_acquisition_on() -> None:
     assert felt(rig, 150)[0, 0, 0] > 50  # not only when what was computed ahead is used up
 
 
+@pytest.mark.thorough
 def test_a_board_that_restarts_still_feels_who_presses_but_takes_it_for_nothing() -> None:
     rig = streaming()
     at = places(rig)[0, 0, 0]

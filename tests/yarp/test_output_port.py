@@ -197,6 +197,7 @@ def test_other_things_that_are_asked_for(there: There) -> None:
         assert said[1:4] == [b"[ver] 1 2 3", b"", b'[fail] "send [help] for list of valid commands"']
 
 
+@pytest.mark.thorough
 def test_a_reader_that_does_not_read_misses_vectors_and_holds_nobody_up(yarp: Robot, there: There) -> None:
     many = [0.125] * 3000
     with contextlib.closing(Input(Carrier.TCP)) as busy, called(there, b"CONNECT slow\nr\n"):

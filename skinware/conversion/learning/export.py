@@ -95,12 +95,7 @@ def convert_to_learning_set(
 
 
 class _Recordings:
-    """Recordings, of which one is open at a time: what a large skin is made of takes 20 MB in each.
-
-    Args:
-        paths: of them.
-        open_one: opens one.
-    """
+    """Recordings, of which one is open at a time: what a large skin is made of takes 20 MB in each."""
 
     def __init__(self, paths: Sequence[Path], open_one: Callable[[Path], Source]) -> None:
         self.paths, self._open_one = paths, open_one
@@ -178,15 +173,6 @@ def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval
 
 
 class _Set:
-    """A dataset that is written.
-
-    Args:
-        recordings: of which the episodes are.
-        wanted: how it is made.
-        joined: what is joined.
-        episodes: of it, by recording and time.
-    """
-
     def __init__(
         self, recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], episodes: Sequence[Episode]
     ) -> None:

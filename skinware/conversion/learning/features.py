@@ -51,8 +51,6 @@ class SkinFeatures:
     """Features of a driver: values and status of each sensor type, and the age of its samples.
 
     Args:
-        service: name of the driver.
-        structure: of the driver.
         sensor_names: in the order of its values.
         window: number of samples in a row, the oldest first.
         period_ns: the driver's nominal period, 0 if it has none.
@@ -87,7 +85,6 @@ class SkinFeatures:
         """Return the features of t rows.
 
         Args:
-            frames: samples of the driver.
             numbers: (t, window) samples of each row, the newest last.
             rows_ns: (t,) time of each row, wall clock.
         """
@@ -127,7 +124,6 @@ class Frames:
     """Samples of a driver by number, read in one pass over its table.
 
     Args:
-        table: of the driver.
         times_ns: (f,) times of all samples, from the pass before.
         window: number of samples that stay available.
     """
@@ -272,7 +268,6 @@ class Moments:
     """Moments of rows.
 
     Attributes:
-        count: number of rows.
         least, greatest, mean: (...) of each number of a row.
         squares: (...) sum of the squared differences from the mean.
     """
@@ -340,11 +335,7 @@ class Statistics:
     """Statistics of the rows of a feature.
 
     Args:
-        shape: of a row.
-        dtype: of its numbers.
-        rows: number of rows to come.
         most_bytes: of the rows kept for quantiles.
-        per_item: rows that count as one: pixels of an image.
     """
 
     def __init__(

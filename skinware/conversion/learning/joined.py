@@ -29,13 +29,7 @@ Columns = Mapping[str, npt.NDArray[Any]]
 class Joined:
     """Data for a feature: rows of numbers, or paths of images, each with its time.
 
-    Args:
-        join: columns of a file.
-
     Attributes:
-        name: of the feature.
-        path: of the file.
-        names: of the numbers in a row, or of the one column of paths.
         rows: (m, n) float32; (m,) text for paths.
 
     Raises:
@@ -72,7 +66,6 @@ class Joined:
         """Return the time of each row, (m,) ns since 1970, on the axis of the recording.
 
         Args:
-            source: the recording that the times belong to.
             is_only: it is the only recording.
 
         Raises:
@@ -153,7 +146,6 @@ def matched(
         times_ns: (m,) in order.
         at_ns: (t,) the moments.
         match: the newest time at or before a moment, or the nearest one (the earlier of two).
-        limit_ns: greatest distance.
     """
     found: npt.NDArray[np.int64] = np.searchsorted(times_ns, at_ns, "right") - 1
     if match == "nearest":

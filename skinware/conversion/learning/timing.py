@@ -29,13 +29,7 @@ Times = npt.NDArray[np.int64]
 class TimedTable:
     """The times of a driver's samples, as long as its structure stayed the same.
 
-    Args:
-        table: of a driver.
-        structure: of the driver.
-
     Attributes:
-        name: of the table.
-        structure: as given.
         period_ns: the driver's nominal period, 0 if it has none.
         recorded_ns: (f,) time of publication of each sample, wall clock, as recorded.
         times_ns: (f,) the same, never going back.
@@ -61,7 +55,6 @@ class TimedTable:
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
     def window(self, wanted: LearningSet) -> int:
-        """Return the number of samples in a row."""
         return wanted.window or max(1, int(np.ceil(self.rate_hz / wanted.fps - 1e-3)))
 
     def runs(self, gap_s: float | None) -> Iterator[tuple[int, int]]:
@@ -78,7 +71,6 @@ class Piece:
 
     Attributes:
         begin_ns, end_ns: wall clock, both in it.
-        tables: by driver.
     """
 
     begin_ns: int
@@ -95,12 +87,8 @@ class Episode:
     """Rows of a learning set that follow each other.
 
     Attributes:
-        recording: number of the recording.
-        task: its description.
         times_ns: (t,) of each row, wall clock.
-        piece: the drivers.
         frames: by driver, (t,) number of the newest sample at each row.
-        joined: by joined feature, (t,) its row.
     """
 
     recording: int
@@ -118,10 +106,6 @@ class Planner:
     """Makes episodes of one recording.
 
     Args:
-        number: of the recording.
-        source: the recording, reduced to the selected drivers.
-        wanted: definition of the set.
-        joined: joined data, each with its times, wall clock.
         structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:

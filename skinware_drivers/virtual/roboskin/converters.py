@@ -41,10 +41,6 @@ TriangleState = Literal["unplugged", "plugged_in", "no_ack", "ack"]
 class TriangleFaults:
     """The faults of one board's triangles and taxels.
 
-    Args:
-        options: of all boards.
-        address: of the board, as in the options.
-
     Attributes:
         disconnected: (16,) bool, triangles whose I2C lines read 0xFFFF.
         not_acknowledging: (16,) bool, triangles whose registers stay 0.
@@ -105,8 +101,6 @@ class TriangleFaults:
 
 
 class Acquisition(NamedTuple):
-    """The result of one acquisition."""
-
     time_ns: int
     payloads: list[bytes]
     """HEAD, TAIL, HEAD ... of all 16 triangles."""
@@ -118,8 +112,6 @@ class Converters:
     """The 16 converters of a board, with default settings and no baseline.
 
     Args:
-        touch: the capacitances of the board.
-        faults: of the board.
         mtb3: they belong to the older kind of board.
         short_tail: the second frame has no diagnostics.
     """

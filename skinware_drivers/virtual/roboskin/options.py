@@ -68,7 +68,6 @@ class RoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, 
         """Return the places of a list option as numbers.
 
         Args:
-            name: of the option.
             depth: 2 for (board, triangle), 3 for (board, triangle, taxel).
 
         Raises:

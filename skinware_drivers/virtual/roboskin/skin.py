@@ -35,7 +35,6 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
-        options: of the boards and their faults.
         log: receives the :mod:`skinware_drivers.virtual.events`, for example a list.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
             0-255 go on the wire instead of felt ones. Flags stay true.
@@ -99,7 +98,6 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
         self._set_triangle(address, triangle, "unplugged", now_ns)
 
     def plug_in(self, address: int, triangle: int, now_ns: int) -> None:
-        """Plug a triangle in."""
         self._set_triangle(address, triangle, "plugged_in", now_ns)
 
     def acknowledge(self, address: int, triangle: int, now_ns: int, *, on: bool) -> None:

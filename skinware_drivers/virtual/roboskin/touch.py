@@ -52,9 +52,6 @@ _SENSORS = TRIANGLES * CHANNELS
 class PressedSkin:
     """The skin of all boards, and the presses on it.
 
-    Args:
-        options: of the boards.
-
     Raises:
         ConfigurationError: the file of the option ``stage`` cannot be used.
 
@@ -188,7 +185,6 @@ class Touch:
     """The capacitances of one board.
 
     Args:
-        seed: of all boards.
         ordinal: of the board; others feel other presses.
         skin: of all boards, with the presses on it; None: an untouched board.
     """

@@ -75,7 +75,7 @@ class Pass:
         from_m = max(4 * step_m, 4 * self.sigma_m + 0.02) + phase * step_m
         if self.way != "meet":
             away_m = from_m - step_m * np.arange(round(2 * from_m / step_m) + 1)
-            return away_m if self.way == "cross" else np.abs(away_m).astype(np.float64)
+            return (away_m if self.way == "cross" else np.abs(away_m)).astype(np.float64)
         brake_m = self.speed_m_s**2 / (2 * BRAKE_M_S2)
         nearest_m = 0.0 if self.lane else max(WIDTHS_APART * self.sigma_m, FINGER_M) / 2
         begin_s, brake_s = from_m / self.speed_m_s, self.speed_m_s / BRAKE_M_S2

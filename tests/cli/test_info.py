@@ -64,12 +64,12 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert driver["age_ms"] >= 0
     assert driver["rate_hz"] > 0
     assert driver["buses"] == [
-        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
-        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
+        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "dropped": 2, "errors": 0, "unknown": 7},
+        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "dropped": 0, "errors": 0, "unknown": 0},
     ]
     (record,) = driver["readers"]
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
-    counts = {"frames", "lost", "overruns", "missed_periods", "rate_hz", "age_ms"}
+    counts = {"frames", "missed", "overruns", "missed_periods", "rate_hz", "age_ms"}
     assert record.keys() == {"service", "pid", "program", "kind", "wall", "cpu", "age", "lateness"} | counts
     assert driver["statistics"]["wall"]["count"] == 8
     assert driver["statistics"]["wall"]["worst_ns"] >= driver["statistics"]["wall"]["mean_ns"] > 0

@@ -47,7 +47,7 @@ def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: 
         for _ in range(10):
             bus.wire_bits += 2 * 910_000
             bus.fullest = 0.7
-            bus.counters.lost += 3
+            bus.counters.dropped += 3
             clock.pass_s(2)
             limits.look()
             limits.look()  # within the same second: nothing new

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +10,7 @@ import numpy.typing as npt
 from skinware.bridge.link import Priority
 from skinware.bridge.messages import MOST_FRAMES, RAW, FrameMessage, Service, split_frame, split_generation
 from skinware.bridge.mirror import Mirror
-from skinware.bridge.pacing import Pacing
+from skinware.bridge.pacing import LinkTraffic, Pacing, Pulls
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge_state import ServiceState
 from skinware.errors import BadRecording, BridgeError, SkinwareError
@@ -28,62 +27,6 @@ _AGAIN_NS = NS_PER_S // 4
 _LATEST_NS = 1 << 61
 """More than any clock shows."""
 _EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
-
-
-@dataclass
-class LinkTraffic:
-    """The frames of a service that came.
-
-    Attributes:
-        gap: frames of the robot that were not published here, since the first one; all others: since the last report.
-        ages_ns: from the publication there to the one here.
-    """
-
-    frames: int = 0
-    gap: int = 0
-    gap_before: int = 0
-    bytes: int = 0
-    ages_ns: list[int] = field(default_factory=list)
-
-    def report(self, state: str, mode: str) -> ServiceState:
-        """Return the state of the service, with the rates since the last report."""
-        ages_ns = sorted(self.ages_ns)
-        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
-        new = self.gap - self.gap_before
-        report = ServiceState(state, mode, self.frames, self.gap, self.bytes, median, oldest, new)
-        self.frames, self.bytes, self.gap_before = 0, 0, self.gap
-        self.ages_ns.clear()
-        return report
-
-
-@dataclass
-class Pulls:
-    """Questions for frames that wait for an answer.
-
-    Attributes:
-        open: by number, the time until which an answer may come.
-        probe_until_ns: the same for a probe of the link.
-    """
-
-    count: int = 0
-    open: dict[int, int] = field(default_factory=dict)
-    probe_until_ns: int = 0
-
-    def begin(self, timeout_s: float) -> int:
-        """Return the number of a new question."""
-        self.count += 1
-        self.open[self.count] = now_ns() + round(timeout_s * NS_PER_S)
-        return self.count
-
-    def end(self, number: int, is_answered: bool) -> bool:
-        """Close a question; return whether it was open.
-
-        Answers come in order: an answer also closes earlier questions, which the link has dropped.
-        """
-        is_open = self.open.pop(number, None) is not None
-        if is_answered:
-            self.open = {later: until_ns for later, until_ns in self.open.items() if later > number}
-        return is_open
 
 
 class FrameOutput:

@@ -12,7 +12,7 @@ from skinware.errors import NamespaceError, RequestTimeout
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus, diagnostics, trigger_response
 from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
@@ -119,7 +119,7 @@ class Ros2Server:
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _ServedDriver] = {}
         self._troubles: set[str] = set()
-        self._diagnostics = node.publisher("/diagnostics", types.DIAGNOSTICS, Qos())
+        self._diagnostics = node.publisher("/diagnostics", messages.DIAGNOSTICS, Qos())
         self._stopping = False
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
@@ -209,7 +209,7 @@ class Ros2Server:
         topics = DriverTopics(self._node, self._prefix, name)
         self._served[name] = served = _ServedDriver(topics)
         if self._with_tare:
-            served.end_tare = self._node.service(f"{topics.base}/tare", types.TRIGGER, lambda _: self._tare(name))
+            served.end_tare = self._node.service(f"{topics.base}/tare", messages.TRIGGER, lambda _: self._tare(name))
         return served
 
     def _report_once(self, text: str) -> None:

@@ -14,8 +14,9 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers import Match, Module, Sensor, taxels
+from skinware_drivers.fields import Bits, Byte, Condition, Identifier, Sentinel
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import Bits, Byte, Condition, Cycle, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 PARTS = (*FINGERS, "palm")
 Beginnings = Mapping[tuple[int, int], int]

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Filter
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout
+from skinware_drivers.fields import Bits, Byte, Identifier
+from skinware_drivers.layout import Frame, Layout
 
 _FLAGS = EXTENDED_FLAG | REMOTE_FLAG
 

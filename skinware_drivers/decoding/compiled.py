@@ -15,8 +15,8 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout
 
 NO_KIND = 255
 """The number in place of the kind of a frame that is of no kind."""

@@ -21,8 +21,8 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import Above, AnyFlag, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers

@@ -18,19 +18,8 @@ from skinware.errors import BusError, StructureError
 from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
 from skinware.status import Status
 from skinware_drivers import Module, Patch, Sensor
-from skinware_drivers.layout import (
-    AnyFlag,
-    Bits,
-    DeviceTime,
-    Flag,
-    Frame,
-    Identifier,
-    Layout,
-    Sentinel,
-    SequenceNumber,
-    StatusBytes,
-    Values,
-)
+from skinware_drivers.fields import AnyFlag, Bits, DeviceTime, Flag, Identifier, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Frame, Layout, Values
 
 MAJOR, MINOR = 1, 0
 MOST_PAYLOAD = 1024

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers import Byte, Frame, Identifier, Layout, Link, Match, Notice, Patch, Poll
-from skinware_drivers.layout import Condition
+from skinware_drivers.fields import Condition
 from skinware_drivers.serial import LRC, Field, Length, Packet, Refused
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,

@@ -13,7 +13,8 @@ import pytest
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 

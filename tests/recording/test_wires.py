@@ -27,8 +27,9 @@ from skinware.wire import COLUMNS, IS_CUT, IS_FD, KIND, WISH, service_name
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.pythoncan import PythonCanBus
+from skinware_drivers.fields import Identifier
 from skinware_drivers.layout import Frame as FrameKind
-from skinware_drivers.layout import Identifier, Layout, Values
+from skinware_drivers.layout import Layout, Values
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.driving import Driving, driving_lines, emulated_skin

@@ -16,7 +16,8 @@ from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.running import bus_line, connection, news, runner

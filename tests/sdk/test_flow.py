@@ -27,7 +27,7 @@ from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.emulation import Emulation, JsonReport
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.native.structs import Source
 from skinware_drivers.polling import Watch

@@ -55,7 +55,7 @@ def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: 
     assert load.startswith("bus can0: about 91% of its time is in use")
     assert load_report(limits.permille) == {"load": 0.91, "load_unknown": None}
     assert fill.startswith("bus can0: the receive buffer was 70% full")
-    assert lost.startswith("bus can0: 3 frames were lost")
+    assert lost.startswith("bus can0: 3 frames dropped")
     assert bus.fullest == 0.0
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.decoding.skin_state import SkinState, Updates
+from skinware_drivers.decoding.decoder import SkinState, Updates
 from skinware_drivers.running.publisher import BurstPauses, Pace
 from tests.specification.decoding import join, take
 

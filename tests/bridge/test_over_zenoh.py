@@ -88,7 +88,7 @@ def test_two_commands_are_enough(namespace: Namespace, here: Namespace) -> None:
             frame = reader.read()
             assert frame.fresh("pressure").all()
             assert (frame.values == frame.values[0]).all()
-        assert serve.wait_for("status", lambda event: "arm" in event["services"])["lost"] == 0
+        assert serve.wait_for("status", lambda event: "arm" in event["services"])["missed"] == 0
 
 
 @pytest.mark.thorough

@@ -383,9 +383,9 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
         "  sensors: 80 pressure in counts, 16 temperature in degC",
     ]
     assert lines[6:9] == [
-        "  bus   state  frames  lost  unknown",  # no errors: not shown
-        "  can0  live    5,156     2        7",
-        "  can1  live        0     0        0",
+        "  bus   state  frames  dropped  unknown",  # no errors: not shown
+        "  can0  live    5,156        2        7",
+        "  can1  live        0        0        0",
     ]
     assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])

@@ -89,7 +89,7 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert out.startswith(
         f"recording torso of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
     )
-    assert " MB, nothing lost\n" in out
+    assert " MB, nothing missed\n" in out
     assert "/skin/torso/frame: " in out
     data = file.read_bytes()
     cut = tmp_path / "cut.mcap"

@@ -38,7 +38,7 @@ REPORT = DriverReport(
 
 def test_a_plain_line() -> None:
     assert plain_line(REPORT) == (
-        "roboskin  20.0 Hz  age 12 ms  sensors 768 (fresh 766, stale 2)  patches 4 live  lost 0  orphans 3"
+        "roboskin  20.0 Hz  age 12 ms  sensors 768 (fresh 766, stale 2)  patches 4 live  dropped 0  orphans 3"
     )
 
 
@@ -52,7 +52,7 @@ def test_a_plain_line() -> None:
         (replace(REPORT, life="starting", age_ns=None), "roboskin  starting, no frame yet  sensors 768"),
         (
             replace(REPORT, patches=(*[PATCH_REPORT] * 3, replace(PATCH_REPORT, state="stale"))),
-            "patches 3 live, 1 stale  lost 0",
+            "patches 3 live, 1 stale  dropped 0",
         ),
         (replace(REPORT, statuses={"fresh": 1, "stale": 0, "never_seen": 7}), "(fresh 1, stale 0, never seen 7)"),
         (
@@ -142,6 +142,6 @@ def test_the_last_states_of_a_dead_driver_are_told_as_such() -> None:
 
 def test_counters_in_words() -> None:
     counters = {"frames": 12345, "dropped": 1, "send_failures": 2, "sent": 0}
-    assert counters_text(counters) == "frames 12,345  lost 1  send failures 2"
+    assert counters_text(counters) == "frames 12,345  dropped 1  send failures 2"
     assert counters_text(counters, besides=("dropped",)) == "frames 12,345  send failures 2"
     assert counters_text({}) == ""

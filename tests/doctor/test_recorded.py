@@ -201,7 +201,7 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
     monkeypatch.setattr(Recording, "events", property(lambda _: json.loads(json.dumps(events))))
     evidence, findings = seen(file)
     assert findings["the wall clock was set, or the machine slept"].evidence == "by +60.00 s"
-    assert findings["the recorder lost frames"].evidence.startswith("3 frames ")
+    assert findings["the recorder missed samples"].evidence.startswith("3 samples ")
     assert evidence.drivers[0].frames_missed == 3
     assert "a service could not be recorded" in findings
 

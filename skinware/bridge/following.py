@@ -16,7 +16,7 @@ from skinware.bridge_state import ServiceState
 from skinware.errors import BadRecording, BridgeError, SkinwareError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.transfer.codec import Decoder
+from skinware.transfer.codec import FrameDecoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
 from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
@@ -96,7 +96,7 @@ class ServiceFollower:
         self._pacing = Pacing(0, mode)
         self._pulls = Pulls()
         self._generation: Generation | None = None
-        self._decoder: Decoder | None = None
+        self._decoder: FrameDecoder | None = None
         self._held = b""  # the newest frame, while its generation or the robot's clock is not known
         self._asked = (0, 0)  # the generation that was asked for, and until when its answer may come
         self._patience_s = _FIRST_GENERATION_S
@@ -319,7 +319,7 @@ class ServiceFollower:
                 raise BadRecording(f"a frame of {len(parts.content)} bytes, not {generation.slot_stride}")
             return np.frombuffer(parts.content, np.uint8)
         if self._decoder is None:
-            self._decoder = Decoder(generation.coded, generation.slot_stride)
+            self._decoder = FrameDecoder(generation.coded, generation.slot_stride)
         return self._decoder.decode(parts.content, keeps=parts.keeps)
 
     def _publish(self, frame: RecordedSample) -> None:

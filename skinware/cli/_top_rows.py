@@ -30,7 +30,7 @@ class RowKey(NamedTuple):
     """Index of the bus or patch in its driver; 0 for the driver itself."""
 
 
-class Row(NamedTuple):
+class ListRow(NamedTuple):
     key: RowKey
     cells: tuple[str, ...]
     """One text for each column."""
@@ -40,7 +40,7 @@ class Row(NamedTuple):
     """Every counter that the driver publishes for this row, by name."""
 
 
-def rows_of(report: DriverReport) -> list[Row]:
+def rows_of(report: DriverReport) -> list[ListRow]:
     """Return the row of a driver, then those of its buses, each followed by its patches."""
     name, counters = report.name, report.counters
     state = report.life if report.age_ns is None else state_shown(report.life, report.fresh, report.sensors)
@@ -54,13 +54,15 @@ def rows_of(report: DriverReport) -> list[Row]:
         count_text(counters.get("orphans")),
         "",
     )
-    rows = [Row(RowKey(name, DRIVER, 0), cells, state, counters)]
+    rows = [ListRow(RowKey(name, DRIVER, 0), cells, state, counters)]
     for at, bus in enumerate(report.buses):
         state, dropped = report.last(bus.state), count_text(bus.counters.get("dropped"))
         reason = "" if bus.reason is None else bus.reason.replace("_", "-")
         others = f"{reason}  {counters_text(bus.counters, besides=_NOT_AMONG_OTHERS)}".strip()
         rows.append(
-            Row(RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", dropped, "", others), state, bus.counters)
+            ListRow(
+                RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", dropped, "", others), state, bus.counters
+            )
         )
         for number, patch in enumerate(report.patches):
             if patch.bus != at:
@@ -76,7 +78,7 @@ def rows_of(report: DriverReport) -> list[Row]:
                 count_text(patch.counters.get("orphans")),
                 counters_text(patch.counters, besides=_NOT_AMONG_OTHERS),
             )
-            rows.append(Row(RowKey(name, PATCH, number), cells, state, patch.counters))
+            rows.append(ListRow(RowKey(name, PATCH, number), cells, state, patch.counters))
     return rows
 
 

@@ -127,7 +127,7 @@ def sensor_names(structure: Structure) -> list[str]:
     return [str(name) for name in names]
 
 
-class Source(Protocol):
+class TableSource(Protocol):
     """A file that is converted."""
 
     path: Path
@@ -153,7 +153,7 @@ class Source(Protocol):
 class DerivedSource:
     """A source with other tables than the one that it stands for."""
 
-    def __init__(self, source: Source, tables: Sequence[Table]) -> None:
+    def __init__(self, source: TableSource, tables: Sequence[Table]) -> None:
         self._source = source
         self.path: Path = source.path
         self.start_ns: int = source.start_ns
@@ -326,7 +326,7 @@ class RecordedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.Source`."""
+        """See :class:`skinware.conversion.tables.TableSource`."""
         return self._in_span(self._recording.events)
 
     @property

@@ -29,7 +29,7 @@ from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Head, PendingChunk, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
-from skinware.transfer.codec import CodedColumn, Encoder
+from skinware.transfer.codec import CodedColumn, FrameEncoder
 from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
@@ -193,7 +193,7 @@ class Recorder:
 @dataclass
 class _Stream:
     head: Head
-    encoder: Encoder
+    encoder: FrameEncoder
     generation: Generation | None
 
 
@@ -294,7 +294,7 @@ class _Coder(threading.Thread):
         number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
         channel, schema = self.channels.of_service(service, GENERATION)
         columns = segment.layout.slot
-        encoder = Encoder([CodedColumn.of(column) for column in columns])
+        encoder = FrameEncoder([CodedColumn.of(column) for column in columns])
         generation = None
         if self._renderer is not None:
             with contextlib.suppress(BadRecording):  # viewers cannot show an unreadable driver

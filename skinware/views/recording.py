@@ -21,7 +21,7 @@ _END_S = 10.0
 """Time for a recording to complete its file."""
 
 
-class Recording:
+class RecordingProgram:
     """Run ``skin-record``, one at a time.
 
     Args:

@@ -37,7 +37,7 @@ from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     SATURATED,
     TAXEL,
-    Board,
+    PaxiniBoard,
     Slot,
     module,
     nominal_places,
@@ -105,7 +105,7 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 """All streamed frames are strange as long as the slots are unknown."""
 
 
-class HighSpeedBoard(Board):
+class HighSpeedBoard(PaxiniBoard):
     """One board: a patch with a module for each connected slot."""
 
     def __init__(self, hand: Hand, **how: Any) -> None:

@@ -58,7 +58,7 @@ class XelaMessages(Framing):
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
     def framer(self) -> Framer:
-        return _Messages()
+        return _SeenMessages()
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Refuse: nothing is sent to the server.
@@ -69,7 +69,7 @@ class XelaMessages(Framing):
         raise ValueError(f"XELA's server is only read ({identifier:#x}, {len(payload)} bytes)")
 
 
-class _Messages(Framer):
+class _SeenMessages(Framer):
     def __init__(self) -> None:
         super().__init__()
         self._seen: Seen = {}

@@ -203,7 +203,7 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
     """Fingertips of board 1 send the slices, one per cycle; the first one until somebody reads, at the end the last."""
     from skinware_drivers.can.socketcan import SocketCanBus
     from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
-    from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+    from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
     from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
     begun = itertools.count()
@@ -215,7 +215,7 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
         values = slices[slice_of[cycle]]
         return values[12 * triangle : 12 * triangle + 12] if triangle < 5 else [240] * 12
 
-    options = RoboskinOptions(boards=(1,))
+    options = EmulatedRoboskinOptions(boards=(1,))
     hardware = EmulatedRoboskin(options, source=source)
     bus = SocketCanBus(bus_name)
     with open(os.devnull, "w") as nowhere, SignalWatch() as stop:

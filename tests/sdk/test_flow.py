@@ -35,7 +35,7 @@ from skinware_drivers.running.flow import FlowLoop, FlowSelector
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.cable import Cable
 from tests.sdk.driving import emulated, follow

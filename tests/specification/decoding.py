@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Field, Form
+from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
 from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates
 from skinware_drivers.decoding.device_numbers import read_numbers
@@ -92,7 +92,7 @@ def _look_up(form: Form, bus: npt.NDArray[np.uint16], identifier: Indices, slots
             slots[rows[hits[known]]] = found[at[known]]
 
 
-def _field(field: Field, identifier: Indices) -> Indices:
+def _field(field: KeyField, identifier: Indices) -> Indices:
     return identifier >> field.shift & field.mask | field.constant
 
 

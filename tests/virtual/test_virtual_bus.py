@@ -14,7 +14,7 @@ from skinware.errors import BusError, BusNotAvailable, BusSendError, Configurati
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS
@@ -34,7 +34,7 @@ class Clock:
 
 
 def boards(**options: object) -> EmulatedRoboskin:
-    return EmulatedRoboskin(RoboskinOptions(**options))  # type: ignore[arg-type]
+    return EmulatedRoboskin(EmulatedRoboskinOptions(**options))  # type: ignore[arg-type]
 
 
 MakeBus = Callable[..., VirtualCanBus]

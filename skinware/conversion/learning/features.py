@@ -297,7 +297,7 @@ class Moments:
         )
 
 
-class Sample:
+class ChosenRows:
     """Evenly chosen rows of those that are added.
 
     Args:
@@ -341,7 +341,7 @@ class Statistics:
     def __init__(
         self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int, per_item: int = 1
     ) -> None:
-        self._sample, self._per_item = Sample(shape, dtype, rows, most_bytes), per_item
+        self._sample, self._per_item = ChosenRows(shape, dtype, rows, most_bytes), per_item
         self._moments: Moments | None = None
 
     def add(self, rows: npt.NDArray[Any], moments: Moments) -> None:

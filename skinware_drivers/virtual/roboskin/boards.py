@@ -29,7 +29,7 @@ _NO_ACKS_TO_RECALIBRATE = 5
 _INERTIAL = "inertial"  # the timer of the inertial sensors
 
 
-class Board(Device):
+class EmulatedBoard(Device):
     """One board.
 
     Defaults: icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp, ``setdefault`` and

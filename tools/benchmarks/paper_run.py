@@ -314,7 +314,7 @@ def _figures(
         age_p99_us=float(max(np.percentile(one, 99) for one in ages)),
         age_max_us=float(all_ages.max()),
         reads_per_s=len(all_ages) / seconds,
-        lost=sum(reader.missed for reader in readers),
+        lost=sum(reader.lost for reader in readers),
         torn=sum(reader.torn for reader in readers),
         missed_periods=sum(missed for _, missed, _ in wrote),
         writers_cpu_percent=100 * sum(cpu for _, _, cpu in wrote),

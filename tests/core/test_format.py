@@ -88,7 +88,7 @@ def test_a_real_driver_has_the_documented_tables_and_columns() -> None:
     static, columns, *_ = tables("Drivers")
     made = grouped()
     places = Geometry.unknown(["pressure"] * made.n_sensors, made.sensor_uid)
-    with DriverWriter("x", made.placed(places), bus_counters=["lost"], patch_counters=["cycles", "late"]):
+    with DriverWriter("x", made.placed(places), bus_counters=["dropped"], patch_counters=["cycles", "late"]):
         with ServiceReader[Any]("x") as reader:
             layout = reader._ring.segment.layout
     assert {row[0]: np.dtype(row[1]) for row in static} == {c.name: c.dtype for c in layout.static}

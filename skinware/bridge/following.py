@@ -68,7 +68,7 @@ class FrameOutput:
             return None
         count = generation.published_before + frame.sequence
         if self.count is not None:
-            self.traffic.lost += max(0, count - self.count - 1)
+            self.traffic.gap += max(0, count - self.count - 1)
         self.count, self.newest, self.is_dead = count, frame.position, False
         self.traffic.frames += 1
         self.traffic.ages_ns.append(age_ns)

@@ -49,13 +49,13 @@ class LinkTraffic:
     """The frames of a service that came.
 
     Attributes:
-        lost: frames of the robot that were not published here, since the first one; all others: since the last report.
+        gap: frames of the robot that were not published here, since the first one; all others: since the last report.
         ages_ns: from the publication there to the one here.
     """
 
     frames: int = 0
-    lost: int = 0
-    lost_before: int = 0
+    gap: int = 0
+    gap_before: int = 0
     bytes: int = 0
     ages_ns: list[int] = field(default_factory=list)
 
@@ -63,9 +63,9 @@ class LinkTraffic:
         """Return the state of the service, with the rates since the last report."""
         ages_ns = sorted(self.ages_ns)
         median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
-        new = self.lost - self.lost_before
-        report = ServiceState(state, mode, self.frames, self.lost, self.bytes, median, oldest, new)
-        self.frames, self.bytes, self.lost_before = 0, 0, self.lost
+        new = self.gap - self.gap_before
+        report = ServiceState(state, mode, self.frames, self.gap, self.bytes, median, oldest, new)
+        self.frames, self.bytes, self.gap_before = 0, 0, self.gap
         self.ages_ns.clear()
         return report
 

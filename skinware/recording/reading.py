@@ -146,9 +146,9 @@ class Recording:
         return list(self._json(CLOCK))
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Samples that were published meanwhile and could not be recorded."""
-        return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "lost")
+        return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "missed")
 
     @property
     def problems(self) -> list[str]:

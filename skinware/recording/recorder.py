@@ -1,7 +1,8 @@
 """Record all samples of all services.
 
 One thread takes samples from the rings and never waits for the disk; another codes, compresses and writes them. If the
-second one cannot keep up (a slow disk), samples wait in memory; if that is full, they are not taken, and count as lost.
+second one cannot keep up (a slow disk), samples wait in memory; if that is full, they are not taken, and count as
+missed.
 """
 
 from __future__ import annotations
@@ -110,9 +111,9 @@ class Recorder:
         self._stopping = False
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Samples that were published meanwhile and could not be taken."""
-        return self._collector.lost
+        return self._collector.missed
 
     @property
     def services(self) -> list[str]:

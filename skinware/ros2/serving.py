@@ -44,14 +44,14 @@ class ServedReport:
         state: as :func:`skinware.state.life_of`; ``gone``: it was withdrawn.
         rate_hz: frames that it publishes; None: not known yet.
         age_ms: of its newest data; None: no frame so far.
-        lost: frames so far that a subscriber wanted and that could not be taken.
+        missed: frames so far that a subscriber wanted and that could not be taken.
         left_out: messages that were not sent, because the carrier took no more.
     """
 
     state: str
     rate_hz: float | None
     age_ms: float | None
-    lost: int
+    missed: int
     messages: int
     left_out: int
 
@@ -74,12 +74,12 @@ class _ServedDriver:
     look_ns: int = 0
     is_over: bool = False
     wants_frames: bool = False
-    lost: int = 0
+    missed: int = 0
 
     def take(self, frame: DriverSnapshot, *, wants_frames: bool) -> None:
         before = self.frame
         if before is not None and wants_frames and self.wants_frames and frame.generation == before.generation:
-            self.lost += frame.sequence - before.sequence - 1
+            self.missed += frame.sequence - before.sequence - 1
         self.frame, self.wants_frames, self.is_over = frame, wants_frames, False
 
     def publish_last(self) -> None:
@@ -154,7 +154,7 @@ class Ros2Server:
         """Return the state of all drivers that were found at any time, by name."""
         reports = {}
         for name, served in self._served.items():
-            live, traffic = self._live.get(name), (served.lost, served.topics.messages, served.topics.left_out)
+            live, traffic = self._live.get(name), (served.missed, served.topics.messages, served.topics.left_out)
             if live is None:
                 reports[name] = ServedReport(GONE, 0.0, None, *traffic)
                 continue

@@ -51,7 +51,7 @@ class RecordingProgram:
         """The file, its size, losses and duration; None while nothing is recorded."""
         if self._running is None:
             return None
-        figures = {name: self._report.get(name, 0) for name in ("bytes", "lost")}
+        figures = {name: self._report.get(name, 0) for name in ("bytes", "missed")}
         return {"file": str(self._file), **figures, "s": round(time.monotonic() - self._begin_s, 1)}
 
     def start(self) -> None:

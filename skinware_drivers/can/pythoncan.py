@@ -255,7 +255,7 @@ class _MessageQueue:
 
     def _take(self, message: can.Message) -> None:
         if len(self.queue) >= _QUEUE_FRAMES:
-            self._counters.lost += 1
+            self._counters.dropped += 1
             return
         identifier = message.arbitration_id
         for is_so, flag in (

@@ -295,9 +295,9 @@ def print_capture(capture: Capture, as_json: bool) -> None:
         elif capture.result["problem"]:
             echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
         else:
-            lost = f", {capture.result['lost']} frames lost" if capture.result["lost"] else ""
+            missed = f", {capture.result['missed']} frames missed" if capture.result["missed"] else ""
             size = capture.result["bytes"] / 1e6
-            echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
+            echo(f"{capture.path}: {size:.1f} MB{missed}; skin-driver --bus replay:{capture.path} decodes it again")
 
 
 async def report(runner: Runner) -> None:

@@ -326,5 +326,5 @@ class _Walk:
         return ", ".join(names[taxel] for taxel in taxels[:_MOST_NAMES]) + more
 
 
-_LOSSES = ("lost", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
+_LOSSES = ("dropped", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
 """Counters of losses and damage on a bus."""

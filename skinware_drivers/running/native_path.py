@@ -177,7 +177,7 @@ def _compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs
     counts = publisher.count_buses()
     plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
     plan.skipped_column = _SKIPPED
-    for name in ("lost", "frames", "errors", "refused"):
+    for name in ("dropped", "frames", "errors", "refused"):
         setattr(plan, f"{name}_column", OWN_BUS_COUNTERS.index(name))
     plan.bytes_column = OWN_BUS_COUNTERS.index("bytes_in")
     plan.skipped, plan.skipped_before = arrays.at(exchange.skipped), arrays.at(exchange.skipped_before)

@@ -167,7 +167,7 @@ def test_aligned_snapshots_show_one_moment() -> None:
                 skin.read(newer_than=aligned, align=True, timeout_s=0.1)
             publish(slow, 3, now)
             assert skin.read(newer_than=aligned, align=True).raw("pressure").tolist() == [41] * 10 + [3] * 10
-            assert skin.reader("fast").lost == 0  # an older one, taken later, makes none lost
+            assert skin.reader("fast").missed == 0  # an older one, taken later, makes none lost
 
 
 def test_a_silent_driver_does_not_hold_the_moment_back() -> None:

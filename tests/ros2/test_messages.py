@@ -159,7 +159,7 @@ def test_ages_of_points_are_those_of_their_modules() -> None:
 def test_diagnostics() -> None:
     told = [
         messages.DiagnosticStatus(
-            messages.DiagnosticLevel.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}
+            messages.DiagnosticLevel.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"dropped": "2"}
         ),
         DiagnosticStatus(DiagnosticLevel.OK, "skin: arm: can0", "live", "can0", {}),
     ]

@@ -126,7 +126,7 @@ def measure(sensors: int, seconds: float) -> None:
                 ages = answer(pipe, PATIENCE_S)
             events = bridge.end()
         told = next(event for event in reversed(events) if event["event"] == "status")["drivers"]["large"]
-        print(f"    {what:<15} {100 * share:5.1f} % of a core, {told['lost']} lost, {told['left_out']} left out")
+        print(f"    {what:<15} {100 * share:5.1f} % of a core, {told['missed']} lost, {told['left_out']} left out")
         for topic, of_topic in ages.items():
             p50, p99 = (float(np.percentile(of_topic, at)) / 1e6 for at in (50, 99)) if of_topic else (np.nan, np.nan)
             rate = len(of_topic) / seconds

@@ -48,9 +48,7 @@ def name_in_module(type_name: str, number: int, is_only: bool) -> str:
     """Return the name of a sensor's place within its module; empty: that of the module says all.
 
     Args:
-        type_name: its type.
         number: its uid, counted from the lowest in the module.
-        is_only: the module has no other of that type.
     """
     by_type = type_name.startswith(_BY_TYPE)
     if is_only:

@@ -38,9 +38,9 @@ _ROW = np.dtype(
         ("state", "u1"),
         ("mode", "u1"),
         ("reserved", "u1", (6,)),
-        ("lost", "<u8"),
+        ("gap", "<u8"),
         ("rate_hz", "<f8"),
-        ("lost_hz", "<f8"),
+        ("gap_hz", "<f8"),
         ("bytes_per_s", "<f8"),
         ("age_p50_ns", "<f8"),
         ("age_p99_ns", "<f8"),
@@ -70,9 +70,9 @@ class ServiceState:
     Attributes:
         state: one of ``STATES``.
         mode: one of ``MODES``.
-        rate_hz, lost_hz: samples of the last second that were published here, and that the robot published and that did
+        rate_hz, gap_hz: samples of the last second that were published here, and that the robot published and that did
             not come.
-        lost: samples that the robot published and that did not come, since the first one.
+        gap: samples that the robot published and that did not come, since the first one.
         bytes_per_s: of messages, in the last second.
         age_p50_ns, age_p99_ns: from the publication there to the one here, in the last second; None: there was none.
     """
@@ -80,11 +80,11 @@ class ServiceState:
     state: str
     mode: str
     rate_hz: float = 0.0
-    lost: int = 0
+    gap: int = 0
     bytes_per_s: float = 0.0
     age_p50_ns: float | None = None
     age_p99_ns: float | None = None
-    lost_hz: float = 0.0
+    gap_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,10 @@ class BridgeState:
     """State of a bridge.
 
     Attributes:
-        robot: its name.
-        is_up: its bridge is heard.
         since_ns: since when that is so, CLOCK_MONOTONIC.
         clock_offset_ns: our clock minus the robot's; None: not known.
         clock_error_ns: largest error of the offset; None: not known.
         round_trip_ns: the shortest lately.
-        services: by name.
         instance: number of the bridge that is followed; empty: none so far.
         host: name of its machine; empty: not known.
         namesakes: other bridges that serve a robot of this name.
@@ -127,8 +124,6 @@ def service_name(robot: str) -> str:
 
 
 class BridgeSample(Sample):
-    """State of a bridge at one moment."""
-
     __slots__ = ()
 
     @property
@@ -180,7 +175,6 @@ class BridgeStateWriter:
     """Publish the state of a bridge.
 
     Args:
-        robot: its name.
         namespace: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
     """
 
@@ -230,8 +224,8 @@ class BridgeStateWriter:
 def _row_of(name: str, service: ServiceState) -> tuple[Any, ...]:
     ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
     state, mode = STATES.index(service.state), MODES.index(service.mode)
-    rates = service.rate_hz, service.lost_hz, service.bytes_per_s
-    return name.encode(), state, mode, 0, service.lost, *rates, *ages
+    rates = service.rate_hz, service.gap_hz, service.bytes_per_s
+    return name.encode(), state, mode, 0, service.gap, *rates, *ages
 
 
 def _state_of(row: npt.NDArray[Any]) -> ServiceState:
@@ -241,11 +235,11 @@ def _state_of(row: npt.NDArray[Any]) -> ServiceState:
         STATES[state] if state < len(STATES) else STATES[0],
         MODES[mode] if mode < len(MODES) else MODES[0],
         float(row["rate_hz"]),
-        int(row["lost"]),
+        int(row["gap"]),
         float(row["bytes_per_s"]),
         p50_ns,
         p99_ns,
-        float(row["lost_hz"]),
+        float(row["gap_hz"]),
     )
 
 

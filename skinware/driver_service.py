@@ -145,10 +145,7 @@ def counters_of(
     """Return counters in a snapshot: their names, and (count, names) numbers; no names if the driver has none.
 
     Args:
-        frame: a snapshot of the driver.
-        tables: its static columns.
         what: ``bus`` or ``patch``.
-        count: how many of those the driver has.
     """
     names = _names(tables, f"{what}_counter_name")
     try:

@@ -35,7 +35,6 @@ class Drivers(Generic[ReaderT]):
     another kind, is tried again when it is replaced, and after ten seconds.
 
     Args:
-        namespace: where to look.
         reader: makes a reader from a name and ``namespace=``. It raises
             :class:`skinware.errors.BadServiceFile` for a service of another kind; a class of readers does.
         names: of the services to follow; None: all.
@@ -78,9 +77,6 @@ class Drivers(Generic[ReaderT]):
 
     def look(self, *, at_once: bool = False) -> bool:
         """Find services that came or went, if a look is due.
-
-        Args:
-            at_once: look although it is not due.
 
         Returns:
             False if no look was due, or all services are followed and every file is that of the look before.
@@ -135,10 +131,6 @@ class Drivers(Generic[ReaderT]):
 
     def newest(self, name: str, *, newer_than: Sample | None = None) -> Any:
         """Return the newest sample of a service; never wait.
-
-        Args:
-            name: which service.
-            newer_than: a sample that is not wanted again.
 
         Returns:
             None if there is no newer one, the service has just restarted, or is not followed any more.

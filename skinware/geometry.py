@@ -58,13 +58,11 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Sensors of one type in one frame.
 
     Attributes:
-        type: name of their sensor type.
         frame: name of the coordinate frame of the numbers.
         uid: of each sensor.
         position_m: of each sensor, m.
         normal: of each sensor, of length 1, outwards; NaN where it is not known, None if no normal is known.
         radius_m: of each of them, m; None if it is not known.
-        name: for people.
         confidence: 0 to 1, the part of them that is within half a pitch of its place, as estimated from
             measurements; None: not estimated.
     """
@@ -100,7 +98,7 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"normal {row} has the length {length[row]:.3g}, not 1")
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _GeometryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
     group: tuple[GeometryGroup, ...] = ()
@@ -147,12 +145,7 @@ class Geometry:
         return self.at([type_name] * len(uid), uid)
 
     def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """Return the places of n sensors; not known where this geometry does not have them.
-
-        Args:
-            type_name: name of each one's type.
-            uid: (n,) of each.
-        """
+        """Return the places of n sensors; not known where this geometry does not have them."""
         rows = {pair: row for row, pair in enumerate(zip(self.type_name.tolist(), self.uid.tolist(), strict=True))}
         found = [rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)]
         return self._take(np.array(found, np.int64), type_name, uid)
@@ -263,16 +256,10 @@ def geometry_of(text: TomlText) -> Geometry:
     Raises:
         ConfigurationError: as for :func:`read_geometry`.
     """
-    return _joined(text.of_format("geometry file", FORMAT, VERSION, _File).group, text.place)
+    return _joined(text.of_format("geometry file", FORMAT, VERSION, _GeometryFile).group, text.place)
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
-    """Return the text of a geometry file.
-
-    Args:
-        groups: what is in it.
-        comment: lines for its head.
-    """
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]

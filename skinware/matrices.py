@@ -46,9 +46,6 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
     arrays of that type. A key that is not here raises a StructureError, which says why.
 
     Args:
-        type_name: of the sensors.
-        keys: of all modules.
-        kinds: of all modules.
         module_of: (n,) the module of each sensor; in a matrix, they are row by row.
         names: of all modules; a name that only one of them has is as good as its key.
     """

@@ -38,7 +38,6 @@ class BusReport:
     """One bus of a driver.
 
     Attributes:
-        name: of the bus.
         state: name of a :class:`skinware.status.BusState`.
         reason: name of a :class:`skinware.status.BusReason`; None without one.
         load: part of the time that the bus is in use, 0 to 1; None where it is not known.
@@ -57,7 +56,6 @@ class PatchReport:
     """One patch of a driver.
 
     Attributes:
-        name: of the patch.
         bus: index of its bus.
         state: name of a :class:`skinware.status.PatchState`.
         sensors, fresh, untouched: number of all its sensors, of the fresh ones, and of those that were only 0 so far.
@@ -82,11 +80,9 @@ class DriverReport:
     """One driver with its buses and patches.
 
     Attributes:
-        name: of the driver.
         life: what it is doing, see :func:`life_of`.
         rate_hz: snapshots per second now; None where that is not known yet.
         age_ns: age of its newest data; None before the first snapshot.
-        sensors: number of its sensors.
         statuses: number of sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``
             counts those of modules that sent only 0 so far; they are fresh all the same.
         buses, patches: in the order of the structure; empty before the first snapshot and while the structure changes.
@@ -137,9 +133,6 @@ def report_of(
     """Return the report of a driver.
 
     Args:
-        reader: its reader.
-        frame: its newest snapshot.
-        measured_hz: its rate as measured.
         patch_rates_hz: updates per second of each patch as measured; ignored unless there is one for each patch.
         life: what it is doing; default: what :func:`life_of` returns.
         status: (n_sensors,) uint8, status of its sensors now; default: what :func:`status_now` returns.
@@ -193,10 +186,6 @@ def report_of(
 
 def life_of(service: ServiceReader[Any], newest: Sample | None) -> str:
     """Return what a service is doing.
-
-    Args:
-        service: its reader.
-        newest: its newest sample.
 
     Returns:
         ``live``; ``silent``: its process runs but has published nothing for a second and for five of its periods (it

@@ -94,7 +94,6 @@ def table(
 
     Args:
         titles: one for each column.
-        rows: one text for each column.
         left: the first so many columns are aligned left, the others right.
         width: columns of a line; wider tables continue in a table below with the same first column.
     """
@@ -137,10 +136,6 @@ def printable(text: str, keep: str = "") -> str:
 
     Nothing in it moves the cursor, changes colours, or turns the reading direction: control and format characters (also
     of bidirectional text), lone surrogates and all line ends are replaced.
-
-    Args:
-        text: any.
-        keep: characters that stay.
     """
     if text.translate(dict.fromkeys(map(ord, keep))).isprintable():
         return text

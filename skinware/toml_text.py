@@ -31,9 +31,6 @@ class TomlText:
     Args:
         path: of the file; None: one that says nothing.
 
-    Attributes:
-        data: what it says.
-
     Raises:
         ConfigurationError: it cannot be read, or is not TOML.
     """
@@ -61,8 +58,6 @@ class TomlText:
         Args:
             what: such a file is called, for messages.
             format_name: that it must have.
-            version: that it must have.
-            struct: of all that may be in it, these two included.
 
         Raises:
             ConfigurationError: another format or version, or a value that does not fit; the message says where.
@@ -88,12 +83,7 @@ def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:
 
 
 def line_of(text: str, keys: Sequence[str | int]) -> int:
-    """Return the number of the line of a value, or of the table or value that has it in itself; 1 if there is none.
-
-    Args:
-        text: of the file.
-        keys: where the value is.
-    """
+    """Return the number of the line of a value, or of the table or value that has it in itself; 1 if there is none."""
     found, depth = 1, 0
     for number, path in _paths(text):
         if len(path) > depth and path == tuple(keys[: len(path)]):

@@ -52,8 +52,6 @@ class Adapter(HasOptions[OptionsT], ABC):
         elsewhere: classes with the same options for the same devices on other kinds of bus.
         Options: struct of the options, as named in the brackets; its fields become command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
-        dtype: dtype of the values.
-        layout: the meaning of the frames.
         patches: the patches on each bus, unless ``describe`` finds them.
         geometry: positions of the sensors, by their uids on the bus; None: unknown. A geometry of the bus or of a
             person takes its place. For hands: :mod:`skinware_drivers.hand`.
@@ -187,7 +185,6 @@ class Adapter(HasOptions[OptionsT], ABC):
         Send only requests that do no harm to any device of this kind, whatever it is doing.
 
         Args:
-            link: the bus.
             idle: no device is sending, so requests that disturb a sending device are harmless, too.
 
         Returns:

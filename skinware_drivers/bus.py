@@ -180,7 +180,6 @@ class Bus(ABC):
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
         device_end: makes the end to which emulated devices are attached; None: both ends are alike.
-        counters: counts what happens on the bus.
         samples: some of the frames that could not be used.
         tap: keeps what goes over the wire, in both directions, while a program records it.
         narrows: it can leave out unwanted frames, see ``narrow``.
@@ -188,7 +187,7 @@ class Bus(ABC):
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
         fullest: largest share of the receive buffer in use after a ``receive``, since it was last set to 0.
 
-    Frames of one bus arrive in order. ``counters.lost`` counts frames that were lost. A bus that goes down or away
+    Frames of one bus arrive in order. ``counters.dropped`` counts frames that were lost. A bus that goes down or away
     raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once; its owner then closes it and opens it again,
     indefinitely, with growing pauses.
 
@@ -343,7 +342,6 @@ class KernelBus(Bus):
         """Describe the bus to C, which then reads it in place of ``receive``.
 
         Args:
-            batch: gets the frames.
             source: filled in: the descriptor, and the stream of a line; for a socket, the memory of ancillary data, the
                 clocks and the counts so far.
 

@@ -42,7 +42,7 @@ class BusCounters:
 
     frames: int = 0
     """Frames received."""
-    lost: int = 0
+    dropped: int = 0
     """Frames that the kernel (or the interface's queue) dropped before we could read them."""
     errors: int = 0
     """CAN error frames and similar."""
@@ -89,9 +89,6 @@ class Samples:
     """The newest few unused frames of one bus, of each reason, with different identifiers.
 
     At most four frames a second of each reason are looked at.
-
-    Attributes:
-        rows: (SAMPLES,) :data:`skinware.samples.SAMPLE`.
     """
 
     def __init__(self) -> None:
@@ -107,7 +104,6 @@ class Samples:
         """Keep one of these frames if it is time, and one has a new identifier.
 
         Args:
-            why: the reason why they were not used.
             wire: (n,) rows of a batch (:func:`skinware_drivers.bus.wire_dtype`).
         """
         if not len(wire) or not self.wants(why):

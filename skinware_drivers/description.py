@@ -76,7 +76,6 @@ class SkinTables:
     """The descriptions of all buses: the structure, and the way from keys and channels into it.
 
     Attributes:
-        structure: the tables that programs see.
         patch_key: (bus, key) -> patch.
         module_key: (patch, key) -> module.
         channel_to_sensor: (n_modules, n_channels) int64, sensor of each channel; ``n_sensors`` = none.

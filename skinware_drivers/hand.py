@@ -60,7 +60,6 @@ class Grid:
         """Return the positions of a grid's taxels.
 
         Args:
-            centre_m: centre of the grid.
             type_names: types of the sensors of each taxel (``["pressure"]``, or its axes).
             uid: uids of the taxels, row by row; the last ones may be missing.
             frame: coordinate frame, if not that of a hand.

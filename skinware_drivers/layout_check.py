@@ -9,7 +9,8 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.layout import Cycle, Frame, Layout, Packed, Values
+from skinware_drivers.fields import Packed
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.native.compiling import check_values
 
 _DTYPES = ("u1", "i2", "u2", "i4", "f4")
@@ -20,9 +21,6 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     """Refuse a layout under which values would be cut or dropped, or halves of two cycles be joined.
 
     Args:
-        layout: of one bus.
-        patches: on that bus.
-        tables: made of them.
         period_s: nominal time between two updates of a module.
 
     Raises:

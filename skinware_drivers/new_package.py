@@ -67,9 +67,7 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
     """Make the package in the folder ``where / name``, completely or not at all.
 
     Args:
-        name: of the driver, the package and the folder.
         transport: ``can``, ``serial``, ``modbus``, ``tcp`` or ``virtual``.
-        where: folder in which the new folder is made.
 
     Returns:
         The files, relative to the new folder.

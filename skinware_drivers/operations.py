@@ -60,7 +60,6 @@ def operations_of(adapter: type[Any], *, alone: bool = False) -> dict[str, Opera
     """Return the operations of an adapter class by name, sorted.
 
     Args:
-        adapter: the class.
         alone: also those that a running driver does not offer.
     """
     members = inspect.getmembers(adapter, inspect.iscoroutinefunction)

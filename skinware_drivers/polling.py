@@ -14,9 +14,9 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers.bus import identifier_text
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.link import Match
+from skinware_drivers.fields import Match
 
 
 class Notice(enum.Enum):
@@ -82,7 +82,6 @@ def check_polls(polls: Sequence[Poll], wire_s: Callable[[Poll], float]) -> str:
     """Refuse polls that cannot be answered in time.
 
     Args:
-        polls: those of one bus.
         wire_s: returns the least time that question and answer take on the line, s; 0 if it is not known.
 
     Returns:

@@ -9,14 +9,14 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import CHOOSE, Bus, chosen_by
 from skinware_drivers.bus_names import BusName, parse_bus_name
-from skinware_drivers.loading import Kind, load, registered
+from skinware_drivers.loading import ClassKind, load, registered
 from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
 DEFAULT_DRIVER = "roboskin"
 
-_DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
+_DRIVER = ClassKind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
 class NamedBus:
@@ -27,7 +27,6 @@ class NamedBus:
         driver: the driver whose devices the bus ``virtual`` emulates, if ``text`` names none; registered, or a file.
 
     Attributes:
-        text: as given.
         name: the same in its parts.
 
     Raises:
@@ -60,7 +59,6 @@ class NamedBus:
 
         Args:
             payload_size: longest payload that the layout knows.
-            listen_only: refuse to send.
             for_devices: the end to which emulated devices are attached, where that is another.
 
         Raises:

@@ -78,6 +78,7 @@ def test_a_large_skin_over_a_slow_link_is_one_row() -> None:
     assert 0 < row["age_p50_ms"] <= row["age_p99_ms"]
 
 
+@pytest.mark.thorough
 def test_a_fleet_where_no_machines_can_be_made_is_on_the_loopback(tmp_path: Path) -> None:
     options = ("--robots", "2", "--robot-sensors", "32", "--link", "fast", "--mode", "push")
     ((row,), messages) = scale("robots", *options, path=str(tmp_path))
@@ -87,6 +88,7 @@ def test_a_fleet_where_no_machines_can_be_made_is_on_the_loopback(tmp_path: Path
     assert row["serve_us"] > 0
 
 
+@pytest.mark.thorough
 def test_a_row_that_does_not_work_says_why_and_ends() -> None:
     options = ("--sensors", "24", "--link", "fast", "--mode", "push", "--loopback")
     ((row,), _) = scale("sizes", *options, status=1)

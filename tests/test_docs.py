@@ -62,6 +62,7 @@ def execute(page: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "page", [page for page in PAGES[1:] if blocks(page) and page.stem not in ELSEWHERE], ids=lambda page: page.stem
 )
@@ -183,6 +184,7 @@ def mentioned(page: Path) -> list[list[str]]:
     return [words for words in whole if not any(word.endswith(".py") for word in words)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if commands_of(page) or mentioned(page)], ids=lambda page: page.stem
 )
@@ -233,6 +235,7 @@ RUN_HERE = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("page", list(dict.fromkeys(page for page, _, _ in RUN_HERE)), ids=lambda page: page.stem)
 def test_documented_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -292,6 +295,7 @@ def test_attributes_that_the_parity_table_names_exist() -> None:
     assert [name for name in functions if not hasattr(threads, name)] == []
 
 
+@pytest.mark.thorough
 def test_what_is_said_of_an_attribute_is_not_taken_for_its_type() -> None:
     """Sphinx takes the words before the first colon for one: a page of errors had lines such as "Type: It says so"."""
     code = """

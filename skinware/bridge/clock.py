@@ -40,8 +40,6 @@ class Exchange:
     """Bounds of our clock minus the other one, from a question and its answer.
 
     Attributes:
-        at_ns: the moment, by our clock.
-        low_ns, high_ns: the bounds.
         round_trip_ns: without the time that the other end took.
     """
 
@@ -144,9 +142,6 @@ class Pinger:
 
     ``on_sample`` gets the bounds of a round: in the receiving thread with the last answer, or, if some answers do not
     come, when the next round begins.
-
-    Attributes:
-        asked_ns: when the last round began.
     """
 
     def __init__(self, link: Link, who: str, on_sample: Callable[[Exchange], None], guard: Guard) -> None:

@@ -203,7 +203,6 @@ def why_unreachable(endpoint: str, tls: Path | None) -> str:
 
     Args:
         endpoint: ``tcp/HOST:PORT`` or ``tls/HOST:PORT``.
-        tls: folder with our certificates.
 
     Returns:
         The reason why it fails, in one line; empty if it succeeds.

@@ -33,7 +33,6 @@ class Question:
     """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
 
     Attributes:
-        reply: sends the answer.
         fail: sends the reason why there is no answer.
     """
 
@@ -248,9 +247,6 @@ class Guard:
     """Counts messages that cannot be read or used.
 
     ``report`` gets (kind of message, reason) for the first message of each kind, in the thread that found it.
-
-    Attributes:
-        last: kind and reason of the last one; empty: none so far.
     """
 
     def __init__(self, report: Callable[[str, str], object] = lambda _kind, _why: None) -> None:

@@ -84,12 +84,9 @@ class Services(msgspec.Struct, frozen=True):
     """All services of a robot.
 
     Attributes:
-        instance: number of the bridge that serves them.
         start: boot of the machine, and namespace; another one has another clock and other generations.
         callers: names of the certificates that may call; empty: all.
-        services: by name.
         missing: parts of a wish that do not exist, in one line; empty: none.
-        host: name of the machine, for people.
     """
 
     instance: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
@@ -134,9 +131,8 @@ class DriverSummary(msgspec.Struct, frozen=True):
         state: ``live``, ``paused``, ``closed`` or ``dead``.
         rate_hz: frames in the last second.
         age_ms: age of the newest data in its newest frame, on the robot; None before the first.
-        lost: frames lost on its buses since it started.
+        dropped: frames dropped on its buses since it started.
         sensors, fresh: number of sensors, and of those whose value is good and new.
-        patches: number of patches.
         silent: names of the first patches that do not send.
         n_silent: number of patches that do not send.
         problems: 1 if the driver is not live, else the number of its buses and patches that are not.
@@ -145,7 +141,7 @@ class DriverSummary(msgspec.Struct, frozen=True):
     state: State
     rate_hz: _Figure
     age_ms: _Figure | None
-    lost: _Count
+    dropped: _Count
     sensors: _Count
     fresh: _Count
     patches: _Count
@@ -158,17 +154,14 @@ class Summary(msgspec.Struct, frozen=True):
     """Summary of a robot.
 
     Attributes:
-        namespace: that is served.
-        drivers: by name.
         services: number of services that are no drivers.
-        lost: frames that the bridge missed in their rings.
-        host: name of the machine, for people.
+        missed: frames that the bridge missed in their rings.
     """
 
     namespace: _Name
     drivers: Annotated[dict[_Name, DriverSummary], msgspec.Meta(max_length=LIMITS.services)] = {}
     services: _Count = 0
-    lost: _Count = 0
+    missed: _Count = 0
     host: _Word = ""
 
 
@@ -187,7 +180,6 @@ class CallResult(msgspec.Struct, frozen=True):
 
     Attributes:
         generation, sequence: a frame that was published after the operation, by the robot's count; 0: none.
-        result: the value that the operation returned.
         error: in words; None: the call succeeded.
         why: kind of error: ``refused``, ``failed``, ``paused``, ``cancelled``.
     """
@@ -282,7 +274,6 @@ class FrameMessage(NamedTuple):
     Attributes:
         form: ``RAW`` or ``CODED``.
         content: the slot, or the coded frame.
-        keeps: the receiver is to keep the frame.
     """
 
     form: int

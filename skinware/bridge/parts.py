@@ -57,12 +57,7 @@ class Cut:
     """Some sensors of a generation of a driver, with their modules, patches and buses.
 
     Args:
-        whole: the generation.
         positions: (n,) of the sensors that stay, in a frame, ascending.
-
-    Attributes:
-        generation: of the same number, with what stays.
-        file: of that generation.
 
     Raises:
         StructureError: it is not a driver, or no sensor stays.
@@ -172,7 +167,6 @@ class RobotPart:
             self._streams[name].take(frame)
 
     def find(self, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of this part of a driver."""
         _, cut = self._cuts.get(name, (None, None))
         return None if cut is None else (cut.file, self._streams[name])
 
@@ -216,7 +210,6 @@ class Parts:
             return part
 
     def find(self, number: str, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of a driver's part."""
         part = self._parts.get(number)
         return None if part is None else part.find(name)
 

@@ -65,7 +65,6 @@ class Jobs:
                 os.eventfd_write(self.fd, 1)
 
     def run(self) -> None:
-        """Do all jobs that wait."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         for _ in range(len(self._jobs)):
@@ -114,7 +113,6 @@ class Bridges:
         instance, host, start: of the one that is followed, as in :class:`Services`; empty: none so far.
         switches: how often another robot of this name took the place of the first.
         there: numbers of all that are there.
-        other_robots: names of robots that other bridges serve.
     """
 
     instance: str = ""
@@ -135,8 +133,6 @@ class Peer:
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
-        is_connected: the robot is heard.
-        since_ns: when that began.
         guard: counts its messages that cannot be read.
     """
 

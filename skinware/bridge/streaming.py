@@ -67,10 +67,6 @@ class FrameStream:
     """Sends the frames of a service: each to listeners, the newest to pullers.
 
     ``soon`` calls a function in the only thread that codes.
-
-    Attributes:
-        frames: number of frames so far.
-        newest: the newest frame; None: none of this generation so far.
     """
 
     def __init__(self, send: Sender, soon: Callable[..., None]) -> None:

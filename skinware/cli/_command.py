@@ -153,10 +153,6 @@ def regions_option(command: _Decorated) -> _Decorated:
 def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
     """Return the regions of files, or of the default file.
 
-    Args:
-        files: to read; empty: the default one.
-        names: of regions that must be in them.
-
     Raises:
         ConfigurationError: a file cannot be read, or a region is missing.
     """
@@ -220,7 +216,6 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     SIGTERM ends a command as Ctrl-C does.
 
     Args:
-        command: to run.
         goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
 

@@ -76,7 +76,6 @@ def labels_of(places: Sequence[TouchedPlace], arrangement: Arrangement) -> dict[
 
     Args:
         places: the contacts; contacts outside the picture have no label.
-        arrangement: of the picture.
     """
     labels: dict[int, list[Label]] = {}
     for place in places:

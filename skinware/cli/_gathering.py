@@ -31,8 +31,6 @@ def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]
     """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
 
     Args:
-        structure: of the driver.
-        type_name: of the sensors.
         coverage: (n,) 0 to 1 for each sensor.
     """
     patch = structure.patch_of(type_name)
@@ -48,10 +46,7 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
     """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage.
 
     Args:
-        structure: of the driver.
-        type_name: of the sensors.
         coverage: (n,) 0 to 1 for each sensor.
-        width: of the terminal.
     """
     drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
     of_sensor = np.zeros(structure.n_sensors)
@@ -68,13 +63,6 @@ def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float
 
 
 def finding_data(finding: Finding, structure: Structure, type_name: str) -> dict[str, Any]:
-    """Return a finding for programs.
-
-    Args:
-        finding: about sensors of one type.
-        structure: of the skin.
-        type_name: of the sensors.
-    """
     return {
         "kind": finding.kind,
         "modules": [structure.module_names[number] for number in finding.modules],
@@ -117,18 +105,7 @@ class Gathering:
     """Take the snapshots of a driver into a session, and report the progress.
 
     Args:
-        reader: of the driver.
-        session: that gathers.
-        source: of the loads.
-        poses: of the presses; None: the session needs none.
-        state_path: file of gathered data.
         fresh: begin with nothing, and ignore that file.
-        as_json: print JSON, not text.
-
-    Attributes:
-        structure: of the driver.
-        type_name: of the sensors.
-        restored: whether it continues with the data of the state file.
 
     Raises:
         ConfigurationError: the data of the state file do not fit.
@@ -159,7 +136,6 @@ class Gathering:
         Gathered data are in the state file afterwards, also after Ctrl-C.
 
         Args:
-            what_to_do: for the person.
             share: part of the sensors that is enough, 0 to 1.
             duration_s: longest time after the baselines are known; None: no limit.
 

@@ -192,8 +192,6 @@ def segments_of(
     Args:
         upper: (columns,) uint8, codes of the pixels in the upper half of the line.
         lower: (columns,) uint8, codes of the pixels in the lower half.
-        labels: words to put in.
-        palette: the terminal's.
     """
     pairs = upper.astype(np.uint16) << 8 | lower
     edges = (np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist()
@@ -253,8 +251,6 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
 
     Args:
         values: of the lowest level, of the middle one if it is wanted, and of the highest.
-        unit: of the values.
-        palette: the terminal's.
     """
     first, *others = map(figure_text, values)
     text = Text(f"{first} ", no_wrap=True)
@@ -275,7 +271,6 @@ def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
 
     Args:
         marks: (n,) uint8, marks of all sensors that are drawn.
-        palette: the terminal's.
     """
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
     fresh = counts[heat.FRESH] + counts[heat.UNMOVED]  # a stuck sensor is fresh, too
@@ -317,9 +312,7 @@ class HeatMap(ScrollView, can_focus=False):
         """Draw the lines that changed.
 
         Args:
-            arrangement: of the sensors.
             pixels: (2 * lines, columns) uint8 from ``arrangement.draw``; not changed afterwards.
-            marks: words over sensors, by line.
         """
         before = self._pixels if arrangement is self._arrangement else None
         moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}

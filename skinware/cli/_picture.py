@@ -40,9 +40,6 @@ def change_levels(
 
     Args:
         change: (n,) physical, 0 or more.
-        noise: nothing is shown up to here.
-        span: change of the highest level.
-        before: the levels drawn so far.
     """
     felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
     return levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before), (0.0, span / 4, span)
@@ -54,7 +51,6 @@ class Picture:
     Args:
         type_name: the type to draw where there is one of this name; otherwise each driver's first.
         scale_name: the first meaning of the colours, one of ``SCALES``.
-        palette: of the terminal.
         regions: that a person may choose from; None: there are none.
         region: draw only sensors in this one at first; None: all.
 
@@ -62,8 +58,6 @@ class Picture:
         scale_name: the meaning of the colours: ``change`` from rest, the type's ``range``, ``raw`` counts.
         arrangement: places of sensors; None before the first ``draw``.
         pixels: (2 * lines, columns) uint8, codes of the pixels last drawn.
-        title: of the picture.
-        scale: the colours with their values.
         marks: the meaning of the characters, with the number of sensors for each.
     """
 
@@ -109,12 +103,6 @@ class Picture:
         self._region = names[(names.index(self._region) + 1) % len(names)]
 
     def regions_of(self, driver: str, position: int) -> list[str]:
-        """Return the names of the regions of a sensor.
-
-        Args:
-            driver: that was drawn.
-            position: of the sensor in a snapshot.
-        """
         structure = self._memories[driver].structure
         in_regions = self._in_regions(driver, structure, _type_of(structure, position).name)
         return [name for name, is_inside in in_regions.items() if is_inside[position]]
@@ -161,10 +149,6 @@ class Picture:
         """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts.
 
         Args:
-            key: of the row.
-            frame: the snapshot of its driver.
-            width: columns of the space.
-            height: lines of the space.
             life: what the driver is doing; nothing is fresh where no news comes.
         """
         structure = frame.structure

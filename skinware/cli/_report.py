@@ -36,10 +36,6 @@ SampleT = TypeVar("SampleT", bound=Sample)
 def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
     """Return everything that can be seen of a namespace, as ``skin-info --json`` prints it.
 
-    Args:
-        namespace: to show.
-        only: name of the only service to show.
-
     Raises:
         ServiceNotFound: no service has the name ``only``.
         NamespaceError: the namespace cannot be trusted or read.
@@ -263,10 +259,6 @@ def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> 
 
 def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any]:
     """Return the health of all sensors that services publish, as ``skin-info --health --json`` prints it.
-
-    Args:
-        namespaces: to look in.
-        driver: name of the only driver to show.
 
     Raises:
         NamespaceError: a namespace cannot be trusted or read.

@@ -34,9 +34,6 @@ _AT_THE_END_S = 1.0
 class PatientStream(io.TextIOBase):
     """Accept text at once, and write it when the reader takes it.
 
-    Args:
-        stream: to write to.
-
     Attributes:
         left_out: writes that were left out because too much text waited.
     """
@@ -124,7 +121,6 @@ class PatientStream(io.TextIOBase):
             os.close(fd)
 
     def _write(self, data: bytes) -> int:
-        """Write without waiting, and return the number of bytes."""
         if self._own_fd is not None:
             try:
                 return os.write(self._own_fd, data)

@@ -302,14 +302,7 @@ def _opened(
     how: _How,
     poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[Gathering, Any]]:
-    """Yield a gathering, with driver and poses open, and its session.
-
-    Args:
-        state_path: file of gathered data.
-        session_of: makes a session for a number of sensors.
-        how: options of all commands that gather.
-        poses: service, its namespace, column and shape.
-    """
+    """Yield a gathering, with driver and poses open, and its session."""
     from skinware.cli._gathering import Gathering
     from skinware.memory.namespace import Namespace
     from skinware.service import ServiceReader

@@ -30,11 +30,7 @@ _BAR = 20
 
 
 class Terminal:
-    """The keys and the line of progress; without a terminal, or in its background, there are none.
-
-    Args:
-        replayer: controlled by the keys.
-    """
+    """The keys and the line of progress; without a terminal, or in its background, there are none."""
 
     def __init__(self, replayer: Replayer) -> None:
         self._replayer = replayer

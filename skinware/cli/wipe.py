@@ -66,23 +66,17 @@ def command(
 
 
 class _Wipe:
-    """Run a wipe test and report it.
-
-    Args:
-        reader: of the driver.
-        type_name: of the sensors; None: the driver's first type.
-        as_json: print JSON, not text.
-    """
+    """Run a wipe test and report it."""
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 
-        from skinware.views.history import Rest, WipeTest
+        from skinware.views.history import DriverRest, WipeTest
 
         self._reader, self._as_json = reader, as_json
         self._structure = reader.structure
         self._type = self._structure.types[0] if type_name is None else self._structure.type(type_name)
-        self._rest, self._test = Rest(self._structure), WipeTest(self._structure)
+        self._rest, self._test = DriverRest(self._structure), WipeTest(self._structure)
         self._status = np.zeros(self._structure.n_sensors, np.uint8)
         self._is_redrawing = not as_json and sys.stdout.isatty()
 

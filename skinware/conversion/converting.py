@@ -16,7 +16,7 @@ from skinware.conversion.arrays import write_hdf5, write_npz
 from skinware.conversion.mcap_files import ros2_without, viewers_without, write_foxglove, write_recording, write_ros2
 from skinware.conversion.rows import csv_without, write_csv, write_parquet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Source, Table
+from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording import Recording
 from skinware.recording.wire import Chosen, Exported, export_candump, export_pcapng
@@ -26,14 +26,13 @@ class Format(NamedTuple):
     """A format of files or folders.
 
     Attributes:
-        suffix: of its files or folders.
         write: writes a source to a path that does not exist.
         without: returns a line for each thing of a source that the format cannot hold.
     """
 
     suffix: str
-    write: Callable[[Source, Path], None]
-    without: Callable[[Source], list[str]] = lambda _: []
+    write: Callable[[TableSource, Path], None]
+    without: Callable[[TableSource], list[str]] = lambda _: []
 
 
 FORMATS = {
@@ -135,7 +134,7 @@ def begun_beside(target: Path) -> Iterator[Path]:
 class Watched(DerivedSource):
     """A source that counts its samples as they are written, and ends when it is stopped."""
 
-    def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:
+    def __init__(self, source: TableSource, is_stopped: Callable[[], bool]) -> None:
         self.frames: Counter[str] = Counter()
         super().__init__(source, [_WatchedTable(table, self.frames, is_stopped) for table in source.tables])
 
@@ -149,7 +148,6 @@ class _WatchedTable(Table):
         self._table, self._frames, self._is_stopped = table, frames, is_stopped
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         self._frames[self.name] = 0
         for block in self._table.blocks(names):
             if self._is_stopped():

@@ -29,7 +29,6 @@ class Cdr:
 
         Args:
             code: of :mod:`struct`: ``I``, ``q``, ``?`` ...
-            values: of the fields.
         """
         self._align(struct.calcsize(f"<{code}"))
         self._append(struct.pack(f"<{len(values)}{code}", *values))
@@ -61,7 +60,6 @@ class Cdr:
 
         Args:
             time_ns: wall clock.
-            frame: coordinate frame.
         """
         return self.numbers("i", time_ns // NS_PER_S).numbers("I", time_ns % NS_PER_S).text(frame)
 
@@ -181,7 +179,6 @@ def acquired_ns(frame: DriverSnapshot, time_ns: int) -> int:
     """Return when the newest data of a sample was acquired, wall clock; without data the time of publication.
 
     Args:
-        frame: it.
         time_ns: when it was published, wall clock.
     """
     return time_ns - (frame.published_ns - frame.acquired_ns if frame.acquired_ns else 0)
@@ -191,7 +188,6 @@ def skin_frame(frame: DriverSnapshot, time_ns: int, status: npt.NDArray[np.uint8
     """Return all values of a sample as ``skinware_msgs/SkinFrame``.
 
     Args:
-        frame: it.
         time_ns: when it was published, wall clock.
         status: (n_sensors,) of the sensors; default: as of the frame.
     """
@@ -208,9 +204,6 @@ def sensors(structure: Structure, names: Sequence[str], generation: int, time_ns
     """Return the sensors of a generation as ``skinware_msgs/Sensors``.
 
     Args:
-        structure: of it.
-        names: of the sensors, as people know them.
-        generation: its number.
         time_ns: wall clock.
     """
     types = {each.id: each for each in structure.types}

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -69,7 +70,6 @@ class ArrayFormat(NamedTuple):
 
     Attributes:
         shape: () for one number.
-        dtype: of its numbers.
     """
 
     shape: tuple[int, ...]
@@ -85,11 +85,7 @@ class Table(ABC):
 
     Args:
         name: of the table: the service's, with ``@2`` for its second part.
-        service: name of the service.
         generations: of its samples, by number; all have the same columns and tables.
-
-    Attributes:
-        name, service, generations: as given.
     """
 
     def __init__(self, name: str, service: str, generations: Sequence[Generation]) -> None:
@@ -132,7 +128,7 @@ def sensor_names(structure: Structure) -> list[str]:
     return [str(name) for name in names]
 
 
-class Source(Protocol):
+class TableSource(Protocol):
     """A file that is converted."""
 
     path: Path
@@ -156,14 +152,9 @@ class Source(Protocol):
 
 
 class DerivedSource:
-    """A source with other tables than the one that it stands for.
+    """A source with other tables than the one that it stands for."""
 
-    Args:
-        source: everything but the tables.
-        tables: made of the source's.
-    """
-
-    def __init__(self, source: Source, tables: Sequence[Table]) -> None:
+    def __init__(self, source: TableSource, tables: Sequence[Table]) -> None:
         self._source = source
         self.path: Path = source.path
         self.start_ns: int = source.start_ns
@@ -171,7 +162,6 @@ class DerivedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`Source`."""
         return self._source.events
 
     @property
@@ -191,9 +181,6 @@ class Output:
     """An array to write: one of a table's, or computed from them.
 
     Attributes:
-        name: in the file.
-        format: of a row.
-        unit: of its numbers, for people.
         needs: names of the table's arrays that it is computed from.
         of: computes it from a block of these.
     """
@@ -207,7 +194,7 @@ class Output:
 
 def outputs(table: Table) -> list[Output]:
     """Return all arrays of a table, and ``physical/TYPE``, values in its unit, for each sensor type."""
-    found = [Output(name, each, _unit(table, name), (name,), _itself(name)) for name, each in table.arrays.items()]
+    found = [Output(name, each, _unit(table, name), (name,), itemgetter(name)) for name, each in table.arrays.items()]
     structure = table.structure
     if structure is not None:
         values = COLUMNS + "values"
@@ -279,10 +266,6 @@ def _unit(table: Table, name: str) -> str:
     return table.origin.schema.columns[column].unit or ("ns" if column.endswith("_ns") else "")
 
 
-def _itself(name: str) -> Callable[[Block], npt.NDArray[Any]]:
-    return lambda block: block[name]
-
-
 def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDArray[Any]]:
     return lambda block: structure.physical(block[COLUMNS + "values"], type_name)
 
@@ -295,7 +278,6 @@ class RecordedTable(Table):
         self._part, self._start_ns, self._span = part, recording.start_ns, span
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """See :class:`Table`."""
         columns = [name.removeprefix(COLUMNS) for name in names if name.startswith(COLUMNS)]
         start_s = (self._span.begin_ns - self._start_ns) / NS_PER_S
         end_s = (self._span.end_ns - self._start_ns) / NS_PER_S
@@ -316,7 +298,6 @@ class RecordedSource:
     """A recording.
 
     Args:
-        path: of the file.
         start_s, end_s: part of its time, s since it began; None: to its end.
 
     Raises:
@@ -342,7 +323,7 @@ class RecordedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.Source`."""
+        """See :class:`skinware.conversion.tables.TableSource`."""
         return self._in_span(self._recording.events)
 
     @property

@@ -114,9 +114,6 @@ class ProcessWatch(Descriptor):
 
     Where nothing can be known (another pid namespace, a ``/proc`` of another one, a kernel before 5.3, no descriptor
     left), it has not ended: the lock alone decides.
-
-    Args:
-        process: which; None: none, of which nothing can be known.
     """
 
     def __init__(self, process: Process | None) -> None:

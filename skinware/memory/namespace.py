@@ -20,7 +20,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
 
 
 def is_name(name: str) -> bool:
-    """Return whether a service or a namespace can have a name."""
     return _NAME.fullmatch(name) is not None
 
 

@@ -34,14 +34,11 @@ class Turns(NamedTuple):
     """The turns that C took since they were last settled.
 
     Attributes:
-        frames: samples taken.
-        lost: samples missed.
         last: sequence of the last sample taken.
-        over: the turns that are over.
     """
 
     frames: int
-    lost: int
+    missed: int
     last: int
     over: list[Turn]
 
@@ -50,8 +47,6 @@ class RingReader(Generic[SampleT]):
     """The reader's end of one generation: it reads only, takes no lock, and the writer does not know it.
 
     Args:
-        segment: the attached generation.
-        frame_class: class of the samples it hands out.
         context: what every sample carries as ``context``.
     """
 
@@ -147,8 +142,8 @@ class RingReader(Generic[SampleT]):
         state = self.state_in_c
         if not (state.frames or state.noted):
             return None
-        settled = Turns(state.frames, state.lost, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
-        state.frames = state.lost = state.noted = 0
+        settled = Turns(state.frames, state.missed, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
+        state.frames = state.missed = state.noted = 0
         return settled
 
     def end_turn(self) -> tuple[int, int] | None:

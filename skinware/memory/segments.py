@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory import file_layout, futex
-from skinware.memory.file_layout import Layout
+from skinware.memory.file_layout import FileLayout
 from skinware.memory.futex import fence
 from skinware.memory.locks import Descriptor, Process, ProcessWatch, has_ended, is_locked, this_process, try_lock
 from skinware.memory.namespace import Namespace
@@ -35,9 +35,7 @@ class Segment:
     """A mapped generation. Arrays keep the map alive; it is never unmapped under them.
 
     Attributes:
-        path: file name, for messages.
         header: header row (:data:`file_layout.HEADER`).
-        layout: where the columns are.
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
         maker: answers a reader whether the process that made it has ended.
@@ -47,7 +45,7 @@ class Segment:
 
     path: str
     header: np.void
-    layout: Layout
+    layout: FileLayout
     data: npt.NDArray[np.uint8]
     descriptor: Descriptor
     inode: tuple[int, int]
@@ -161,7 +159,7 @@ def create(
 def _write_head(
     data: npt.NDArray[np.uint8],
     header: npt.NDArray[np.void],
-    layout: Layout,
+    layout: FileLayout,
     static: Mapping[str, npt.NDArray[Any]],
 ) -> None:
     """Write what is before the slots, but for what changes while a writer runs."""
@@ -261,7 +259,6 @@ def recorded(head: bytes, name: str) -> Segment:
 
     Args:
         head: its bytes.
-        name: for messages.
 
     Raises:
         BadServiceFile: they are not a head that can be read safely.
@@ -278,11 +275,6 @@ def recorded(head: bytes, name: str) -> Segment:
 
 def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray[Any]]) -> bytes:
     """Return the head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
-
-    Args:
-        segment: the generation.
-        schema: of the columns of its slots.
-        static: its tables.
 
     Raises:
         ConfigurationError: the format cannot hold them.
@@ -342,7 +334,7 @@ def _not_found(namespace: Namespace, name: str) -> str:
 
 
 def _header(
-    name: str, layout: Layout, digest: bytes, kind: str, period_ns: int, published_before: int
+    name: str, layout: FileLayout, digest: bytes, kind: str, period_ns: int, published_before: int
 ) -> npt.NDArray[np.void]:
     header = np.zeros(1, file_layout.HEADER)
     header["magic"] = file_layout.MAGIC

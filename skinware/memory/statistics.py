@@ -22,7 +22,6 @@ class Spread(msgspec.Struct):
     Attributes:
         count: how often it was timed.
         best_ns, worst_ns: extremes; 0 as long as ``count`` is.
-        total_ns: sum.
     """
 
     count: int = 0
@@ -74,7 +73,6 @@ class WriterStatistics(msgspec.Struct):
     """Figures that a writer counts in one generation of its service.
 
     Attributes:
-        published: samples.
         missed_periods: periods in which it published nothing because it was late.
         before_boot: samples whose ``acquired_ns`` lay before this machine booted, and counts as 0.
         ahead: samples whose ``acquired_ns`` lay more than 0.2 s in the future, so that nothing in them is fresh.

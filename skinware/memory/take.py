@@ -35,9 +35,6 @@ class Turn(NamedTuple):
     """One turn of a loop that takes samples.
 
     Attributes:
-        acquired_ns: ``acquired_ns`` of its sample.
-        taken_ns: when the sample was handed out.
-        ended_ns: when the loop came back.
         cpu_ns: CPU time of the thread at the end; 0 if it was not asked for.
     """
 
@@ -71,7 +68,7 @@ class ReaderState(RingWords):
         ("descriptor", ctypes.c_int64),
         ("writer", ctypes.c_int64),
         ("frames", ctypes.c_uint64),
-        ("lost", ctypes.c_uint64),
+        ("missed", ctypes.c_uint64),
         ("acquired_ns", ctypes.c_int64),
         ("taken_ns", ctypes.c_int64),
         ("noted", ctypes.c_uint64),
@@ -104,9 +101,6 @@ class TakeState(ctypes.Structure):
 
 class FramePool(Generic[SampleT]):
     """Samples to be filled by C: one of each ring, all in one piece of memory. Not for several threads at once.
-
-    Args:
-        rings: whose samples.
 
     Attributes:
         starts: where each sample begins in the memory, bytes.
@@ -149,7 +143,6 @@ class Take(Generic[SampleT]):
 
     Args:
         rings: 1 to :data:`skinware.memory.futex.MAX_WORDS`.
-        pool: where samples are put.
         is_loop: it is the loop of one reader, whose turn ends with the next call.
     """
 

@@ -23,7 +23,6 @@ class Clocks(NamedTuple):
     """Clocks of the machine at one moment, ns.
 
     Attributes:
-        monotonic_ns: CLOCK_MONOTONIC, the time of samples.
         realtime_ns: CLOCK_REALTIME, the wall clock.
         boottime_ns: CLOCK_BOOTTIME: CLOCK_MONOTONIC plus the time in which the machine was suspended.
     """
@@ -46,9 +45,6 @@ def read_clocks() -> Clocks:
 
 class TimeAxis:
     """The times of a recording's messages.
-
-    Args:
-        read: reads the clocks.
 
     Attributes:
         clocks: the last reading.

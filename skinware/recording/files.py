@@ -19,7 +19,7 @@ from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import ClosedChunk, McapFile, OpenChunk
-from skinware.transfer.codec import Encoder
+from skinware.transfer.codec import FrameEncoder
 
 _REPEATED_AFTER_NS = 60 * NS_PER_S
 _REPEATED_AFTER_BYTES = 64 << 20
@@ -31,7 +31,6 @@ class Head:
     """The message that describes a generation, written before the first chunk with its samples.
 
     Attributes:
-        channel, schema: of the message.
         sequence: number of the generations of the service before it.
         data: the service's file up to its slots.
     """
@@ -65,7 +64,6 @@ class Target(Protocol):
         """Add a chunk.
 
         Args:
-            chunk: the chunk.
             heads: descriptions of the generations of its samples.
 
         Raises:
@@ -158,7 +156,7 @@ class PendingChunk:
         schema: Schema,
         sample: Sample,
         time_ns: int,
-        encoder: Encoder,
+        encoder: FrameEncoder,
         head: Head,
         wall_ns: int | None = None,
     ) -> None:
@@ -220,7 +218,6 @@ class Files:
         return self._max_size is not None and self._split_size is None and self.size >= self._max_size
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
-        """See :class:`Target`."""
         if self._split_size is not None and self._file.file.size >= self._split_size:
             self._file.finish()
             self._ended.append(self._file.file)
@@ -232,14 +229,12 @@ class Files:
             self._ended.popleft().path.unlink(missing_ok=True)
 
     def check(self) -> None:
-        """See :class:`Target`."""
         self._file.file.check()
 
     def save(self) -> None:
         """Do nothing: every chunk is written at once."""
 
     def finish(self) -> None:
-        """See :class:`Target`."""
         self._file.finish()
 
     @property
@@ -289,7 +284,6 @@ class Past:
         return False
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
-        """See :class:`Target`."""
         self._chunks.append((chunk, tuple(heads)))
         while self._chunks[0][0].end_ns < chunk.end_ns - self._duration_ns:
             self._chunks.popleft()
@@ -323,8 +317,6 @@ class Recovered:
     """The result of a recovery.
 
     Attributes:
-        messages: number in the new file, by topic.
-        damaged: number of damaged chunks.
         was_whole: the file had its summary, and no chunk was damaged.
     """
 
@@ -337,7 +329,6 @@ def recover(source: Path, target: Path) -> Recovered:
     """Copy the undamaged chunks of a recording into a new file, which appears when it is complete.
 
     Args:
-        source: the recording; it is only read.
         target: the new file; it may replace the old one, but no other.
 
     Raises:

@@ -41,14 +41,11 @@ class Damaged(Exception):
     """A chunk or the summary is not as it was written."""
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """One message.
 
     Attributes:
-        channel_id: number of its channel.
-        sequence: number of the message.
         time_ns: time of publication, on the axis that orders the file (``log_time``).
-        data: contents.
     """
 
     channel_id: int
@@ -62,7 +59,6 @@ class ChunkPlace:
     """The place of a chunk in its file.
 
     Attributes:
-        offset: of its record.
         start_ns, end_ns: times of its first and last message.
         size: bytes of its contents.
         compressed_at, compressed_size: place of its compressed contents.
@@ -86,29 +82,19 @@ class ChunkPlace:
 
 @dataclass
 class ChunkContents:
-    """The contents of a chunk.
-
-    Attributes:
-        channels, schemas: by id.
-        messages: in the order in which they were written.
-    """
+    """The contents of a chunk."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
-    messages: list[Message] = field(default_factory=list)
+    messages: list[McapMessage] = field(default_factory=list)
 
 
 class McapSource:
     """An open MCAP file.
 
-    Args:
-        path: of the file.
-        limits: bounds for the size of its chunks.
-
     Attributes:
         is_whole: it ends with a summary that fits it.
         chunks: places of its chunks, in the order of the file; without a summary only those that are whole.
-        channels: by id.
         damaged: number of damaged chunks found so far.
         refused: a line for each chunk that claims more bytes than the limits allow.
 
@@ -282,7 +268,7 @@ def _parsed(data: bytes, limits: Limits) -> ChunkContents:
             channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
             if time_ns > limits.time_ns:
                 raise Damaged("a message has a time that no clock has")
-            contents.messages.append(Message(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
+            contents.messages.append(McapMessage(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
         elif opcode == Opcode.CHANNEL:
             channel = _read(Channel, record)
             contents.channels[channel.id] = channel

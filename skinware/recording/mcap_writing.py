@@ -48,11 +48,7 @@ class ClosedChunk:
     """A finished chunk, ready for any file.
 
     Attributes:
-        record: bytes of the chunk and of its message indexes.
         index: its entry in the summary, for a chunk at offset 0.
-        counts: messages of each channel.
-        channels: of its messages.
-        schemas: of these channels.
     """
 
     record: bytes
@@ -98,10 +94,7 @@ class OpenChunk:
 
         Args:
             channel: its channel, the same object each time.
-            schema: schema of the channel.
-            sequence: number of the message.
             time_ns: time of publication, on the axis that orders the file (MCAP's ``log_time``).
-            data: contents.
             wall_ns: the same moment by the wall clock (MCAP's ``publish_time``); None: ``time_ns``.
         """
         if schema.id not in self._schemas:
@@ -170,9 +163,6 @@ class McapFile:
         path: of the file, which must not exist.
         profile: MCAP's name for the kind of its channels.
 
-    Attributes:
-        size: bytes in it so far.
-
     Raises:
         OSError: it cannot be made.
     """
@@ -235,7 +225,8 @@ class McapFile:
         """
         self.check()
         free = os.fstatvfs(self._fd)
-        if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * self._summary_size + _LEAST_FREE:
+        summary_size = 2048 + self._index.size
+        if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * summary_size + _LEAST_FREE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
         index = chunk.index
         moved = ChunkIndex(
@@ -280,10 +271,6 @@ class McapFile:
                 os.close(fd)
             except OSError as error:  # network file systems report a full disk late
                 raise OSError(error.errno, error.strerror, str(self.path)) from None
-
-    @property
-    def _summary_size(self) -> int:
-        return 2048 + self._index.size
 
     def _summary(self, start: int) -> Iterator[bytes]:
         statistics = Statistics(
@@ -332,11 +319,7 @@ class McapFile:
 
 
 class _Spool:
-    """Records of a summary, kept in an unnamed file beside the recording instead of in memory.
-
-    Args:
-        folder: where to make the unnamed file.
-    """
+    """Records of a summary, kept in an unnamed file beside the recording instead of in memory."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

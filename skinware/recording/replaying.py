@@ -30,16 +30,9 @@ class _Tape:
     """Moves along the moments of a recording, and publishes what was newest at each place.
 
     Args:
-        recording: the recording.
-        names: of services; None: all.
-        ahead: decodes in the background.
-        republisher: publishes samples and events.
         start_s, end_s: the part to publish, s since the recording began.
 
     Attributes:
-        start_s: beginning of the part.
-        last_s: end of the part.
-        next: the moment that is due next; None: not taken yet, or the end.
         reached_s: time of the last published moment.
     """
 
@@ -142,9 +135,6 @@ class Replayer:
     that runs the replay.
 
     Args:
-        recording: the recording to publish.
-        names: of services; None: all.
-        namespace: in which to publish them.
         speed: 2.0 is twice as fast as recorded.
         start_s: begin at this time, s since the recording began.
         end_s: end before this time; None: at the end of the recording.
@@ -258,7 +248,6 @@ class Replayer:
         self._republisher.watch(fd, call)
 
     def unwatch(self, fd: int) -> None:
-        """End a watch."""
         self._republisher.unwatch(fd)
 
     # -- operations -----------------------------------------------------------------------------------------------

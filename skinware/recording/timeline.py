@@ -21,8 +21,6 @@ class Moment(NamedTuple):
 
     Attributes:
         time_s: since the recording began.
-        service: its name.
-        frame: the sample; None for an event.
         event: ``paused``, ``live``, ``closed`` or ``dead``; empty for a sample.
     """
 
@@ -53,8 +51,6 @@ class Timeline:
     """A position between two moments of some services.
 
     Args:
-        recording: the source of the moments.
-        services: names of the services.
         ahead: decodes the next chunk in the background; None: each chunk is decoded when it is needed.
     """
 

@@ -131,8 +131,6 @@ _FOR_DRIVERS = ("values", "status", "module_time_ns")
 
 
 class ChunkSource(Protocol):
-    """A recording that has chunks."""
-
     path: Path
     start_ns: int
 
@@ -353,7 +351,6 @@ class _Request(NamedTuple):
 
     Attributes:
         origin: their generation, reduced to the sensors to read.
-        columns: names.
         positions: of these sensors in a sample; None: all.
     """
 

@@ -38,7 +38,6 @@ class Chosen:
     """The part of the wires to export.
 
     Attributes:
-        drivers: names; empty: all.
         start_s: begin at this time, s since the recording began.
         end_s: end before this time; None: at the end of the recording.
         is_stopped: called now and then; True ends the export with :class:`KeyboardInterrupt`.
@@ -66,11 +65,6 @@ class Exported:
 def export_candump(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
     """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
 
-    Args:
-        recording: a recording with wires.
-        path: of the new file.
-        chosen: the part to export; None: all.
-
     Raises:
         BadRecording: no frame of a CAN bus was recorded.
         ConfigurationError: no wire of a chosen driver was recorded.
@@ -93,11 +87,6 @@ def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None
     """Write all wires for Wireshark, with times in ns and directions.
 
     An interface of a CAN bus has the link type :data:`SOCKETCAN`, one of a serial line :data:`SERIAL`.
-
-    Args:
-        recording: a recording with wires.
-        path: of the new file.
-        chosen: the part to export; None: all.
 
     Raises:
         BadRecording: no wire was recorded.
@@ -141,8 +130,8 @@ def _export(
             wires.append((wire, name))
         else:
             exported.notes.append(f"{wire.bus} of {wire.driver} left out: the format has no serial lines")
-        if wire.lost:
-            exported.notes.append(f"{wire.bus} of {wire.driver}: {wire.lost} lost while it was recorded")
+        if wire.missed:
+            exported.notes.append(f"{wire.bus} of {wire.driver}: {wire.missed} missed while it was recorded")
     if not wires:
         what = "no frame of a CAN bus" if exported.notes else "no wire"
         raise BadRecording(f"{recording.path}: {what} was recorded: skin-record --wire records them")

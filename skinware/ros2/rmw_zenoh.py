@@ -48,7 +48,6 @@ class ZenohNode:
     It can publish without a router. Others discover it as soon as there is one, and again after the router was away.
 
     Args:
-        identity: of the node.
         connect: endpoints of routers, ``tcp/HOST:PORT``.
         router_changed: called with (is there, line for people) when the router goes or comes back, and a second after
             the start if there is none; in a thread of the node.

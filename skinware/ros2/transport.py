@@ -86,12 +86,7 @@ class MessageType:
 
 @dataclass(frozen=True)
 class ServiceType(MessageType):
-    """A type of services; its hash is that of both messages and the event together.
-
-    Attributes:
-        request: type of the question: ``std_srvs/srv/Trigger_Request``.
-        response: type of the answer.
-    """
+    """A type of services; its hash is that of both messages and the event together."""
 
     request: MessageType
     response: MessageType

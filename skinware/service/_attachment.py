@@ -29,8 +29,6 @@ class Attachment(Generic[SampleT]):
     """Attached to one service by name; goes over to its next generation when the writer comes back.
 
     Args:
-        name: the service.
-        namespace: where it is.
         timeout_s: how long to wait for it to appear; 0 for not at all, None for no limit.
 
     Raises:
@@ -119,8 +117,6 @@ class Attachment(Generic[SampleT]):
         """Have the writer do something that it declares (see ``operations``), and wait for the result.
 
         Args:
-            operation: which.
-            timeout_s: longest wait.
             arguments: of the operation, by name; anything that JSON can hold.
 
         Raises:

@@ -91,12 +91,7 @@ class PendingRequest:
 
 
 class RequestClient(ForkGuard):
-    """A connection to one service, made when it is first needed and again after the service's return.
-
-    Args:
-        namespace: where the service is.
-        name: of the service.
-    """
+    """A connection to one service, made when it is first needed and again after the service's return."""
 
     def __init__(self, namespace: Namespace, name: str) -> None:
         self.name = name

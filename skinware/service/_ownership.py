@@ -32,8 +32,6 @@ class Ownership:
     """Holds a name from its construction to ``close``, and publishes one generation after the other under it.
 
     Args:
-        name: the service.
-        namespace: where it is.
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.
@@ -236,7 +234,6 @@ class Ownership:
     def _succeed(
         self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], rate_hz: float | None = None, skip: int = 0
     ) -> None:
-        """Go on with another generation."""
         self._require_open()
         own = self._ring.segment
         period_ns = self._period_ns if rate_hz is None else round(NS_PER_S / rate_hz)

@@ -46,8 +46,6 @@ _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 @dataclass(eq=False, slots=True)
 class _Peer:
-    """A program that is connected."""
-
     connection: socket.socket
     user: int
     is_stranger: bool

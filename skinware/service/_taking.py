@@ -1,4 +1,4 @@
-"""Take the samples of a service: wait for them, and count them and those that were lost."""
+"""Take the samples of a service: wait for them, and count them and those that were missed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ class Accounts:
     With more readers than processors, what one does before it sleeps makes the next one's sample older.
 
     Args:
-        namespace, service: what is read.
         announce: let others see it, from its first sample or wait on.
     """
 
@@ -52,10 +51,10 @@ class Accounts:
         self._record.kind = kind
         self._in_loop = True
 
-    def taken(self, lost: int) -> None:
+    def taken(self, missed: int) -> None:
         self._record.frames += 1
-        if lost:
-            self._record.lost += lost
+        if missed:
+            self._record.missed += missed
 
     @property
     def due_ns(self) -> int:
@@ -63,7 +62,7 @@ class Accounts:
 
     def settle(self, turns: Turns) -> None:
         self._record.frames += turns.frames
-        self._record.lost += turns.lost
+        self._record.missed += turns.missed
         self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
 
     def end_turn(self, turn: tuple[int, int] | None) -> None:
@@ -110,7 +109,6 @@ class Taking(Attachment[SampleT]):
 
     Args:
         name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
-        announce: let others see it.
     """
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None, announce: bool) -> None:
@@ -128,7 +126,7 @@ class Taking(Attachment[SampleT]):
             published = ring.segment.published_before
             if published < taken:  # the count began again: the lock's file was removed
                 published = before.published
-            self._accounts.record.lost += published - taken
+            self._accounts.record.missed += published - taken
             self._last = (ring.generation, 0)
         super()._adopt(ring)
 
@@ -213,7 +211,7 @@ class Taking(Attachment[SampleT]):
         frame = self._ring.copy(last + 1)
         if frame is not None:
             return frame
-        for _ in range(COPY_ATTEMPTS):  # it lost some
+        for _ in range(COPY_ATTEMPTS):  # it missed some
             latest = self._ring.latest
             oldest = max(last + 1, latest - self._ring.slot_count + 2)
             for sequence in range(oldest, latest + 1):
@@ -266,9 +264,7 @@ class Taking(Attachment[SampleT]):
 
         Args:
             wanted: ``NEWER`` for the newest, or ``NEXT``.
-            timeout_ns: longest wait.
             max_age_s: as for ``read``.
-            newer_than: position of a sample.
         """
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:
@@ -312,11 +308,11 @@ class Taking(Attachment[SampleT]):
 
     def _count(self, frame: SampleT) -> None:
         last = self._last
-        lost = 0
+        missed = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
-            lost = frame.sequence - last[1] - 1
+            missed = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
-        self._accounts.taken(lost)
+        self._accounts.taken(missed)
         self._open_turn = frame.acquired_ns, now_ns()
 
 

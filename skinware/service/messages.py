@@ -30,7 +30,6 @@ class Ask(msgspec.Struct, gc=False):
 
     Attributes:
         id: unique on this connection.
-        operation: what to do.
         arguments: by name; still JSON, as decoding them takes the time.
     """
 
@@ -43,11 +42,8 @@ class Answer(msgspec.Struct):
     """From a service to a program.
 
     Attributes:
-        id: of the request.
         generation, sequence: a sample that was published after the request was carried out; 0: none was.
-        result: what the operation returned.
         error: what went wrong, None if nothing did.
-        why: kind of error.
     """
 
     id: int

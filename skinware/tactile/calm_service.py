@@ -224,7 +224,7 @@ class CalmService:
             "sequence": 0 if writer is None else writer.sequence,
             "driver_alive": self._source.alive,
             "frames": self.frames,
-            "lost": 0 if reader is None else reader.lost,
+            "missed": 0 if reader is None else reader.missed,
             "restored": self.restored,
             "ready": {name: int(stage.baseline.ready.sum()) for name, stage in stages.items()},
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},

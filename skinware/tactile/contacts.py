@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
@@ -23,15 +22,12 @@ from skinware.geometry import Geometry
 from skinware.structure import Structure
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
-from skinware.tactile.tracking import ContactKind, Places, Tracker, TrackingSettings
+from skinware.tactile.tracking import Blobs, ContactKind, Tracker, TrackingSettings
 
 MOST = 64
 """Most contacts of one frame; of more, those with the largest loads are kept."""
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
-
-_REACH_PITCHES = 2.3
-"""Pitches: default of ``reach_m``, a bit more than the second ring of neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +137,7 @@ class Contacts:
         geometry: places of the n taxels; None, or NaN in it: not known. Contacts then have no centre.
         module: (n,) int, module of each taxel; touched taxels without neighbours are one contact per module.
         unit: unit of the values; forces are known where it is ``Pa``.
-        tracking: settings of the tracking; default: distances that fit the pitch of the geometry.
+        tracking: settings of the tracking.
 
     Raises:
         ConfigurationError: something is not of n taxels.
@@ -171,16 +167,25 @@ class Contacts:
         self.frames: tuple[str, ...] = tuple(names.tolist())
         self._frame = np.full(n, -1, np.int64)
         self._frame[known] = number
-        self._tracker = Tracker(n, tracking or _tracking(geometry))
+        pitch = pitch_m(geometry)
+        median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
+        self._tracker = Tracker(self._position_m, median_m, tracking)
 
     @classmethod
-    def of(cls, structure: Structure, type_name: str, neighbours: npt.NDArray[Any] | None = None) -> Self:
+    def of(
+        cls,
+        structure: Structure,
+        type_name: str,
+        neighbours: npt.NDArray[Any] | None = None,
+        tracking: TrackingSettings | None = None,
+    ) -> Self:
         """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
         Args:
             structure: structure of the driver.
             type_name: which sensors.
             neighbours: default: from their places, as far as they are known.
+            tracking: settings of the tracking.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -190,7 +195,8 @@ class Contacts:
         geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
         if neighbours is None and geometry is not None:
             neighbours = neighbours_of(geometry)
-        return cls(len(module), neighbours, geometry, module=module, unit=structure.type(type_name).unit)
+        unit = structure.type(type_name).unit
+        return cls(len(module), neighbours, geometry, module=module, unit=unit, tracking=tracking)
 
     def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
         """Return the contacts of the next frame.
@@ -217,11 +223,12 @@ class Contacts:
             taxels, contact, load = _largest(taxels, contact, load, count)
             count = MOST
         found = self._measure(taxels, contact, load, count)
-        places = Places(taxels, contact, found["load"], found["frame"], found["cop_m"])
-        found |= self._tracker.follow(places, time_ns)._asdict()
+        blobs = Blobs(taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"])
+        found |= self._tracker.follow(blobs, time_ns)._asdict()
         order = np.lexsort([found["id"], -found["age_s"]])
-        row = np.empty(count, np.int64)
-        row[order] = np.arange(count)
+        order = order[found["id"][order] > 0]
+        row = np.full(count, NO_CONTACT)
+        row[order] = np.arange(len(order))
         contact_of[taxels] = row[contact]
         columns = {name: found[name][order].astype(dtype) for name, (dtype, _) in COLUMNS.items()}
         return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
@@ -281,11 +288,3 @@ def _largest(
     number = number[contact]
     is_kept = number >= 0
     return taxels[is_kept], number[is_kept], load[is_kept]
-
-
-def _tracking(geometry: Geometry) -> TrackingSettings:
-    pitch = pitch_m(geometry)
-    if np.isnan(pitch).all():
-        return TrackingSettings()
-    median_m = float(np.nanmedian(pitch))
-    return dataclasses.replace(TrackingSettings(), reach_m=_REACH_PITCHES * median_m, fast_m=median_m)

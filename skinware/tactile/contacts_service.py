@@ -33,6 +33,7 @@ from skinware.tactile.source_service import (
     Static,
     ValueSource,
 )
+from skinware.tactile.tracking import TrackingSettings
 
 NAME = "contacts"
 
@@ -133,6 +134,7 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         driver: its name, for readers.
         neighbours: (n, k) int, as for :class:`skinware.tactile.contacts.Contacts`; default: from the places that the
             structure has.
+        tracking: settings of the tracking.
         name: of the service.
         options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`, which also lists
             the errors.
@@ -151,10 +153,12 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         *,
         driver: str = "",
         neighbours: npt.NDArray[Any] | None = None,
+        tracking: TrackingSettings | None = None,
         name: str = NAME,
         **options: Unpack[ServiceOptions],
     ) -> None:
-        self._contacts = Contacts.of(structure, type_name, neighbours)
+        self._tracking = tracking
+        self._contacts = Contacts.of(structure, type_name, neighbours, tracking)
         source = _source(structure, type_name, driver, self._contacts)
         super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
 
@@ -190,7 +194,7 @@ class ContactsWriter(SourceWriter[ContactsSource]):
             NamespaceError: shared memory is full; the old generation then goes on, too.
         """
         type_name = self.source.type_name
-        contacts = Contacts.of(structure, type_name, neighbours)
+        contacts = Contacts.of(structure, type_name, neighbours, self._tracking)
         self._restructure(_source(structure, type_name, self.source.driver, contacts))
         self._contacts = contacts
 

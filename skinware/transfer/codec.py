@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadRecording
 from skinware.limits import LIMITS
-from skinware.memory.file_layout import SLOT, Column
+from skinware.memory.file_layout import SLOT, ColumnPlace
 from skinware.memory.ring import Sample
 
 HEADER = np.dtype(
@@ -60,10 +60,8 @@ class CodedColumn:
     """How a column of a slot is coded.
 
     Attributes:
-        name: of the column.
         offset: in the slot, bytes.
         words: dtype of its words, unsigned.
-        count: of words.
         is_integer: differences are those of integers, not exclusive ors.
     """
 
@@ -74,7 +72,7 @@ class CodedColumn:
     is_integer: bool
 
     @staticmethod
-    def of(column: Column) -> CodedColumn:
+    def of(column: ColumnPlace) -> CodedColumn:
         """Return how a column of a service's column table is coded."""
         dtype = column.dtype
         if dtype.kind in "uif" and dtype.itemsize in (1, 2, 4, 8):
@@ -87,7 +85,7 @@ class CodedColumn:
         return np.frombuffer(slot, self.words, self.count, self.offset)
 
 
-class Encoder:
+class FrameEncoder:
     """Codes the frames of one generation, in order."""
 
     def __init__(self, columns: Sequence[CodedColumn]) -> None:
@@ -107,9 +105,7 @@ def encoded(frame: Sample, before: Sample | None, columns: Sequence[CodedColumn]
     """Return the message of a frame.
 
     Args:
-        frame: to be coded.
         before: the frame whose difference to it is coded; None: it becomes a key frame.
-        columns: of the slots of both.
     """
     slot, slot_before = frame.slot, None if before is None else before.slot
     after = 0 if before is None else before.sequence
@@ -159,10 +155,6 @@ def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
 class Run:
     """Messages of frames of one generation: a key frame, and frames that are each coded after the one before.
 
-    Args:
-        messages: of n frames.
-        columns: of the generation's slots.
-
     Attributes:
         headers: (n,) of :data:`HEADER`.
 
@@ -190,7 +182,6 @@ class Run:
         """Write the words of a column.
 
         Args:
-            number: of the column.
             into: (n, count) of its words' dtype; rows may lie apart.
 
         Raises:
@@ -220,7 +211,7 @@ class Run:
         return slots
 
 
-class Decoder:
+class FrameDecoder:
     """Decodes frames of one generation, each coded after one of the last two that were kept."""
 
     def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:
@@ -236,7 +227,6 @@ class Decoder:
         """Return (stride,) uint8, the slot of a frame; callers must not change it.
 
         Args:
-            message: of the frame.
             keeps: later frames may be coded after this one.
 
         Raises:

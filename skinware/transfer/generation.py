@@ -32,19 +32,13 @@ class Generation:
 
     Args:
         head: the bytes of the file up to its slots.
-        name: of the service.
 
     Attributes:
-        head, name: as given.
-        generation: its number.
         kind: of the service: ``driver``, ``data``.
-        is_driver: the service is a driver.
         context: the structure of a driver; None for other services.
         period_ns: the writer's nominal period, 0 if it has none.
-        published_before: frames of earlier generations.
         slot_count, slot_stride: number of slots, and bytes of each.
         columns: (shape, dtype, offset in the slot) of every column, by name.
-        coded: how the columns are coded.
 
     Raises:
         BadRecording: the head cannot be read, or asks for more than :data:`skinware.limits.LIMITS` allow.
@@ -97,14 +91,10 @@ class Generation:
         return self._segment.schema
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the tables, by name."""
         return self._segment.static_columns()
 
     def only(self, positions: Index) -> Generation:
         """Return the same generation of a driver with some of its sensors.
-
-        Args:
-            positions: of the sensors that stay, in a frame.
 
         Raises:
             StructureError: there are none, or it is not a driver.
@@ -128,7 +118,6 @@ def disguised(head: bytes, name: str, disguise: Callable[[str], str]) -> bytes:
 
     Args:
         head: the bytes of the service's file up to its slots.
-        name: of the service.
         disguise: returns the other name of a bus.
 
     Raises:

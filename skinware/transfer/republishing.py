@@ -49,7 +49,6 @@ class Republisher:
     By default all times of a frame are moved by the time between its two publications, so that ages stay as they were.
 
     Args:
-        namespace: where to publish.
         operations: that every service offers, also while it is paused.
         keeps_times: publish times as they were recorded.
         keeps_counts: frames keep their numbers, so that readers know what they lost even if another process published
@@ -91,9 +90,6 @@ class Republisher:
         """Publish a frame now.
 
         Args:
-            name: of the service.
-            frame: to be published.
-            generation: of the frame.
             follows: it comes after the frame before, so that another generation means a restart; otherwise only other
                 columns or tables begin a new generation.
 

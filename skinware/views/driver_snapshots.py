@@ -21,7 +21,6 @@ def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReade
     """Return a reader of a driver, or of the only one that runs.
 
     Args:
-        namespace: of the driver.
         driver: its name; None: the only one.
         how: the way to choose one, for the message.
 
@@ -44,7 +43,6 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
     """Yield the driver's newest snapshots, each once.
 
     Args:
-        reader: of the driver.
         is_over: called before each snapshot, and ten times a second while none arrives; True ends it.
 
     Raises:

@@ -18,7 +18,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
-from skinware.views.history import Past, Rest
+from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
 from skinware.views.quantities import Quantity, physical_values, quantities_of
 from skinware.views.robot import Robot
@@ -35,7 +35,6 @@ class Newest:
     """The newest snapshot of a driver, and what is known about it now.
 
     Attributes:
-        frame: the snapshot.
         status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
         calm: snapshot of the calmed driver, if it lives and has the same sensors.
         contacts, motion: on the driver; None where no service publishes them.
@@ -92,19 +91,13 @@ class ShownDriver:
 
     Args:
         number: by which viewers know it, also after a restart.
-        live: the driver.
-        namespace: of the driver.
 
     Attributes:
-        structure: of the values that are shown.
         generation: in which the driver began with this structure.
-        quantities: that can be shown.
         life: what it is doing; see :func:`skinware.state.life_of`.
         newest: its newest snapshot; None before the first.
         status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
-        past: its values of the last seconds.
-        rest: its values at rest.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
@@ -116,7 +109,7 @@ class ShownDriver:
         self.newest: Newest | None = None
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
-        self.past, self.rest = Past(self.structure.n_sensors, self.structure.dtype), Rest(self.structure)
+        self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
 
     @property
     def name(self) -> str:
@@ -140,11 +133,11 @@ class ShownDriver:
         return report_of(live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status)
 
     def take(self, frame: DriverSnapshot, services: TactileServices) -> None:
-        """Go on to a newer snapshot."""
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)
-            self.past, self.rest = Past(self.structure.n_sensors, self.structure.dtype), Rest(self.structure)
+            self.past = RecentValues(self.structure.n_sensors, self.structure.dtype)
+            self.rest = DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         self.newest = self._judged(frame, services)
@@ -189,17 +182,10 @@ class Follower:
     """All drivers of a namespace, and what services publish about them.
 
     Args:
-        namespace: of the drivers.
-        names: of those to follow; default: all.
         calm: namespace of calmed drivers; None: without it.
-        robot: under the skin.
 
     Attributes:
-        namespace, names, calm_namespace, robot: as given.
-        drivers: all drivers, by name.
-        scene: places of their taxels.
         edition: changes whenever drivers or structures change.
-        problem: why nothing can be seen; None: all is well.
     """
 
     def __init__(

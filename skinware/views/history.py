@@ -42,7 +42,6 @@ class ChangeSpan:
         Args:
             change: (k,) physical, 0 or more, of the sensors that count.
             noise: how far values move without a touch; the span is at least 8 times as large.
-            time_ns: of the frame.
         """
         passed_s = max(0, time_ns - self._time_ns) / 1e9
         self._time_ns = time_ns
@@ -80,15 +79,12 @@ def rounded_up(value: float) -> float:
     return next(step * unit for step in _STEPS if step * unit >= value * (1 - 1e-9))
 
 
-class Rest:
+class DriverRest:
     """The baseline of every sensor of a driver, and its noise.
 
     A baseline is the mean of the first second. Then it follows slowly, over a minute: a touch stays visible, drift does
     not. Pressure and force only grow when touched, and their baselines follow a lower value within a second: a sensor
     that was touched at the start is right again soon after it was let go.
-
-    Args:
-        structure: of the driver.
 
     Attributes:
         baseline: (n,) float32, physical; NaN for a sensor that had no fresh value so far.
@@ -140,13 +136,8 @@ class Rest:
         return max(float(np.median(unrest)), count)
 
 
-class Past:
-    """Values of n sensors in the last seconds.
-
-    Args:
-        n: sensors.
-        dtype: of their values.
-    """
+class RecentValues:
+    """Values of n sensors in the last seconds."""
 
     def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
         self._values: npt.NDArray[Any] = np.zeros((_FRAMES, n), dtype)
@@ -192,9 +183,6 @@ class WipeTest:
     """How far every sensor of a driver has moved while a hand goes over the whole skin.
 
     A sensor that never moved is broken, however plausible its value is.
-
-    Args:
-        structure: of the driver.
     """
 
     def __init__(self, structure: Structure) -> None:
@@ -226,12 +214,6 @@ class WipeTest:
     def save(self, folder: Path, driver: str, type_name: str, noise: float) -> Path:
         """Write a list of the sensors that never moved.
 
-        Args:
-            folder: of the new file.
-            driver: name of the driver.
-            type_name: which sensors.
-            noise: of that type, physical.
-
         Returns:
             The new file; its name contains the time.
 
@@ -256,16 +238,11 @@ def threshold(noise: float) -> float:
 
 
 class Memory:
-    """Everything that a picture of one driver remembers from snapshot to snapshot.
+    """Everything that a picture of one driver remembers from snapshot to snapshot."""
 
-    Args:
-        structure: of the driver.
-        rest: its values at rest, if others follow them too; default: its own.
-    """
-
-    def __init__(self, structure: Structure, rest: Rest | None = None) -> None:
+    def __init__(self, structure: Structure, rest: DriverRest | None = None) -> None:
         self.structure = structure
-        self.rest = rest or Rest(structure)
+        self.rest = rest or DriverRest(structure)
         self.wipe: WipeTest | None = None
         self.peak: tuple[str, Floats] | None = None
         self._spans: dict[tuple[str, str], ChangeSpan] = {}

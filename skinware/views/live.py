@@ -39,12 +39,7 @@ class _Count(NamedTuple):
 
 
 class LiveDriver:
-    """One driver and its newest snapshot.
-
-    Attributes:
-        reader: of the driver.
-        frame: its newest snapshot; None before the first.
-    """
+    """One driver and its newest snapshot."""
 
     def __init__(self, reader: DriverReader) -> None:
         self.reader = reader
@@ -86,7 +81,6 @@ class LiveDriver:
         return report_of(self.reader, self.frame, self.rate_hz, self.patch_rates_hz)
 
     def take(self, frame: DriverSnapshot) -> None:
-        """Make a snapshot the newest one."""
         counts = self._counts
         if self.frame is not None and frame.generation != self.frame.generation:
             counts.clear()
@@ -105,12 +99,7 @@ class LiveDriver:
 
 
 class LiveDrivers:
-    """The drivers of a namespace, dead ones too as long as their last snapshot can be read.
-
-    Args:
-        namespace: where to look.
-        names: of the drivers to follow; default: all.
-    """
+    """The drivers of a namespace, dead ones too as long as their last snapshot can be read."""
 
     def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
         self.namespace = namespace
@@ -153,12 +142,6 @@ class LiveDrivers:
 
 
 class LiveBridges(Drivers[BridgeReader]):
-    """The bridges of a namespace.
-
-    Args:
-        namespace: where to look.
-    """
-
     def __init__(self, namespace: Namespace) -> None:
         super().__init__(namespace, BridgeReader)
 
@@ -188,8 +171,6 @@ class TactileServices:
     """Calmed drivers, contacts and motion for the drivers of a namespace, from it and from the namespace of calm.
 
     Args:
-        drivers: of the namespace.
-        names: of the drivers that count; default: all.
         calm: namespace of calmed drivers; None: without it.
     """
 
@@ -243,11 +224,8 @@ class TouchedPlace(NamedTuple):
     """A contact, and its place on the skin.
 
     Attributes:
-        contact: from the service of contacts.
-        unit: of its load.
         sensor: position in a snapshot of the taxel nearest to its centre; of its first taxel where places are not
             known.
-        module: name of the module of that taxel.
     """
 
     contact: Contact
@@ -260,7 +238,6 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
     """Return the places of contacts, the oldest first; none if they are of other sensors than those of the driver.
 
     Args:
-        frame: the contacts; None: there are none.
         structure: of their driver now.
     """
     if frame is None:
@@ -286,11 +263,7 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
 
 
 class Overview:
-    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges.
-
-    Args:
-        namespace: to follow.
-    """
+    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges."""
 
     def __init__(self, namespace: Namespace) -> None:
         self.drivers = LiveDrivers(namespace)

@@ -17,8 +17,6 @@ Number = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
 
 
 class Next(msgspec.Struct, tag_field="op", tag="next"):
-    """Ask for the next turn."""
-
     protocol: str | None = None
 
 
@@ -66,8 +64,6 @@ class Wipe(msgspec.Struct, tag_field="op", tag="wipe"):
 
 
 class Record(msgspec.Struct, tag_field="op", tag="record"):
-    """Begin or end a recording."""
-
     action: Literal["start", "stop"]
 
 

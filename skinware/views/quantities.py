@@ -36,7 +36,6 @@ class Quantity:
         type: of the value; of three axes the one along the normal.
         index: (n,) int64, positions in a snapshot of the n sensors with the values.
         where: the same, as a slice if it is one.
-        geometry: places of the n taxels.
         axes: names of the types of the two axes within the skin; empty where the skin has no such sensors.
         shear: (n, 2) int64, positions of the sensors of these axes, -1 without one.
     """

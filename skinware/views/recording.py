@@ -21,7 +21,7 @@ _END_S = 10.0
 """Time for a recording to complete its file."""
 
 
-class Recording:
+class RecordingProgram:
     """Run ``skin-record``, one at a time.
 
     Args:
@@ -51,7 +51,7 @@ class Recording:
         """The file, its size, losses and duration; None while nothing is recorded."""
         if self._running is None:
             return None
-        figures = {name: self._report.get(name, 0) for name in ("bytes", "lost")}
+        figures = {name: self._report.get(name, 0) for name in ("bytes", "missed")}
         return {"file": str(self._file), **figures, "s": round(time.monotonic() - self._begin_s, 1)}
 
     def start(self) -> None:
@@ -112,11 +112,7 @@ _PATIENCE_NS = 2 * NS_PER_S
 
 
 class ReplayControl:
-    """Find a driver of a replay, and control the replay for viewers.
-
-    Attributes:
-        state: of the replay; None: no replay is shown.
-    """
+    """Find a driver of a replay, and control the replay for viewers."""
 
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
@@ -150,8 +146,6 @@ class ReplayControl:
         """Call an operation of the replay.
 
         Args:
-            action: name of the operation.
-            value: of its argument; None: its default.
             complain: called with the reason if the operation failed.
 
         Raises:

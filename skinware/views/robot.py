@@ -41,7 +41,6 @@ class Mesh:
 
     Attributes:
         frame: the link's coordinate frame.
-        file: of the mesh (STL).
         pose: (4, 4) of the mesh in that frame, with its scale.
     """
 
@@ -56,7 +55,6 @@ class Robot:
 
     Attributes:
         poses: (4, 4) of each frame, by name.
-        meshes: of links.
         left_out: the parts of the file that could not be used, for people.
     """
 
@@ -73,7 +71,7 @@ class _Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rpy: Triple = _NOWHERE
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
     link: tuple[_Link, ...] = ()
@@ -105,7 +103,7 @@ def _from_toml(path: Path) -> Robot:
     text = TomlText(path)
     poses: dict[str, Pose] = {}
     meshes = []
-    for number, link in enumerate(text.of_format("file of links", FORMAT, VERSION, _File).link):
+    for number, link in enumerate(text.of_format("file of links", FORMAT, VERSION, _RobotFile).link):
         pose = pose_of(link.xyz, link.rpy)
         place = text.place(("link", number))
         if not np.isfinite(pose).all():

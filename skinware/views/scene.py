@@ -30,12 +30,11 @@ _BY_KIND = {("triangle", 10): _TRIANGLE, ("fingertip", 12): _FINGERTIP}
 
 
 @dataclass(frozen=True)
-class Shape:
+class ModuleShape:
     """The places of the sensors of a module.
 
     Attributes:
         cells: one for each sensor, in the order of a snapshot.
-        rows: height.
         halves: width in halves of a sensor.
     """
 
@@ -45,7 +44,7 @@ class Shape:
 
 
 @cache
-def shape_of(kind: str, count: int) -> Shape:
+def shape_of(kind: str, count: int) -> ModuleShape:
     """Return the shape of a module.
 
     Args:
@@ -54,7 +53,7 @@ def shape_of(kind: str, count: int) -> Shape:
     """
     known = _BY_KIND.get((kind, count))
     if known is not None:
-        return Shape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
+        return ModuleShape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
     grid = filled_by(kind, count)
     if grid is not None:
         return rows_of(count, grid[1])
@@ -62,9 +61,9 @@ def shape_of(kind: str, count: int) -> Shape:
 
 
 @cache
-def rows_of(count: int, columns: int) -> Shape:
+def rows_of(count: int, columns: int) -> ModuleShape:
     cells = tuple((number // columns, 2 * (number % columns)) for number in range(count))
-    return Shape(cells, math.ceil(count / columns), 2 * columns)
+    return ModuleShape(cells, math.ceil(count / columns), 2 * columns)
 
 
 def block_columns(count: int) -> int:
@@ -124,7 +123,6 @@ class Scene:
 
     Args:
         drivers: structure and quantities of each driver, by name.
-        poses: of coordinate frames, by name.
     """
 
     def __init__(
@@ -248,7 +246,6 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
     Modules of a patch are together, in lines; patches stand side by side on shelves. The upper left corner is at 0, 0.
 
     Args:
-        structure: of the driver.
         sensors: (k,) positions in a snapshot.
     """
     position = np.zeros((len(sensors), 3), np.float32)
@@ -282,10 +279,6 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
 
 def on_shelves(sizes: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
     """Return the upper left corners of boxes that stand in lines in their order, so that all fit into a small window.
-
-    Args:
-        sizes: width and height of each.
-        gap: between them.
 
     Returns:
         The distance of each to the right and up; the first is at 0, 0, and lower ones have negative heights.

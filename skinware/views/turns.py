@@ -51,14 +51,7 @@ class Blobs:
 
 
 class Viewer:
-    """One viewer: its look, its questions, and what it has got so far.
-
-    Args:
-        follower: of the drivers that are shown.
-
-    Attributes:
-        look: its choices.
-    """
+    """One viewer: its look, its questions, and what it has got so far."""
 
     def __init__(self, follower: Follower) -> None:
         self.look = Look()

@@ -31,10 +31,7 @@ class PortAddress(NamedTuple):
     """Address of a port.
 
     Attributes:
-        name: of the port.
-        host: name or number.
         port: of TCP, 1 to 65535.
-        carrier: that begins a connection; ``tcp`` for all ordinary ports.
     """
 
     name: str

@@ -23,7 +23,7 @@ from skinware.yarp.carriers import (
     Carrier,
     Value,
     VectorMessage,
-    Word,
+    YarpWord,
     framed,
     in_text,
     of_text,
@@ -76,7 +76,6 @@ class Receiver:
     """A reader.
 
     Attributes:
-        sent: messages so far.
         passed_over: messages that it missed because it had not finished the one before.
     """
 
@@ -101,8 +100,6 @@ class OutputPort:
     """An output port; to be used in the event loop in which :meth:`open` was called.
 
     Args:
-        name: of the port.
-        server: knows the ports to which it connects.
         yarp: major version of the YARP of binary readers, 3 or 4; None: not known.
     """
 
@@ -204,7 +201,7 @@ class OutputPort:
             if command == "a":
                 answer = packed(await self._administer([str(value) for value in unpacked(data)]))
             elif command[:1] == "d":  # D expects no answer
-                answer = packed([Word("fail"), _SENDS_ONLY])
+                answer = packed([YarpWord("fail"), _SENDS_ONLY])
             elif command.startswith(("/", "!/")):
                 await self._obey(command, reader)
             caller.writer.write(answer + (framed(0) if caller.carrier.acknowledges else b""))
@@ -244,9 +241,9 @@ class OutputPort:
     async def _administer(self, words: list[str]) -> list[Value]:
         match words:
             case ["ver", *_]:
-                return [Word("ver"), 1, 2, 3]
+                return [YarpWord("ver"), 1, 2, 3]
             case ["help", *_]:
-                return [Word("many"), *_ADMINISTRATION]
+                return [YarpWord("many"), *_ADMINISTRATION]
             case ["list", "in", *_]:
                 return []
             case ["list", "out"]:
@@ -264,7 +261,7 @@ class OutputPort:
             case ["del", name, *_]:
                 said = self._remove(name)
             case _:
-                return [Word("fail"), "send [help] for list of valid commands"]
+                return [YarpWord("fail"), "send [help] for list of valid commands"]
         return [0 if said.startswith(("Added", "Removed")) else -1, said]
 
     # -- outgoing connections --------------------------------------------------------------------------------------

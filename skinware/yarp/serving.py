@@ -46,12 +46,8 @@ class Settings:
     """Settings of the ports.
 
     Attributes:
-        names: of drivers; empty: all, also later ones.
         prefix: before the names of all ports.
-        type_name: of sensors.
         full_scale: physical value that becomes 255; None: the maximum of the type.
-        regions: that have a port each.
-        host: where ports listen.
         yarp: major version of the YARP of binary readers, 3 or 4; None: they are refused.
     """
 
@@ -145,9 +141,6 @@ class YarpServer:
     """Publishes drivers as ports.
 
     Args:
-        namespace: whose drivers.
-        settings: of the ports.
-        names: where ports are registered.
         on_event: called with events (``port``, ``trouble``), as JSON has them.
 
     Raises:
@@ -174,9 +167,9 @@ class YarpServer:
         self._thread.start()
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames that were missed in their rings."""
-        return self._collector.lost
+        return self._collector.missed
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
         """Run until ``stop``; call ``each_second`` once a second."""

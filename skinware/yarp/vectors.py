@@ -70,12 +70,7 @@ def vectors_of(
     have the order of the structure.
 
     Args:
-        name: of the driver.
-        structure: of the driver.
-        driver_type: of the driver.
-        type_name: of sensors.
         full_scale: physical value that becomes 255; None: the maximum of the type.
-        regions: that have a port each.
 
     Raises:
         ConfigurationError: it has no such sensors, or their full scale is not known.

@@ -28,7 +28,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, ClassVar, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -37,12 +36,12 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Patch, check_options, taxels
+from skinware_drivers import Link, Match, Module, Options, Patch, taxels
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
+from skinware_drivers.fields import Byte, Identifier, Reply, Sentinel, SequenceNumber
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
-from skinware_drivers.link import Reply
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import SerialAdapter, Unframed
 
@@ -74,9 +73,7 @@ _TWICE = 1.5
 """Messages per period above which two hands are assumed."""
 
 
-class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class AllegroV5Options(Options, frozen=True):
     model: Annotated[
         Literal["auto", "tips", "sense"],
         Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: by the frames"),
@@ -94,9 +91,6 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
     ] = None
     learn_s: Annotated[float, Meta(description="time of listening for the model, s", gt=0)] = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):

@@ -22,16 +22,16 @@ import contextlib
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Link, Match, Module, Patch, Poll, check_options, taxels
+from skinware_drivers import Link, Match, Module, Options, Patch, Poll, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Packed, Values
+from skinware_drivers.fields import Bits, Byte, Identifier, Packed
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 
 FIRST_NODE, LAST_NODE = 11, 14
 CELLS = 24
@@ -71,9 +71,7 @@ _TOP_10 = Frame(
 )
 
 
-class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class BarrettOptions(Options, frozen=True):
     nodes: Annotated[tuple[int, ...], Meta(description="nodes with tactile cells, 11-14")] = (11, 12, 13, 14)
     format: Annotated[
         Literal["full", "top10"], Meta(description="all cells in 12 bits, or the ten strongest in four")
@@ -82,7 +80,7 @@ class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tact: Annotated[int, Meta(description="number of the property TACT, by firmware", ge=1, le=127)] = 106
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if not self.nodes or len(set(self.nodes)) < len(self.nodes):
             raise ConfigurationError(f"nodes {self.nodes}: give at least one, and none twice")
         if not set(self.nodes) <= set(range(FIRST_NODE, LAST_NODE + 1)):

@@ -22,7 +22,6 @@ class TextFrame:
         identifier: 11 or 29 bits.
         extended: whether the identifier has 29 bits.
         fd: flags of a CAN FD frame; None: a classic frame.
-        payload: its data.
     """
 
     time_us: int
@@ -45,7 +44,6 @@ def text_frames(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[TextFrame]:
     """Yield the frames of a batch.
 
     Args:
-        batch: CAN frames.
         epoch_offset_ns: time since 1970 minus CLOCK_MONOTONIC, ns.
     """
     rows = slice(batch.start, batch.stop)

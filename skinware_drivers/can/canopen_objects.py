@@ -18,7 +18,8 @@ from canopen.sdo.exceptions import SdoAbortedError
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
 from skinware_drivers import EXTENDED_FLAG, Link, Match, Module, Patch, Sensor
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
+from skinware_drivers.fields import Bits, Identifier, Packed
+from skinware_drivers.layout import Frame, Layout, Values
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -45,7 +46,6 @@ class SdoClient:
     """Access to one device's object dictionary; one transfer at a time.
 
     Args:
-        link: the bus.
         node: node id, 1 to 127.
     """
 
@@ -193,12 +193,7 @@ class PdoMap:
     """The frames, types and patches of all nodes of a bus.
 
     Args:
-        dictionary: the object dictionary, of any node.
-        nodes: TPDOs by node id.
         default_type: type of objects whose name contains none.
-
-    Attributes:
-        layout, types, dtype, patches: for an adapter.
 
     Raises:
         ConfigurationError: no mapped object is a number, or sensors of one type differ in scale.

@@ -16,17 +16,17 @@ from importlib import resources
 from typing import Annotated
 
 import canopen
-import msgspec
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE
-from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options
+from skinware_drivers import Link, Match, Notice, Options, Patch, Poll
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
-from skinware_drivers.link import Heard, Reply
+from skinware_drivers.fields import Reply
+from skinware_drivers.link import Heard
 from skinware_drivers.options import nearest_name
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -39,9 +39,7 @@ _MOST_ERRORS_LOGGED = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
 
-class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class CanopenOptions(Options, frozen=True):
     eds: Annotated[str, Meta(description="EDS or DCF file of the patches; default: the example's")] = ""
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127; default: all that answer")] = ()
     period_ms: Annotated[int, Meta(description="time between two updates, ms", ge=1, le=60_000)] = 20
@@ -52,7 +50,7 @@ class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     learn_s: Annotated[float, Meta(description="time in which a listener learns the nodes, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if len(set(self.nodes)) < len(self.nodes) or not set(self.nodes) <= set(range(FIRST_NODE, LAST_NODE + 1)):
             raise ConfigurationError(f"nodes {self.nodes}: give different ids of {FIRST_NODE} to {LAST_NODE}")
         if self.type not in CATALOGUE:

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Cycle, Frame, Identifier, Layout, Module, Patch, Values, check_options, taxels
+from skinware_drivers import Cycle, Frame, Identifier, Layout, Module, Options, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
 
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
@@ -28,13 +27,8 @@ QUARTERS = tuple(
 )
 
 
-class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class CyskinCpmOptions(Options, frozen=True):
     period_ms: Annotated[int, Meta(description="nominal time between two sets, ms", ge=1)] = 20
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):

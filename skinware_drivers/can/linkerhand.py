@@ -26,16 +26,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware_drivers import Identifier, Link, Match, Patch, Poll, check_options, operation
+from skinware_drivers import Identifier, Link, Match, Options, Patch, Poll, operation
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
+from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, TouchQuestion, every_layout, parts_heard
 from skinware_drivers.hand import FINGERS, Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
@@ -56,9 +55,7 @@ _TRIES, _LONGEST_QUESTION = 2, 5
 _FEWEST_ROUNDS, _SHORTEST_ROUND_S, _LONGEST_ROUND_S = 3, 0.01, 2.0
 
 
-class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class LinkerHandOptions(Options, frozen=True):
     hands: Annotated[
         tuple[int, ...], Meta(description="identifiers of the hands; default: 0x27 and 0x28, if present")
     ] = ()
@@ -79,7 +76,7 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     learn_s: Annotated[float, Meta(description="time in which a listener learns the hands, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if len(set(self.hands)) < len(self.hands) or not all(0 < hand <= LARGEST_STANDARD for hand in self.hands):
             raise ConfigurationError(f"hands {self.hands}: give different identifiers of 1 to 0x7FF")
 
@@ -264,7 +261,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return _CANDIDATES.get(kind, tuple(TOUCH))
 
 
-async def _answers(link: Link, hand: int, question: Question) -> bool:
+async def _answers(link: Link, hand: int, question: TouchQuestion) -> bool:
     timeout_s = max(_ANSWER_S, question.patience_s)
     try:
         await link.request(hand, question.payload, question.end(hand), timeout_s=timeout_s, tries=_TRIES)

@@ -36,7 +36,6 @@ class Board:
 
     Attributes:
         address: 1 to 14.
-        board_type: number of its type.
         firmware: ``1.25.0``; without the third number from a boot loader.
         protocol: version of the CAN protocol, ``2.0``; empty if it was not asked.
         is_loader: its boot loader answered, which has no skin, not its application.

@@ -23,7 +23,8 @@ from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PR
 from skinware.status import Status
 from skinware_drivers import Module, Patch, Sensor
 from skinware_drivers.can.roboskin_options import CHANNELS, Inertial, InertialSensor, RoboskinOptions
-from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Byte, Flag, Identifier, Sentinel, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 OLD_SKIN, SKIN, INERTIAL = 3, 4, 5
 """Message classes: robotology/icub-firmware-shared iCubCanProto_classes.h."""
@@ -62,7 +63,6 @@ def make_layout(options: RoboskinOptions, shortest_period_s: float) -> Layout:
     """Return the layout of a bus. A tail belongs to the frame right before it from the same board, or to none.
 
     Args:
-        options: of the bus.
         shortest_period_s: of all boards; head and tail are at most half of it apart.
     """
     # set up the old way, an MTB3 sends class 3 and an MTB4 class 4: the keys of the patches distinguish them

@@ -44,8 +44,6 @@ class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A range of triangles of a board that differ from the rest. If several name a triangle, the last one counts.
 
     Attributes:
-        board: address.
-        triangles: numbers of the triangles.
         kind: ``triangle``, ``fingertip`` or ``palm``; empty: by the board's type of skin.
         thermal: channels that are not tactile; None: those of the kind.
         enabled: switched on or off in the board; None: as the rest of the board.
@@ -74,11 +72,7 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     switches all triangles of the board off: the wanted ones must be switched on again in ``modules``.
 
     Attributes:
-        boards: their addresses.
         period_ms: time between two updates.
-        skin_type: type of skin that is sent to them.
-        no_load: value of an idle taxel.
-        inertial: inertial sensors that they send.
     """
 
     boards: tuple[int, ...]

@@ -20,7 +20,7 @@ from skinware_drivers.can.roboskin_options import (
     SpecialBoards,
     runs,
 )
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.polling import Watch
 
@@ -47,21 +47,16 @@ class BoardSetUp:
     """The set-up of one board, and the state it leaves the board in.
 
     Args:
-        options: of the bus.
-        board: address.
         is_mtb4: matters for the old way only.
 
     Attributes:
-        board: address.
         first: messages for every board, in order; each goes to all boards before the next.
         special_board: messages after the first wait.
         special_triangles: messages after the second wait.
         enabled: triangles that are switched on in the end.
         wiped: triangles that a special board configuration switched off, though no option does.
-        period_ms: of its skin data.
         skin_type: as sent to it.
         is_uneven: its triangles have different shifts or converter offsets.
-        inertial: its inertial sensors.
     """
 
     def __init__(self, options: RoboskinOptions, board: int, *, is_mtb4: bool = True) -> None:

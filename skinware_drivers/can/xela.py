@@ -18,17 +18,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
-from skinware_drivers import Bits, Frame, Identifier, Layout, Link, Module, Patch, Values, check_options, taxels
+from skinware_drivers import Bits, Frame, Identifier, Layout, Link, Module, Options, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
 
 
-class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class XelaOptions(Options, frozen=True):
     """Options of the driver, for every board of a bus."""
 
     boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards, 1-15")] = (1,)
@@ -44,7 +43,7 @@ class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     period_ms: Annotated[int, Meta(description="nominal time between two messages of a taxel, ms", ge=1)] = 10
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if not self.boards or len(set(self.boards)) < len(self.boards) or not set(self.boards) <= set(range(1, 16)):
             raise ConfigurationError(f"boards {self.boards}: give different numbers of 1 to 15")
         if len(self.first_id) != len(self.boards):

@@ -23,10 +23,8 @@ def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_j
     """Compare, print the result, and return whether all values are equal.
 
     Args:
-        capture: the file.
         arguments: of skin-driver: the driver and its own options.
         save: write the values that are decoded now beside the file, as the expected ones.
-        as_json: print JSON.
 
     Raises:
         BadRecording: the file is not a recording.

@@ -39,8 +39,6 @@ def as_text(evidence: Evidence, found: Examination, report: str | None = None) -
     """Return the lines to print, with colours, which ``echo`` takes out without a terminal.
 
     Args:
-        evidence: everything that was seen.
-        found: the findings.
         report: name of the file with the report, if one was written.
     """
     lines = [*_verdict(evidence, found), ""]

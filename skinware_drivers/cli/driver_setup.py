@@ -52,9 +52,6 @@ class DriverSetup:
     """A driver with its buses and options.
 
     Attributes:
-        driver_type: name of the driver.
-        name: its name in the namespace.
-        namespace: where it publishes.
         profile: how it is scheduled; None: as any program.
 
     Raises:

@@ -28,8 +28,6 @@ _LONGEST_COMMAND = {"can": 8, "serial": 4096, "modbus": 4096}
 
 
 class EmulateCommand(HardwareCommand):
-    """The command, with the options of the chosen emulator."""
-
     def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
         from skinware_drivers.loading import short_name
         from skinware_drivers.virtual.hardware import load_emulator

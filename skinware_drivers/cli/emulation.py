@@ -38,8 +38,6 @@ class EventSink(Protocol):
 
 
 class JsonReport:
-    """Print one JSON object a line."""
-
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
@@ -108,8 +106,6 @@ class Stop(Protocol):
 
 
 class Companion(Protocol):
-    """Work in the loop of an emulation."""
-
     def fileno(self) -> int:
         """Return a descriptor that is readable when ``step`` has work."""
 
@@ -128,7 +124,6 @@ class Emulation:
     Args:
         bus: not opened yet.
         hardware: not powered up yet.
-        report: receives the events.
         clock: CLOCK_MONOTONIC ns.
         poll: waits until a descriptor is readable, or for a time: ``(descriptors, timeout_s)``.
         companion: other work in the same loop.

@@ -19,10 +19,7 @@ class PressingService:
     """Publish the presses on the skin at 50 Hz, and take new ones by the operation ``press``.
 
     Args:
-        name: of the service.
-        hardware: the emulated skin.
         bus_name: of the emulation, for the replies.
-        namespace: of the service.
 
     Raises:
         NameInUse, NamespaceError, ConfigurationError: as for :class:`skinware.ServiceWriter`.

@@ -116,7 +116,6 @@ class WireSender:
     Args:
         pairs: recorded wires, and unopened buses to send them on.
         speed: 2.0: twice as fast.
-        start_s: begin, in seconds of the recording.
         end_s: end, in seconds of the recording; None: with the last frame.
 
     Attributes:

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Filter
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout
+from skinware_drivers.fields import Bits, Byte, Identifier
+from skinware_drivers.layout import Frame, Layout
 
 _FLAGS = EXTENDED_FLAG | REMOTE_FLAG
 
@@ -55,7 +56,7 @@ def fewest(filters: Iterable[Filter]) -> list[Filter]:
 
 
 STANDARD_IDENTIFIERS = 1 << 11
-_FIELD_BITS = 29  # of the key of a patch or module
+FIELD_BITS = 29  # of the key of a patch or module
 
 Indices = npt.NDArray[np.int64]
 
@@ -66,9 +67,7 @@ class Addresses:
     A *slot* stands for all identifiers of a bus with the same meaning; ``foreign`` is the slot of all others.
 
     Args:
-        frames: all kinds of frame.
         kinds_of_bus: for each bus, the numbers of the kinds that it carries.
-        tables: what is attached to the buses.
 
     Attributes:
         entry: (n_slots,) int64: 0 to n_modules - 1: a module; then n_patches entries for "some module of this patch";
@@ -83,7 +82,7 @@ class Addresses:
         self.foreign: int = len(kinds_of_bus) * STANDARD_IDENTIFIERS
         entries = [self._n_modules + tables.structure.n_patches] * (self.foreign + 1)
         possible: list[tuple[int, ...]] = [()] * (self.foreign + 1)
-        self.forms: list[_Form] = []
+        self.forms: list[Form] = []
         for bus, kinds in enumerate(kinds_of_bus):
             for number in kinds:
                 frame = frames[number]
@@ -96,7 +95,7 @@ class Addresses:
                         entries[slot] = entry
                         possible[slot] = (*possible[slot], number)
             for same in _of_one_address(frames, (number for number in kinds if frames[number].extended)):
-                self.forms.append(_Form(bus, frames[same[0]], tables, len(entries)))
+                self.forms.append(Form(bus, frames[same[0]], tables, len(entries)))
                 entries += self.forms[-1].entries
                 possible += [same] * len(self.forms[-1].entries)
         self.entry: npt.NDArray[np.int64] = np.array(entries, np.int64)
@@ -106,22 +105,7 @@ class Addresses:
         for kinds, row in sets.items():
             self.sets[row, list(kinds)] = True
 
-    def slots(self, bus: npt.NDArray[np.uint16], identifier: npt.NDArray[np.uint32]) -> Indices:
-        slots: Indices = bus * np.int64(STANDARD_IDENTIFIERS) + identifier
-        if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
-            rows = np.flatnonzero(identifier >= STANDARD_IDENTIFIERS)
-            slots[rows] = self.foreign
-            for form in self.forms:
-                form.look_up(bus[rows], identifier[rows].astype(np.int64), slots, rows)
-        return slots
-
     def modules_of(self, kind: int, frame: Frame) -> list[int]:
-        """Return the modules that frames of a kind can be of.
-
-        Args:
-            kind: its number.
-            frame: its declaration.
-        """
         found = set(self.entry[self.sets[self.candidates, kind]].tolist())
         byte = frame.module_byte
         if byte is None:
@@ -150,28 +134,25 @@ class Addresses:
 
 
 @dataclass(frozen=True)
-class _Field:
+class KeyField:
     shift: int
     mask: int
     constant: int = 0
 
     @staticmethod
-    def of(bits: Bits | int | None) -> _Field:
+    def of(bits: Bits | int | None) -> KeyField:
         if isinstance(bits, int):
-            return _Field(0, 0, bits)
-        return _Field(0, 0) if bits is None or bits.byte is not None else _Field(bits.shift, (1 << bits.width) - 1)
-
-    def take(self, identifier: Indices) -> Indices:
-        return identifier >> self.shift & self.mask | self.constant
+            return KeyField(0, 0, bits)
+        return KeyField(0, 0) if bits is None or bits.byte is not None else KeyField(bits.shift, (1 << bits.width) - 1)
 
 
-class _Form:
+class Form:
     """29-bit identifiers of one bus with the same conditions and keys."""
 
     def __init__(self, bus: int, frame: Frame, tables: SkinTables, first_slot: int) -> None:
         self.bus = bus
         self.conditions = [c for c in frame.when if isinstance(c, Identifier)]
-        self.patch, self.module = _Field.of(frame.patch), _Field.of(frame.module)
+        self.patch, self.module = KeyField.of(frame.patch), KeyField.of(frame.module)
         by_byte = frame.module_byte is not None
         known: dict[int, int] = {}
         self._anyone: dict[int, int] = {}  # patch key -> slot of "some module of this patch"
@@ -183,26 +164,10 @@ class _Form:
             self.entries.append(tables.structure.n_modules + patch)
             for (of_patch, module_key), module in tables.module_key.items():
                 if of_patch == patch and not by_byte:
-                    known[patch_key << _FIELD_BITS | module_key] = first_slot + len(self.entries)
+                    known[patch_key << FIELD_BITS | module_key] = first_slot + len(self.entries)
                     self.entries.append(module)
         self.codes, self.slots = _sorted(known)
         self.patch_codes, self.patch_slots = _sorted(self._anyone)
-
-    def look_up(self, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
-        match = bus == self.bus
-        match &= (identifier & EXTENDED_FLAG) != 0
-        for condition in self.conditions:
-            match &= identifier & condition.mask == condition.value
-        hits = np.flatnonzero(match)
-        if not len(hits):
-            return
-        patch_key = self.patch.take(identifier[hits])
-        code = patch_key << _FIELD_BITS | self.module.take(identifier[hits])
-        for codes, found, key in ((self.patch_codes, self.patch_slots, patch_key), (self.codes, self.slots, code)):
-            if len(codes):
-                at = np.minimum(np.searchsorted(codes, key), len(codes) - 1)
-                known = codes[at] == key
-                slots[rows[hits[known]]] = found[at[known]]
 
 
 def bits_of(identifier: int, bits: Bits | int | None) -> int:

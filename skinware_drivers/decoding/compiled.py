@@ -14,24 +14,93 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
-from skinware_drivers.decoding.pairing import CompiledCycle
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout
 
 NO_KIND = 255
 """The number in place of the kind of a frame that is of no kind."""
+NEVER_NS = -(1 << 62)
+_MARGIN = 8
+"""One part in so many of the time by which a frame may be early or late is left for the spacing inside a cycle."""
 
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.int64]
 
 
-class Carrier(NamedTuple):
+class Punctuality:
+    """When each kind of frame of each module came last, and how long after the one before.
+
+    Args:
+        period_s: nominal time from one cycle of a module to the next; a module may always be slower.
+    """
+
+    def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
+        self._n = len(cycle.members)
+        self.all_as_they_should = cycle.order != "given"
+        self.period_ns = round(period_s * NS_PER_S)
+        self.reach_ns = round(cycle.reach_s * NS_PER_S)
+        self.margin_ns = (self.period_ns - self.reach_ns) // _MARGIN
+        self.soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self.margin_ns
+        self.last_ns = np.full(n_modules * self._n, NEVER_NS, np.int64)
+        self.spacings_ns = np.full(n_modules * self._n, self.period_ns, np.int64)
+
+    def forget(self, modules: Indices) -> None:
+        kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
+        self.last_ns[kinds] = NEVER_NS
+        self.spacings_ns[kinds] = self.period_ns
+
+
+class CompiledCycle:
+    """A cycle of one layout.
+
+    Args:
+        members: the numbers of its members among them, in order.
+        period_s: nominal time from one cycle to the next; None: not known.
+
+    Attributes:
+        sequence: the member whose sequence numbers are compared, and their place; None: there are none.
+    """
+
+    def __init__(
+        self,
+        cycle: Cycle,
+        frames: Sequence[Frame],
+        members: list[int],
+        assembly: Assembly,
+        tables: SkinTables,
+        period_s: float | None,
+    ) -> None:
+        self.members = members
+        self.assembly = assembly
+        self.order, self.counters = cycle.order, cycle.counters
+        self.maximum_age_ns = round(cycle.maximum_age_s * NS_PER_S)
+        sequences: Sequence[SequenceNumber | None] = self.counters or [frames[n].sequence for n in members]
+        self.sequence: tuple[int, SequenceNumber] | None = next(
+            ((member, each) for member, each in enumerate(sequences) if each is not None), None
+        )
+        structure = tables.structure
+        if cycle.within == "patch":
+            patches = np.arange(structure.n_patches + 1)
+            groups = np.concatenate([structure.module_patch, patches])
+        else:
+            groups = np.minimum(np.arange(structure.n_modules + structure.n_patches + 1), 0xFFFF)
+        self.group_of_entry = groups.astype(np.uint16)
+        self.punctuality: Punctuality | None = None
+        if period_s is not None and not self.counters:
+            self.punctuality = Punctuality(cycle, cycle.period_s or period_s, structure.n_modules)
+
+    def forget(self, modules: Indices) -> None:
+        """Forget the rhythm of modules that have restarted."""
+        if self.punctuality is not None:
+            self.punctuality.forget(modules)
+
+
+class UpdateMaker(NamedTuple):
     """A kind of frame by itself, or a cycle: it makes one update.
 
     Attributes:
-        modules: that it can fill.
-        channels: for which it has values.
         period_s: nominal time between two of them; None: the driver's.
     """
 
@@ -46,17 +115,13 @@ class Groups:
     A module that one kind of frame or one cycle fills is one group. Where several kinds fill it, one of them can fall
     silent while the others continue. Sensors that the same kinds carry are then a group.
 
-    Args:
-        tables: the skin; its groups are replaced.
-        carriers: all kinds and cycles that make updates.
-
     Attributes:
         tables: the same skin with the groups.
         of_carrier: for each carrier (n_modules + 1, most) int64, groups that an update of a module belongs to;
             ``n_groups``: none.
     """
 
-    def __init__(self, tables: SkinTables, carriers: Sequence[Carrier]) -> None:
+    def __init__(self, tables: SkinTables, carriers: Sequence[UpdateMaker]) -> None:
         structure = tables.structure
         self._tables = tables
         self._carriers_of: list[list[int]] = [[] for _ in range(structure.n_modules)]
@@ -90,7 +155,7 @@ class Groups:
                 table[module, : len(groups)] = groups
             self.of_carrier.append(table)
 
-    def _divide(self, module: int, carriers: Sequence[Carrier]) -> list[tuple[tuple[int, ...], Indices]]:
+    def _divide(self, module: int, carriers: Sequence[UpdateMaker]) -> list[tuple[tuple[int, ...], Indices]]:
         """Return the groups of a module: the carriers that update each, and its sensors."""
         mine = self._carriers_of[module]
         sensors = np.arange(self._tables.structure.n_sensors)[self._tables.structure.module_index(module)]
@@ -114,21 +179,13 @@ class CompiledLayouts:
     """The layouts of all buses of a driver, compiled for one set of tables.
 
     Args:
-        layouts: of each bus; None for a bus whose layout is not known yet.
-        described: what is attached to the buses.
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 
     Attributes:
-        layouts, described: as given.
         tables: what is attached, with the update groups that follow from the layouts.
-        frames: all kinds of frame.
-        kinds: the same, compiled.
-        addresses: whose frames are whose.
         payload_names: (n_sets,) bool, sets of kinds of which one is named by its payload.
         alone: by number of its kind, what reads a frame that is an update by itself.
-        cycles: those of all layouts.
-        width: number of values of every update.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
         header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.
 
@@ -216,12 +273,12 @@ class CompiledLayouts:
         ]
         self.width = width
 
-    def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
+    def _carrier(self, members: Sequence[int], period_s: float) -> UpdateMaker:
         modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
         declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
         longest_s = max([*declared_s, period_s])
         channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
-        return Carrier(sorted(modules), channels, longest_s or None)
+        return UpdateMaker(sorted(modules), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """Return a payload byte and a table over it and the length, if they determine the kind (a fast case)."""

@@ -68,14 +68,8 @@ class _Growth:
 class DriverLog:
     """Sum up the snapshots of one structure of a driver.
 
-    Args:
-        structure: of the driver.
-        by_hour: count losses by the hour.
-
     Attributes:
-        frames: number of snapshots.
         newest: the last one; None before the first.
-        future_ns, backwards, longest_gap_s: see :class:`skinware_drivers.doctor.evidence.DriverTiming`.
     """
 
     structure: Structure
@@ -98,13 +92,7 @@ class DriverLog:
         self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
 
     def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
-        """Add a snapshot.
-
-        Args:
-            frame: the snapshot, of this structure.
-            tables: static columns of its generation.
-            time_s: when it was published, since the look began.
-        """
+        """Add a snapshot."""
         bus_names, bus_counts = counters_of(frame, tables, "bus", len(self.structure.buses))
         patch_names, patch_counts = counters_of(frame, tables, "patch", self.structure.n_patches)
         before = self.newest
@@ -275,12 +263,7 @@ def _lines(bad: npt.NDArray[np.bool_]) -> list[str]:
 
 
 class TaxelJudge:
-    """Judge the health of the taxels of one structure by its snapshots.
-
-    Args:
-        structure: of the driver.
-        driver: name of the driver.
-    """
+    """Judge the health of the taxels of one structure by its snapshots."""
 
     def __init__(self, structure: Structure, driver: str) -> None:
         self._structure = structure

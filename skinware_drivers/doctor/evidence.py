@@ -50,11 +50,9 @@ class BusSeen:
     """A bus of a driver.
 
     Attributes:
-        name: as given to the driver.
         state, reason: at the end, in the words of ``skin-info``; reason ``""``: none.
         since_s: age of the state; None: unknown.
         load: 0 to 1, in a recording the highest; None: unknown.
-        counted: its counters.
         samples: texts of the newest few frames that were not used.
         changes: of its state; the first one is the state at the beginning.
     """
@@ -74,13 +72,9 @@ class PatchSeen:
     """A patch of a driver.
 
     Attributes:
-        name: for people.
-        bus: name of its bus.
         state: at the end, in the words of ``skin-info``.
-        sensors, modules: their numbers.
         fresh: number of sensors that are fresh at the end.
         age_ns: age of its newest data at the end; None: it never sent any.
-        counted: its counters.
         interval: times between two updates of a module, during the look.
         delay: ages of updates when they were published, during the look.
         changes: of its state; the first one is the state at the beginning.
@@ -104,9 +98,7 @@ class TaxelFault:
     """A faulty taxel.
 
     Attributes:
-        name: for people.
         kind: ``dead``, ``stuck``, ``noisy``, ``weak`` or ``clipped``.
-        evidence: the reason, in words.
     """
 
     name: str
@@ -121,7 +113,6 @@ class HealthSeen:
     Attributes:
         source: the judge: ``skin-calm`` or ``these frames``.
         judged: number of taxels of which something is known.
-        faults: the faulty ones.
         missing: reasons why something could not be judged, by the kind of fault.
     """
 
@@ -164,22 +155,18 @@ class DriverSeen:
     """A driver.
 
     Attributes:
-        name, namespace, driver_type: of the driver.
         life: ``live``, ``silent``, ``paused``, ``starting`` or ``dead``, as in ``skin-info``; at the end of a recording
             also ``closed``.
         pid: of its process; 0: unknown.
         scheduling: of its process, in words; empty: unknown.
         data_path: ``native``, ``mixed``, ``python`` or ``not_told``.
         restarts: during the look, or in the recording.
-        frames: number of snapshots that were seen.
-        frames_lost: number of snapshots that were published and are missing in the recording.
-        structure: of its sensors.
+        frames_missed: number of snapshots that were published and are missing in the recording.
         statuses: number of sensors with each status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``.
         lines: names of the rows and columns of matrices that were never good.
         dark: modules that have sent nothing but 0 so far, with the number of their sensors that are suspect; they are
             not among ``lines``.
-        buses, patches, timing: of the driver.
         health: of its taxels; None: not judged.
     """
 
@@ -192,7 +179,7 @@ class DriverSeen:
     data_path: str
     restarts: int
     frames: int
-    frames_lost: int
+    frames_missed: int
     structure: Structure
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
@@ -209,7 +196,6 @@ class NamespaceSeen:
     """A namespace.
 
     Attributes:
-        name, path: of the namespace.
         is_ours: it is the one to examine.
         problem: the reason why it cannot be read; empty: it can.
         damaged: errors of files that cannot be read.
@@ -244,7 +230,6 @@ class MachineSeen:
     Attributes:
         versions: of skinware, Python, numpy ..., by name.
         kernel: release and processor architecture.
-        cpus: number of processors that this process may use.
         load: number of processes that are ready to run, mean of the last minute.
         governors: of the processors, each once; empty: none, or unknown.
         memory_bytes, memory_available_bytes: of the machine; 0: unknown.
@@ -252,7 +237,6 @@ class MachineSeen:
         shared_problem: the reason why files cannot be made in /dev/shm; empty: they can.
         locked_memory_bytes: the most that this user may lock; -1: unlimited.
         realtime_priority: the highest that this user may request; 0: none.
-        groups: of this process.
         limits: settings of the kernel, by name: ``net.core.rmem_max``.
         softnet_dropped: packets that the kernel dropped before any socket, during the look; None: unknown.
         clock_set_s: change of the wall clock by setting it, during the look.
@@ -281,7 +265,6 @@ class ClockSet:
     """A jump of the wall clock in a recording, because it was set or the machine slept.
 
     Attributes:
-        time_s: since the recording began.
         by_s: size of the jump, forward or back.
     """
 
@@ -294,13 +277,10 @@ class RecordingSeen:
     """A recording.
 
     Attributes:
-        name: of the file.
         size: in bytes.
-        duration_s: length.
         is_whole: it was closed in good order.
-        problems: errors in it.
         services: names of the services in it that are not drivers.
-        lost: number of snapshots that were published meanwhile and are missing.
+        missed: number of snapshots that were published meanwhile and are missing.
         events: number of events of each kind: ``restarted``, ``dead`` ...
         clock_sets: jumps of the wall clock.
         boots: number of starts of the machine that it spans.
@@ -313,7 +293,7 @@ class RecordingSeen:
     is_whole: bool
     problems: tuple[str, ...]
     services: tuple[str, ...]
-    lost: int
+    missed: int
     events: Counts
     clock_sets: tuple[ClockSet, ...]
     boots: int
@@ -325,16 +305,14 @@ class ReaderSeen:
     """A program that reads a driver snapshot by snapshot.
 
     Attributes:
-        program, pid: of its process.
-        driver: name of the driver.
-        frames, lost: number of snapshots that it took and missed during the look.
+        frames, missed: number of snapshots that it took and missed during the look.
     """
 
     program: str
     pid: int
     driver: str
     frames: int
-    lost: int
+    missed: int
 
 
 @dataclass(frozen=True)
@@ -343,14 +321,9 @@ class Evidence:
 
     Attributes:
         seconds: duration of the look, or length of the recording.
-        namespace: the one to examine.
-        drivers: in the namespace or the recording.
         machine: this one; of the machine that recorded nothing is known.
         recording: None: a running skin was examined.
-        namespaces: on this machine.
-        interfaces: CAN interfaces of the kernel.
         kernel_has_can: the kernel supports CAN.
-        ports: serial ports.
         running: living drivers in all namespaces that may be read, without those that publish another driver's data.
         waiting: processes of ``skin-driver`` that have published nothing so far.
         readers: programs that read the drivers snapshot by snapshot.

@@ -39,8 +39,6 @@ class Examination:
 
     Attributes:
         findings: the worst first, then in the order in which data travels.
-        looked: what was examined.
-        not_looked: what could not be examined.
     """
 
     findings: tuple[Finding, ...]

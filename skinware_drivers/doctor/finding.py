@@ -16,8 +16,6 @@ from skinware_drivers.registry import load_driver
 
 
 class Severity(enum.IntEnum):
-    """How bad something is."""
-
     NOTE = 1
     """It costs no data now."""
     WARNING = 2
@@ -31,7 +29,6 @@ class Finding:
     """Something that is wrong.
 
     Attributes:
-        severity: how bad it is.
         area: such as ``buses``; filled in by :func:`skinware_drivers.doctor.examining.examine`.
         what: the fault in a few words.
         where: the part of the skin or machine.
@@ -53,13 +50,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Looked:
-    """Something that was examined.
-
-    Attributes:
-        area: as in :class:`Finding`.
-        what: the part of the skin or machine.
-        seen: its condition.
-    """
+    """Something that was examined."""
 
     area: str = field(default="", kw_only=True)
     what: str
@@ -72,8 +63,6 @@ class NotLooked:
 
     Attributes:
         area: as in :class:`Finding`.
-        what: the part of the skin or machine.
-        why: the reason.
         commands: what to type to find out.
     """
 
@@ -108,8 +97,6 @@ class Rule:
         """Return a finding of this kind.
 
         Args:
-            where: the part of the skin or machine.
-            evidence: the figures that show it.
             severity: instead of the rule's.
             **names: values for ``what`` and, quoted for a shell, for ``commands``. A command is left out if one of its
                 names is missing.
@@ -142,14 +129,7 @@ _MOST_HOURS = 3
 
 
 def loss_in_words(counted: Counted, name: str, unit: str, evidence: Evidence) -> Loss | None:
-    """Return a counter in words; None if it is 0.
-
-    Args:
-        counted: counters of a bus or patch.
-        name: the counter.
-        unit: what it counts, in the singular.
-        evidence: everything that was seen.
-    """
+    """Return a counter in words; None if it is 0."""
     total, grown, span = counted.total.get(name, 0), counted.grown.get(name, 0), age_text(evidence.seconds * 1e9)
     if not total and not grown:
         return None

@@ -42,10 +42,6 @@ _PartT = TypeVar("_PartT", BusSeen, PatchSeen)
 def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
     """Examine a whole recording.
 
-    Args:
-        file: the recording.
-        progress: called now and then with the seconds of it that were read.
-
     Raises:
         BadRecording: the file is not a recording, or one of a newer version.
         OSError: the file cannot be read.
@@ -77,7 +73,7 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
         is_whole=recording.is_whole,
         problems=tuple(recording.problems),
         services=tuple(name for name in recording.services if name not in recording.drivers),
-        lost=sum(_lost_in(event) for event in events),
+        missed=sum(_missed_in(event) for event in events),
         events=Counter(str(event.get("event")) for event in events),
         clock_sets=tuple(_clock_sets(clock)),
         boots=len({str(moment.get("boot")) for moment in clock}),
@@ -97,9 +93,9 @@ def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
             yield ClockSet(time_s, now - before)
 
 
-def _lost_in(event: dict[str, Any]) -> int:
+def _missed_in(event: dict[str, Any]) -> int:
     count = event.get("count")
-    return count if event.get("event") == "lost" and isinstance(count, int) else 0
+    return count if event.get("event") == "missed" and isinstance(count, int) else 0
 
 
 class _DriverTrack:
@@ -119,13 +115,7 @@ class _DriverTrack:
         self._longest_gap_ns = 0
 
     def take(self, frame: RecordedDriverSnapshot, tables: Any, time_s: float) -> None:
-        """Add a snapshot.
-
-        Args:
-            frame: the snapshot.
-            tables: static columns of its generation.
-            time_s: when it was published, since the recording began.
-        """
+        """Add a snapshot."""
         before, self._newest = self._newest, frame
         self._frames += 1
         self._age.add(max(0, frame.published_ns - frame.acquired_ns))
@@ -181,7 +171,7 @@ class _DriverTrack:
             data_path=newest.data_path.name.lower(),
             restarts=self._restarts,
             frames=self._frames,
-            frames_lost=sum(_lost_in(event) for event in own),
+            frames_missed=sum(_missed_in(event) for event in own),
             structure=log.structure,
             statuses=statuses,
             affected=affected,

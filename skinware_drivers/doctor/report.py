@@ -55,11 +55,7 @@ class Secrets:
 
     @classmethod
     def of_this_machine(cls, environment: Mapping[str, str] | None = None) -> Secrets:
-        """Return names of people, their home folders, the name of the machine, and values of environment variables.
-
-        Args:
-            environment: default: that of this process.
-        """
+        """Return names of people, their home folders, the name of the machine, and values of environment variables."""
         given = os.environ if environment is None else environment
         people = [one for one in pwd.getpwall() if one.pw_uid in _PEOPLE or one.pw_uid == os.geteuid()]
         homes = {one.pw_dir for one in people} | {str(Path.home()), given.get("HOME", "")}
@@ -111,13 +107,7 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
 
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
-    """Return the report.
-
-    Args:
-        evidence: everything that was seen.
-        found: the findings.
-        secrets: to be left out; default: those of this machine.
-    """
+    """Return the report."""
     text = "\n".join(map(printable, _lines(evidence, found))) + "\n"
     return scrubbed(text, secrets or Secrets.of_this_machine())
 

@@ -32,11 +32,6 @@ _POLICIES = {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
 def watch(namespace: Namespace, seconds: float, progress: Callable[[float], object]) -> tuple[DriverSeen, ...]:
     """Read all drivers of a namespace.
 
-    Args:
-        namespace: of the drivers.
-        seconds: duration.
-        progress: called now and then with the seconds that have passed.
-
     Raises:
         NamespaceError: the namespace cannot be trusted or read.
     """
@@ -55,8 +50,6 @@ def watch(namespace: Namespace, seconds: float, progress: Callable[[float], obje
 
 
 class _DriverWatch:
-    """Read one driver."""
-
     def __init__(self, reader: DriverReader) -> None:
         self._reader = reader
         self._log = DriverLog(reader.structure)
@@ -109,7 +102,7 @@ class _DriverWatch:
             data_path="not_told" if frame is None else frame.data_path.name.lower(),
             restarts=self._restarts,
             frames=log.frames,
-            frames_lost=0,
+            frames_missed=0,
             structure=reader.structure,
             statuses=statuses,
             affected=affected,

@@ -16,7 +16,8 @@ from skinware.errors import BusError, BusSendError, ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 from skinware_drivers.description import Patch
-from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout
+from skinware_drivers.fields import Bits, Identifier
+from skinware_drivers.layout import Expand, Frame, Layout
 from skinware_drivers.link import Heard, Link
 from skinware_drivers.loading import registered, short_name
 from skinware_drivers.registry import DRIVERS, load_driver
@@ -33,7 +34,6 @@ class IdentifierClass:
         name: ``4xx``: 11-bit identifiers 400 to 4FF; ``29-bit``: all of those.
         first, last: the lowest and the highest that was heard.
         identifiers: number of different identifiers.
-        frames: number of frames.
     """
 
     name: str
@@ -44,11 +44,7 @@ class IdentifierClass:
 
 
 class Traffic:
-    """The frames of a bus; give :meth:`take` to the reader of the bus.
-
-    Attributes:
-        frames: number of frames.
-    """
+    """The frames of a bus; give :meth:`take` to the reader of the bus."""
 
     def __init__(self) -> None:
         self.frames: int = 0
@@ -95,10 +91,7 @@ class Guess:
     """A driver that knows some of the frames.
 
     Attributes:
-        driver: its name.
-        frames: number of frames that it knows.
         share: of all frames, 0 to 1.
-        patches: names of their patches.
         likely: no other driver explains these frames better; False: a possibility.
     """
 
@@ -142,9 +135,7 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
     If several know the same frames, the one with more constant bits wins.
 
     Args:
-        traffic: the frames.
         bus: the bus; only its name is used.
-        drivers: to choose from.
     """
     wire = traffic.wire()
     adapters = {
@@ -167,9 +158,7 @@ async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list
     """Return the patches of one driver that were heard, as it describes them; nothing is sent.
 
     Args:
-        traffic: the frames.
         bus: the bus; only its name is used.
-        adapter: the driver's adapter.
     """
     match = _match(type(adapter).__name__, adapter, traffic.wire())
     if match is None:

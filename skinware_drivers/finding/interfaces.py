@@ -41,16 +41,13 @@ class CanInterface:
         name: ``can0``.
         kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` without iproute2.
         driver: kernel driver of the hardware; empty: none.
-        up: it is set up.
         carrier: operational state of the kernel: ``up``, ``down``, ``unknown``.
         bit_rate: bit/s of the arbitration phase; None: not set, or unknown.
         data_bit_rate: of the data phase of CAN FD.
         sample_point: 0 to 1.
         state: of the controller: ``ERROR-ACTIVE``, ``ERROR-PASSIVE``, ``BUS-OFF``, ``STOPPED`` ...; empty: unknown.
         restart_ms: pause before it restarts after bus-off; 0: it does not; None: unknown.
-        is_fd: it passes frames of CAN FD.
         queue_length: most frames that wait for the wire in the kernel.
-        statistics: counters of the kernel.
         controller_errors: counters of the controller: ``bus_error``, ``arbitration_lost``, ``bus_off`` ...
     """
 
@@ -108,7 +105,6 @@ def can_interfaces(
     """Return all CAN interfaces, by name.
 
     Args:
-        root: of sysfs.
         links: output of iproute2 for each interface; default: run it.
         controller: reads bit rate and state without iproute2.
     """
@@ -186,7 +182,6 @@ class CanAdapterFound:
 
     Attributes:
         bus: its name for ``--bus``: ``kvaser:0``.
-        details: other facts from its library.
     """
 
     bus: str
@@ -198,7 +193,6 @@ class Detection:
     """The adapters that python-can found.
 
     Attributes:
-        found: adapters.
         problem: an error, else empty.
     """
 
@@ -207,12 +201,7 @@ class Detection:
 
 
 def detect_adapters(timeout_s: float, command: list[str] | None = None) -> Detection:
-    """Search with all interfaces of python-can that can.
-
-    Args:
-        timeout_s: longest time for all of them.
-        command: the process to start, for tests.
-    """
+    """Search with all interfaces of python-can that can."""
     process = subprocess.Popen(
         command or [sys.executable, "-m", __name__],
         stdin=subprocess.DEVNULL,

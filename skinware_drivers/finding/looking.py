@@ -26,16 +26,11 @@ class HeardOnBus:
     """The traffic of a CAN bus.
 
     Attributes:
-        bus: its name.
         problem: the reason why it cannot be read; else empty.
-        duration_s: time of listening.
-        frames: number of frames.
         rate_hz: frames per second.
         load: share of the bus' time, 0 to 1; None: the bit rate is unknown.
-        error_frames: number of error frames.
         trouble: state of the controller if something is wrong: ``error-passive``.
-        lost: number of frames that were read too late.
-        classes: of the identifiers.
+        dropped: number of frames that were read too late.
         guesses: drivers that know the frames.
     """
 
@@ -47,7 +42,7 @@ class HeardOnBus:
     load: float | None = None
     error_frames: int = 0
     trouble: str = ""
-    lost: int = 0
+    dropped: int = 0
     classes: list[IdentifierClass] = field(default_factory=list)
     guesses: list[Guess] = field(default_factory=list)
 
@@ -57,7 +52,6 @@ class ProbeAnswer:
     """The answers on a bus.
 
     Attributes:
-        bus: its name.
         asked: drivers that asked.
         answers: devices in words, by driver.
         problems: errors, by driver.
@@ -73,11 +67,6 @@ class ProbeAnswer:
 
 async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
     """Listen to a CAN bus. Nothing is sent.
-
-    Args:
-        bus_name: as for ``--bus``.
-        duration_s: time of listening.
-        drivers: that may know the frames.
 
     Raises:
         ConfigurationError: this is not the name of a bus.
@@ -105,7 +94,7 @@ async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping
         load=share_of_time(bus, bus.wire_bits - bits_before, passed_ns),
         error_frames=bus.counters.errors,
         trouble=reason_text(reason) if reason else "",
-        lost=bus.counters.lost,
+        dropped=bus.counters.dropped,
         classes=traffic.classes(),
         guesses=await guess(traffic, bus, dict(drivers)),
     )
@@ -120,9 +109,6 @@ async def ask(
     are harmless for devices that send. A bus of a running driver, and one with unknown frames, are left alone.
 
     Args:
-        heard: the traffic just now.
-        drivers: that may ask.
-        force: ask all questions in any case.
         owner: the running driver of the bus, in words; empty: none.
     """
     if heard.problem:

@@ -27,8 +27,6 @@ class UsbIdentity:
         vendor_id: ``0403``.
         product_id: ``6001``.
         serial_number: empty if it has none.
-        manufacturer: in words.
-        product: in words.
         place: USB socket: ``1-1.2``.
         interface: number of the port's interface: ``00``.
     """
@@ -103,13 +101,7 @@ class SerialPort:
 
 @dataclass(frozen=True)
 class Machine:
-    """The roots of the file systems to read, which tests replace.
-
-    Attributes:
-        sys: sysfs.
-        dev: device files.
-        proc: procfs.
-    """
+    """The roots of the file systems to read, which tests replace."""
 
     sys: Path = Path("/sys")
     dev: Path = Path("/dev")
@@ -135,9 +127,9 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
     ]
 
 
-def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | None:
+def pseudo_terminal(path: str) -> SerialPort | None:
     """Return the pseudo terminal of a path, as ``skin-emulate --bus pty:port`` makes it; None if it is not one."""
-    machine = machine or Machine()
+    machine = Machine()
     real = Path(path).resolve()
     if real.parent != machine.dev / "pts" or not real.is_char_device():
         return None

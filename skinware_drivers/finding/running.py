@@ -23,10 +23,7 @@ class RunningDriver:
     """A driver whose process lives.
 
     Attributes:
-        name, namespace: of the driver.
         driver_type: ``roboskin``.
-        pid: of its process.
-        buses: as given to the driver.
     """
 
     name: str

@@ -81,9 +81,6 @@ async def carry_out(
 
     Args:
         bus: not opened yet.
-        bus_name: for messages.
-        adapter: of the bus.
-        operation: its name.
         arguments: of the operation; ``patch``: name of the only patch.
         agree: called with the patches before anything is changed; may raise.
         force: make changes even if frames are heard.

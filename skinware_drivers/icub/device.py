@@ -23,11 +23,7 @@ class Group:
     """Named parameters, groups and lists.
 
     Attributes:
-        element: of the group.
-        params: by name.
-        groups: by name.
         lists: by name, the elements ``elem`` of each.
-        actions: elements ``action``.
         others: elements that do not belong in a device.
     """
 
@@ -40,11 +36,7 @@ class Group:
 
 
 class DeviceReader:
-    """Find the devices of files, each file and device once.
-
-    Args:
-        notes: takes the remarks.
-    """
+    """Find the devices of files, each file and device once."""
 
     def __init__(self, notes: Notes) -> None:
         self._notes = notes
@@ -193,12 +185,10 @@ _UNUSED = {
 
 
 @dataclass(frozen=True)
-class Port:
+class PortRange:
     """A body part in a skin device's index.
 
     Attributes:
-        name: of the body part.
-        element: of the port.
         first, last: indices of its first and last value in the device.
         local_first: index of its first value in the body part, as position files count.
     """
@@ -215,12 +205,11 @@ class Wrapper:
     """The ports of one skin device.
 
     Attributes:
-        device: name of the skin device.
         ports: in the order of the file.
     """
 
     device: str
-    ports: tuple[Port, ...]
+    ports: tuple[PortRange, ...]
 
 
 def read_wrapper(group: Group, notes: Notes) -> Wrapper:
@@ -230,7 +219,7 @@ def read_wrapper(group: Group, notes: Notes) -> Wrapper:
 
 class _WrapperReader(ValueReader):
     def read(self, group: Group) -> Wrapper:
-        ports: list[Port] = []
+        ports: list[PortRange] = []
         for element in group.lists.get("ports", ()):
             port = self._port(element)
             if port is not None:
@@ -255,7 +244,7 @@ class _WrapperReader(ValueReader):
                 self.note("unknown", element, f"not understood{f': {element.text!r}' if element.text else ''}")
         return Wrapper(names[0] if names else "", tuple(ports))
 
-    def _port(self, element: Element) -> Port | None:
+    def _port(self, element: Element) -> PortRange | None:
         row = self.numbers(element)
         if row is None:
             return None
@@ -266,7 +255,7 @@ class _WrapperReader(ValueReader):
         if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
             self.refuse(element, f"{element.text!r}: the two ranges differ in length")
             return None
-        return Port(element.name, element, first, last, local_first)
+        return PortRange(element.name, element, first, last, local_first)
 
     @staticmethod
     def _rest(group: Group) -> list[Element]:

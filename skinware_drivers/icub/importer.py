@@ -22,8 +22,8 @@ from skinware_drivers.icub.body import (
     read_drawing,
     regions_of,
 )
-from skinware_drivers.icub.device import WRAPPER, DeviceReader, Port, Wrapper, read_wrapper
-from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
+from skinware_drivers.icub.device import WRAPPER, DeviceReader, PortRange, Wrapper, read_wrapper
+from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.translate import (
     TranslatedBus,
@@ -34,7 +34,7 @@ from skinware_drivers.icub.translate import (
     yarp_configuration_text,
 )
 from skinware_drivers.icub.xml_tree import Element, Level, Notes, shown
-from skinware_drivers.icub.yarp import YarpPort, yarp_ports
+from skinware_drivers.icub.yarp import PartPort, yarp_ports
 
 _SUFFIXES = (".xml", ".txt", ".ini")
 _MOST_FILES = 20_000
@@ -47,21 +47,17 @@ class ImportedPart:
 
     Attributes:
         name: of the skin; a name that a service can have.
-        part: as the files describe it.
         ports: body parts in its index.
         buses: in the order of the configuration.
-        yarp: its ports.
         groups: places of its sensors, with those that are switched off.
-        regions: its body parts.
-        triangles: number of triangles that are switched on.
         placed: number of sensors that are switched on and have a place.
     """
 
     name: str
-    part: Part
-    ports: Sequence[Port]
+    part: DevicePart
+    ports: Sequence[PortRange]
     buses: list[TranslatedBus]
-    yarp: list[YarpPort]
+    yarp: list[PartPort]
     groups: list[GeometryGroup]
     regions: list[Region]
     triangles: int
@@ -107,7 +103,6 @@ class ImportedPart:
         return geometry_to_toml(groups, lines) if groups else ""
 
     def yarp_regions_text(self) -> str:
-        """Return a file of regions for it: each port is one."""
         regions = [
             Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
             for bus, port in enumerate(self.yarp)
@@ -133,12 +128,7 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """The result of an import.
-
-    Attributes:
-        parts: translated skin devices.
-        files: files that were read.
-    """
+    """The result of an import."""
 
     parts: list[ImportedPart]
     files: list[Path]
@@ -166,7 +156,6 @@ def import_files(
     Args:
         paths: XML of robots-configuration, position files and drawings of skinGui, and folders of them.
         notes: takes the remarks, also if this raises.
-        only: devices to translate, by name; all if empty.
         positions: position file of a body part, if the names of the files are ambiguous.
         bus_names: bus of each patch; only for one device.
         wants_buses: their buses will be connected to this computer.
@@ -268,7 +257,7 @@ class _Wrappers:
                 self._others.append(device)
         self._used: set[int] = set()
 
-    def ports_of(self, part: Part, notes: Notes) -> Sequence[Port]:
+    def ports_of(self, part: DevicePart, notes: Notes) -> Sequence[PortRange]:
         """Return the ports of a device; with several robots, those of the wrapper in the nearest folder."""
         where = part.element.file.resolve().parts
         of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
@@ -300,8 +289,6 @@ def _shared(one: Sequence[str], other: Sequence[str]) -> int:
 
 
 class _BodyFiles:
-    """Position files and drawings, by body part."""
-
     def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
         self._chosen, self._notes = chosen, notes
         self._positions = sources.positions
@@ -311,7 +298,7 @@ class _BodyFiles:
             self._drawings.append((read_drawing(path, own), own))
         self._used: set[Path] = set()
 
-    def of_ports(self, ports: Sequence[Port]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
+    def of_ports(self, ports: Sequence[PortRange]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
         positions, drawings = {}, {}
         for port in ports:
             path = self._chosen.get(port.name) or self._positions_of(port)
@@ -336,7 +323,7 @@ class _BodyFiles:
             if path not in self._used:
                 self._notes.add("info", path, "no body part of this name is imported")
 
-    def _positions_of(self, port: Port) -> Path | None:
+    def _positions_of(self, port: PortRange) -> Path | None:
         """Find it by the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
         exact = [path for path in self._positions if path.stem == port.name]
         similar = [path for path in self._positions if path.stem.startswith(f"{port.name}_")]
@@ -351,7 +338,7 @@ class _BodyFiles:
             return None
         return candidates[0] if candidates else None
 
-    def _drawing_of(self, port: Port) -> Drawing | None:
+    def _drawing_of(self, port: PortRange) -> Drawing | None:
         found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
         self._used.update(drawing.path for drawing, _ in found)
         if len(found) > 1:
@@ -361,5 +348,5 @@ class _BodyFiles:
             self._notes.take(own)
         return found[0][0] if found else None
 
-    def _note(self, port: Port, level: Level, text: str) -> None:
+    def _note(self, port: PortRange, level: Level, text: str) -> None:
         self._notes.add(level, port.element.file, text, line=port.element.line, element=port.element.label)

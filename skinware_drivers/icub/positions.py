@@ -35,7 +35,6 @@ class Positions:
     """A position file.
 
     Attributes:
-        path: of the file.
         frame: the link with the coordinate frame of the numbers.
         tactile: by channel, whether it is a taxel.
         poses: by channel, in metres; None: the file has no place.
@@ -52,7 +51,6 @@ class Positions:
 
 
 def is_positions(text: str) -> bool:
-    """Return whether a text looks like a position file."""
     return _CALIBRATION in text and "taxel2Repr" in text
 
 

@@ -22,11 +22,7 @@ class Note(msgspec.Struct, frozen=True, order=True):
     """A remark.
 
     Attributes:
-        level: its kind.
-        file: its file.
         line: counted from 1; 0: the whole file.
-        element: its subject.
-        text: the remark.
     """
 
     level: Level
@@ -50,8 +46,6 @@ def shown(text: object) -> str:
 
 
 class Notes:
-    """Remarks in order, each once."""
-
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
 
@@ -89,11 +83,7 @@ def number(text: str) -> int:
 
 
 class ValueReader:
-    """Read values of elements; note those that cannot be read, which count as not given.
-
-    Args:
-        notes: takes the remarks.
-    """
+    """Read values of elements; note those that cannot be read, which count as not given."""
 
     def __init__(self, notes: Notes) -> None:
         self.notes = notes
@@ -157,11 +147,6 @@ class Element:
 
     Attributes:
         tag: with its prefix, if any.
-        attributes: by name.
-        file: of the element.
-        line: counted from 1.
-        children: in order.
-        text: all text directly within, stripped.
         understood: a reader has used it.
     """
 
@@ -179,7 +164,6 @@ class Element:
 
     @property
     def label(self) -> str:
-        """Return it for messages: ``param "period"``."""
         return f'{self.tag} "{self.name}"' if self.name else self.tag
 
     def walk(self) -> Iterator[Element]:
@@ -187,12 +171,8 @@ class Element:
         for child in self.children:
             yield from child.walk()
 
-    def understand(self) -> None:
-        for element in self.walk():
-            element.understood = True
 
-
-def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """Read an ordinary file that is not too large.
 
     Raises:
@@ -202,13 +182,13 @@ def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
         if not path.is_file():
             raise ConfigurationError(f"{path}: not there, or not an ordinary file")
         with path.open("rb") as file:
-            data = file.read(limit + 1)
+            data = file.read(LARGEST_FILE + 1)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror}") from None
     except ValueError as error:  # a NUL in the path
         raise ConfigurationError(f"{str(path)!r}: {error}") from None
-    if len(data) > limit:
-        raise ConfigurationError(f"{path}: larger than {limit >> 20} MiB, too large for a robot's configuration")
+    if len(data) > LARGEST_FILE:
+        raise ConfigurationError(f"{path}: larger than {LARGEST_FILE >> 20} MiB, too large for a robot's configuration")
     return data
 
 

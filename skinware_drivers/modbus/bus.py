@@ -83,10 +83,6 @@ class ModbusBus(KernelBus):
 
     Args:
         channel: ``tcp://HOST[:PORT]``, or the path of a port.
-        options: see :class:`ModbusOptions`.
-        payload_size: longest frame.
-        listen_only: send nothing.
-        make_timer: makes the timer that wakes it.
 
     Raises:
         ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
@@ -155,11 +151,7 @@ class ModbusBus(KernelBus):
         """Set what to ask for, now and after each opening. Options of the bus override these arguments.
 
         Args:
-            wanted: the registers.
-            period_s: time from one cycle to the next.
-            timeout_s: longest wait for a reply.
             turnaround_s: pause after a reply; None: that of the standard on a serial line, none over TCP.
-            baudrate: of a serial line.
 
         Raises:
             ConfigurationError: a serial line has no unit 0.
@@ -184,7 +176,6 @@ class ModbusBus(KernelBus):
         """Return the time that the bytes of a cycle and the silence between them take on a serial line, s; 0 over TCP.
 
         Args:
-            wanted: the registers.
             baudrate: unless the options of the bus give one.
         """
         if self._address is not None:

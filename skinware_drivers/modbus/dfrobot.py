@@ -15,7 +15,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -24,15 +23,15 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
+from skinware_drivers.fields import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -46,7 +45,7 @@ _GRIDS: Mapping[Shape, Grid] = {"4x8": Grid(4, 8), "6x6": Grid(6, 6)}
 _MODELS: Mapping[int, Shape] = {0: "4x8", 1: "6x6"}
 
 
-class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DfrobotOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -67,7 +66,7 @@ class DfrobotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if len(set(self.units)) < len(self.units):
             raise ConfigurationError("option units: name each array once")
         if len(self.shapes) not in (0, 1, len(self.units)):
@@ -95,8 +94,6 @@ class DfrobotWatch(OrderWatch):
 
 
 class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
-    """The arrays on one line, each a patch."""
-
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))

@@ -31,7 +31,6 @@ class _Program(Guest):
     """A program at a port: its own connection, or the serial port that it may open.
 
     Attributes:
-        port: how it is reached.
         watched: the events for which the gateway waits at that port.
     """
 
@@ -83,11 +82,7 @@ class Gateway:
 
     Args:
         places: ``PORT`` or ``HOST:PORT`` for Modbus TCP, or a path for a serial port, separated by commas.
-        guests: takes the questions.
         is_public: other machines may reach it.
-
-    Attributes:
-        note: where it is.
 
     Raises:
         ConfigurationError: there is no such place, or other machines could reach it without ``is_public``.

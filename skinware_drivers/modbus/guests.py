@@ -119,7 +119,6 @@ class Guests:
 
         Args:
             reply: what the unit answered, which may be an exception; None: nothing.
-            time_ns: now.
         """
         if self._open is None:
             return

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -22,19 +21,19 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import Above, AnyFlag, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Watch
 
 _FIRST, _BYTES = 3000, 2
 _FULL_SCALE = 4096
 
 
-class _Matrix(NamedTuple):
+class _PadMatrix(NamedTuple):
     part: str
     name: str
     address: int
@@ -43,29 +42,27 @@ class _Matrix(NamedTuple):
 
 
 _MATRICES = (
-    _Matrix("little", "tip", 3000, 3, 3),
-    _Matrix("little", "top", 3018, 12, 8),
-    _Matrix("little", "pad", 3210, 10, 8),
-    _Matrix("ring", "tip", 3370, 3, 3),
-    _Matrix("ring", "top", 3388, 12, 8),
-    _Matrix("ring", "pad", 3580, 10, 8),
-    _Matrix("middle", "tip", 3740, 3, 3),
-    _Matrix("middle", "top", 3758, 12, 8),
-    _Matrix("middle", "pad", 3950, 10, 8),
-    _Matrix("index", "tip", 4110, 3, 3),
-    _Matrix("index", "top", 4128, 12, 8),
-    _Matrix("index", "pad", 4320, 10, 8),
-    _Matrix("thumb", "tip", 4480, 3, 3),
-    _Matrix("thumb", "top", 4498, 12, 8),
-    _Matrix("thumb", "middle", 4690, 3, 3),
-    _Matrix("thumb", "pad", 4708, 12, 8),
-    _Matrix("palm", "", 4900, 8, 14),
+    _PadMatrix("little", "tip", 3000, 3, 3),
+    _PadMatrix("little", "top", 3018, 12, 8),
+    _PadMatrix("little", "pad", 3210, 10, 8),
+    _PadMatrix("ring", "tip", 3370, 3, 3),
+    _PadMatrix("ring", "top", 3388, 12, 8),
+    _PadMatrix("ring", "pad", 3580, 10, 8),
+    _PadMatrix("middle", "tip", 3740, 3, 3),
+    _PadMatrix("middle", "top", 3758, 12, 8),
+    _PadMatrix("middle", "pad", 3950, 10, 8),
+    _PadMatrix("index", "tip", 4110, 3, 3),
+    _PadMatrix("index", "top", 4128, 12, 8),
+    _PadMatrix("index", "pad", 4320, 10, 8),
+    _PadMatrix("thumb", "tip", 4480, 3, 3),
+    _PadMatrix("thumb", "top", 4498, 12, 8),
+    _PadMatrix("thumb", "middle", 4690, 3, 3),
+    _PadMatrix("thumb", "pad", 4708, 12, 8),
+    _PadMatrix("palm", "", 4900, 8, 14),
 )
 
 
-class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class InspireOptions(Options, frozen=True):
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; the manual has 255 over TCP")] = 1
     period_ms: Annotated[
@@ -76,13 +73,8 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bool, Meta(description="read each matrix by itself: 17 questions instead of 9, and no rule about addresses")
     ] = False
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 class InspireDriver(ModbusAdapter[InspireOptions]):
-    """One hand."""
-
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))
@@ -111,13 +103,13 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
         return OrderWatch(tables, _FULL_SCALE)
 
 
-def _channels(matrix: _Matrix) -> list[int]:
+def _channels(matrix: _PadMatrix) -> list[int]:
     grid = np.arange(matrix.rows * matrix.columns).reshape(matrix.rows, matrix.columns)
     order = grid[::-1].T if matrix.part == "palm" else grid
     return [int(place) for place in order.ravel()]
 
 
-def _uids(matrix: _Matrix) -> list[int]:
+def _uids(matrix: _PadMatrix) -> list[int]:
     """Return the number of each taxel's register, from 3000 on, row by row."""
     first = (matrix.address - _FIRST) // _BYTES
     return [first + int(place) for place in np.argsort(_channels(matrix))]

@@ -15,7 +15,7 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guests, Retry
-from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
+from skinware_drivers.modbus.registers import Image, Overheard, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -28,8 +28,6 @@ _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
 """In place of the number of a read: a question of the driver's own, and one of another program."""
 _MANUALS_COUNT_FROM = 30_001
-_OVERHEARD_NS = NS_PER_S
-"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 class Timing(NamedTuple):
@@ -84,17 +82,9 @@ class Schedule:
     A unit that has not answered three times in a row is asked more and more rarely if there are others; so is a read
     that is answered by an exception.
 
-    Args:
-        reads: of a cycle.
-        period_ns: from one cycle to the next.
-        begun_ns: now.
-
     Attributes:
-        questions: of the reads.
         cycle: number of the present cycle; -1 before the first.
         cycle_ns: when it began.
-        deadline_ns: when the next one begins.
-        next: position of the next read in this cycle.
         retries: of units ("unit", unit) and reads ("read", position) that fail.
     """
 
@@ -150,13 +140,7 @@ class Master(Talk):
     Between two reads that are due, one question of other programs is asked. Those are never repeated.
 
     Args:
-        wanted: the registers.
-        timing: of the device.
-        counters: of the bus.
         over_tcp: the line is a connection, not a serial line.
-        name: of the bus, for messages.
-        begun_ns: now.
-        guests: the other programs.
     """
 
     def __init__(
@@ -348,43 +332,10 @@ class Master(Talk):
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 
 
-class Overheard:
-    """Join what another master reads.
-
-    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
-
-    Args:
-        wanted: the registers to look for.
-    """
-
-    def __init__(self, wanted: Wanted) -> None:
-        self._image = Image(wanted)
-        reads = wanted.reads()
-        self._first = (reads[0].unit, reads[0].question) if reads else None
-        self._cycle_ns = 0
-
-    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
-        """Take a reply; return the frames that are whole now.
-
-        Args:
-            asked: the question.
-            registers: bytes of the registers in the reply.
-            time_ns: when it came.
-        """
-        if (asked.unit, asked.data) == self._first:
-            self._cycle_ns = time_ns
-        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
-        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)
-
-
 class Listener(Talk):
     """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
     A reply does not say which registers it holds, so a reply is dropped if its question was not heard.
-
-    Args:
-        wanted: the registers to look for.
-        counters: of the bus.
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:

@@ -55,7 +55,6 @@ class NativeMaster(Master):
         """Let C go on until ``take_back`` is called.
 
         Args:
-            fd: of the port.
             guests_fd: is readable when another program wants something; -1: no program can.
 
         Returns:

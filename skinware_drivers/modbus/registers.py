@@ -15,11 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.layout import AnyFlag, Packed, Values
-from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
+from skinware.realtime import NS_PER_S
+from skinware_drivers.fields import AnyFlag, Packed
+from skinware_drivers.layout import Values
+from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, Message, question_to_read
 
 Order = Literal["big", "little"]
 _LAST_ADDRESS = 0xFFFF
+_OVERHEARD_NS = NS_PER_S
+"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,6 @@ class Read:
     """One question of a cycle.
 
     Attributes:
-        area: number of its area in the image.
         first: its first register in that area.
     """
 
@@ -127,7 +130,6 @@ class Wanted:
     """The registers that a driver wants, and how they can be read.
 
     Attributes:
-        blocks: of registers.
         step: from the address of one register to the next: 2 where addresses count bytes.
         largest_gap: unwanted registers that are read along at most, to save a question.
         most: registers of a read.
@@ -209,7 +211,6 @@ class Image:
         wanted: the blocks; the identifier of a frame is the number of its block.
 
     Attributes:
-        areas: the registers.
         told_ns: (n_blocks,) int64, when the frame of each was last whole.
         is_plain: a frame has the bytes of its registers as they come.
     """
@@ -227,7 +228,6 @@ class Image:
         """Store registers that were read; return the frames that are whole now.
 
         Args:
-            area: number of the area.
             first: their first register in it.
             data: their bytes.
             time_ns: when they came.
@@ -282,3 +282,28 @@ def _turned(data: bytes, run: Values) -> bytes:
     """Return the values of a run with their registers in the other order."""
     words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
     return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()
+
+
+class Overheard:
+    """Join what another master reads.
+
+    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
+    """
+
+    def __init__(self, wanted: Wanted) -> None:
+        self._image = Image(wanted)
+        reads = wanted.reads()
+        self._first = (reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
+
+    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
+        """Take a reply; return the frames that are whole now.
+
+        Args:
+            registers: bytes of the registers in the reply.
+            time_ns: when it came.
+        """
+        if (asked.unit, asked.data) == self._first:
+            self._cycle_ns = time_ns
+        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
+        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)

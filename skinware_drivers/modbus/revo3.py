@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -28,14 +27,15 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import Sentinel
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Sentinel, Values
+from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -133,7 +133,7 @@ def places(mapping: str, side: str, pad: int, count: int) -> tuple[Grid, Sequenc
     return Grid(len(rows), columns), [columns * number + int(one) for number, row in enumerate(rows) for one in row]
 
 
-class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Revo3Options(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -156,7 +156,7 @@ class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if len(self.points) not in (0, len(_PADS)):
             raise ConfigurationError(f"option points: give {len(_PADS)} numbers")
 

@@ -135,11 +135,7 @@ def tcp_frame(message: Message) -> bytes:
 
 
 class _Messages:
-    """The bytes of a connection or line that are no whole message yet.
-
-    Args:
-        counters: count what is found.
-    """
+    """The bytes of a connection or line that are no whole message yet."""
 
     def __init__(self, counters: FramerCounters) -> None:
         self._counters = counters

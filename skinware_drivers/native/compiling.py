@@ -10,11 +10,11 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.compiled import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
-from skinware_drivers.decoding.pairing import CompiledCycle
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
+from skinware_drivers.fields import Above, Byte, Packed, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Expand, Frame
 from skinware_drivers.native import structs
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
@@ -105,7 +105,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.sensor_group = arrays.of(structure.sensor_group, np.int64)
     plan.first_group = arrays.of(np.searchsorted(structure.group_patch, np.arange(structure.n_patches)), np.int64)
     plan.patch_bus = arrays.of(structure.patch_bus, np.int64)
-    plan.last_sequence, plan.haste = arrays.at(decoder.sequences.last), arrays.at(decoder.haste)
+    plan.last_sequence, plan.haste = arrays.at(decoder.last_sequence), arrays.at(decoder.haste)
     plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
 
     plan.values, plan.status = arrays.at(state.all_values), arrays.at(state.all_status)
@@ -221,8 +221,8 @@ def _compared(form: int, status: Status, number: float, values: np.dtype[Any]) -
 
 
 def _cycle(cycle: CompiledCycle, assembly: int, arrays: structs.Arrays) -> structs.Cycle:
-    pairing, punctuality = cycle.pairing, cycle.punctuality
-    found = structs.Cycle(len(cycle.members), _ORDERS.index(pairing.order), pairing.maximum_age_ns, assembly)
+    punctuality = cycle.punctuality
+    found = structs.Cycle(len(cycle.members), _ORDERS.index(cycle.order), cycle.maximum_age_ns, assembly)
     found.has_counter = bool(cycle.counters)
     _, found.counters = arrays.structs(structs.Number, (_number(counter) for counter in cycle.counters))
     found.group_of_entry = arrays.at(cycle.group_of_entry)

@@ -1,4 +1,4 @@
-/* Frames in, updates out: Decoder.decode. */
+/* Frames in, updates out: SpecifiedDecoder.decode. */
 #include "inside.h"
 
 #include <stdlib.h>

@@ -1,4 +1,4 @@
-/* Which frames belong together: decoding/pairing.py and punctuality.py.
+/* Which frames belong together: tests/specification/pairing.py.
  *
  * The rows of a batch are put in the order of their groups (patches or modules), in which the members of a cycle follow
  * each other. All arrays below are in that order; `order` has the row of each.

@@ -1,4 +1,4 @@
-/* From payloads to values and flags: decoding/frame_kind.py, sequences.py and Decoder._read. */
+/* From payloads to values and flags: tests/specification/reading.py. */
 #include "inside.h"
 
 static const uint8_t bytes_of_type[] = {1, 1, 2, 2, 4, 4, 8, 8, 4, 8};

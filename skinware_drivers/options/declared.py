@@ -1,8 +1,8 @@
 """Options of drivers and emulators: declared as structs, made from texts, described for commands.
 
-An options class is a ``msgspec.Struct`` whose fields carry a description::
+The fields of an options class carry a description::
 
-    class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    class ThumbOptions(Options, frozen=True):
         boards: Annotated[tuple[int, ...], msgspec.Meta(description="board addresses")] = (7, 8)
 """
 
@@ -85,20 +85,22 @@ def options_from_strings(
     return options_class(**values)
 
 
-def check_options(options: msgspec.Struct) -> None:
-    """Check every field against its type and limits; call it in ``__post_init__``: msgspec checks no constructor.
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of options: a new object checks every field, which msgspec does not; with more checks, call ``super()``.
 
     Raises:
         ConfigurationError: a field has a value that its annotation does not allow.
     """
-    hints = get_type_hints(type(options), include_extras=True)
-    for field in msgspec.structs.fields(type(options)):
-        value = getattr(options, field.name)
-        try:
-            msgspec.convert(value, hints[field.name])
-        except msgspec.ValidationError as error:
-            message = f"option {field.encode_name}={option_text(value)}: {_reason(error, hints[field.name])}"
-            raise ConfigurationError(message) from None
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self), include_extras=True)
+        for field in msgspec.structs.fields(type(self)):
+            value = getattr(self, field.name)
+            try:
+                msgspec.convert(value, hints[field.name])
+            except msgspec.ValidationError as error:
+                message = f"option {field.encode_name}={option_text(value)}: {_reason(error, hints[field.name])}"
+                raise ConfigurationError(message) from None
 
 
 def option_text(value: Any) -> str:

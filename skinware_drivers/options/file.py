@@ -80,9 +80,6 @@ class ConfigFile:
     Args:
         path: of the file; None: all settings have their defaults.
 
-    Attributes:
-        settings: its contents.
-
     Raises:
         ConfigurationError: there is no such file, it is no TOML, or a key or value is wrong.
     """
@@ -117,9 +114,7 @@ class ConfigFile:
 
         Args:
             struct: the driver's ``Options``.
-            bus_name: as in the file.
             given: texts by name of option, as of a command line.
-            usual: values that replace the defaults.
 
         Raises:
             ConfigurationError: an unknown option or a wrong value.
@@ -154,8 +149,6 @@ class ConfigFile:
 
 
 class _Wrong(Exception):
-    """A mistake, and the key that has it."""
-
     def __init__(self, text: str, keys: Keys) -> None:
         super().__init__(text)
         self.keys = keys

@@ -55,11 +55,6 @@ def check_capture(
     Expected are the values in the file beside it (:func:`expected_of`), or else those that were decoded and recorded
     then.
 
-    Args:
-        capture: a recording of one driver, with its wires.
-        driver: default: the recorded driver.
-        options: of the driver, in place of recorded ones.
-
     Returns:
         The comparison, and the values that are decoded now.
 
@@ -144,14 +139,7 @@ def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
 
 
 class _ReplayedWire:
-    """A recorded wire, and the adapter of the present driver on it.
-
-    Args:
-        recording: that holds the wire.
-        wire: the wire.
-        listens: the driver sends nothing.
-        clock: the time.
-    """
+    """A recorded wire, and the adapter of the present driver on it."""
 
     def __init__(self, recording: Recording, wire: WireTrack, listens: bool, clock: HandClock) -> None:
         self.wire = wire
@@ -226,8 +214,6 @@ def snapshots_after(reader: DriverReader, last: tuple[int, int] | None) -> Itera
 
 
 class _Published:
-    """Every snapshot that a driver publishes."""
-
     def __init__(self) -> None:
         self._reader: DriverReader | None = None
         self._frames: list[tuple[Structure, list[DriverSnapshot]]] = []

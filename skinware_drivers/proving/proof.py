@@ -32,10 +32,7 @@ class Check:
     """A check.
 
     Attributes:
-        what: its subject.
         where: module or bus; empty: the whole device.
-        verdict: the result.
-        seen: the evidence, in words.
     """
 
     what: str
@@ -49,9 +46,7 @@ class Proof:
     """All checks of a device.
 
     Attributes:
-        driver, driver_type: of the driver.
         about: facts on the device, the driver and this machine's programs.
-        checks: in order.
     """
 
     driver: str
@@ -113,11 +108,7 @@ class Proof:
 class ProofFiles:
     """The files of a proof: a report, the same as JSON, and a capture.
 
-    Args:
-        stem: the common part of their names.
-
     Attributes:
-        report, data, capture: paths; a recorder writes the capture.
         captured: result of the capture; empty before its end.
     """
 
@@ -145,8 +136,8 @@ class ProofFiles:
     def capture_text(self, *, is_whole: bool) -> str:
         beginning = "from the first byte on" if is_whole else "without the frames before skin-prove began"
         text = f"{self.capture.name}, {beginning}"
-        if self.captured.get("lost"):
-            text += f"; {self.captured['lost']} frames lost"
+        if self.captured.get("missed"):
+            text += f"; {self.captured['missed']} frames missed"
         return text + (f"; ended early: {self.captured['problem']}" if self.captured.get("problem") else "")
 
     def write(self, proof: Proof) -> OSError | None:

@@ -24,11 +24,7 @@ _SURE = 0.5
 
 
 class Matrix(NamedTuple):
-    """Taxels in rows and columns, row by row.
-
-    Attributes:
-        rows, columns: their numbers.
-    """
+    """Taxels in rows and columns, row by row."""
 
     rows: int
     columns: int
@@ -67,7 +63,6 @@ def judge(matrix: Matrix, down: Floats, across: Floats, threshold: float) -> Ord
     """Compare the moments at which taxels answered with their declared places.
 
     Args:
-        matrix: as the driver declares it.
         down: (frames, n) distance of each taxel from its rest while a finger went over the rows.
         across: the same while it went over the columns.
         threshold: least distance of an answer.

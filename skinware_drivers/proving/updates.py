@@ -28,7 +28,6 @@ class ModuleUpdates:
     """The updates of one module, in order.
 
     Attributes:
-        sensors: (n,) names.
         time_ns: (k,) int64, since the recording began.
         values: (k, n) raw.
     """
@@ -50,8 +49,6 @@ class Difference:
     """A difference between two decodings.
 
     Attributes:
-        time_s: since the recording began.
-        sensor: name of the first sensor that differs.
         then, now: its raw values; None: there is no such update.
     """
 
@@ -70,7 +67,6 @@ class Comparison:
     """Two decodings of one wire.
 
     Attributes:
-        compared: number of updates that were compared.
         then, now: number of updates of each decoding.
         difference: the first by time; None: they are equal.
     """
@@ -96,7 +92,6 @@ class Collected:
         """Add snapshots of one structure, in order.
 
         Args:
-            structure: of the driver.
             values: (frames, sensors) raw.
             module_time_ns: (frames, modules) int64; 0: never seen.
         """

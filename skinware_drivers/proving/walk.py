@@ -34,13 +34,7 @@ _UNUSABLE = int(Status.NEVER_SEEN | Status.STALE | Status.MASKED)
 
 
 class Step(NamedTuple):
-    """A request to a person.
-
-    Attributes:
-        wanted: kind of the step.
-        module: name of the module; empty: all.
-        text: the request in words.
-    """
+    """A request to a person."""
 
     wanted: Wanted
     module: str
@@ -62,10 +56,7 @@ class Manner:
     """Settings of a walk.
 
     Attributes:
-        type_name: type of the sensors; None: pressure, force, or the first type.
         only: press the modules with one of these words in their names; empty: all.
-        patience_s: longest time of a step.
-        rest_s: duration of the rest at the beginning.
         with_tare: let the driver tare at the end, if it can.
     """
 
@@ -91,12 +82,6 @@ class _Skipped(Exception):
 def walk(reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
     """Check all modules, and add the checks to a proof, which is valid also if the walk is interrupted.
 
-    Args:
-        reader: of the driver.
-        person: who presses.
-        manner: the settings.
-        proof: takes the checks.
-
     Raises:
         ServiceTimeout: no snapshot came for 5 s.
         StructureChanged: the driver has other sensors now.
@@ -109,6 +94,7 @@ class _Walk:
     def __init__(self, reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
         self._reader, self._person, self._manner, self._proof = reader, person, manner, proof
         structure = self._structure = reader.structure
+        self._names = structure.module_names
         names = [one.name for one in structure.types]
         chosen = manner.type_name or next((name for name in _FIRST_CHOICE if name in names), names[0])
         self._type = structure.type(chosen)
@@ -128,10 +114,6 @@ class _Walk:
         self._threshold = 0.0
         self._first: DriverSnapshot | None = None
         self._last: DriverSnapshot | None = None
-
-    @property
-    def _names(self) -> Sequence[str]:
-        return self._structure.module_names
 
     def go(self) -> None:
         self._proof.about["sensors"] = f"{self._structure.n_sensors}, judged by {self._type.name} ({self._type.unit})"
@@ -344,5 +326,5 @@ class _Walk:
         return ", ".join(names[taxel] for taxel in taxels[:_MOST_NAMES]) + more
 
 
-_LOSSES = ("lost", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
+_LOSSES = ("dropped", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
 """Counters of losses and damage on a bus."""

@@ -35,9 +35,6 @@ class Identity:
     """How a driver appears to programs.
 
     Attributes:
-        name: in the namespace.
-        driver_type: name of the driver, for people.
-        listen_only: it sends nothing.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
     """
 
@@ -53,11 +50,8 @@ class Builder:
     """Builds a new generation whenever what is attached to the buses has changed.
 
     Args:
-        identity: of the driver.
-        lines: its buses; the list may change.
         publish, latency_s: as for :class:`.runner.Runner`.
         geometry: where the sensors are; None: as the buses and their adapters say.
-        ending: of the driver.
         began: called with each new generation.
 
     Attributes:
@@ -191,7 +185,6 @@ class Builder:
                         generation.watch.forget(number)
 
     async def close(self) -> None:
-        """Take no more requests."""
         if self.desk is not None and self.writer is not None:
             asyncio.get_running_loop().remove_reader(self.writer.request_server().fileno())
             await self.desk.close()
@@ -201,7 +194,6 @@ def put_in_place(tables: SkinTables, given: Geometry | None, of_buses: Sequence[
     """Return the tables with the places of the sensors; as they are if no place is known.
 
     Args:
-        tables: of the driver.
         given: by a person; nothing else counts then.
         of_buses: by the uids that sensors have on their bus, in the order of the driver's buses.
     """

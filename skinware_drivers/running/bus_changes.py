@@ -28,9 +28,6 @@ class BusChanges:
 
     Args:
         lines: the driver's buses, by place; changed.
-        epoll: where open buses are registered.
-        builder: builds the structure.
-        serving: serves the buses.
     """
 
     def __init__(self, lines: list[BusLine], epoll: select.epoll, builder: Builder, serving: Serving) -> None:

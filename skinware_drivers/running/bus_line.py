@@ -31,19 +31,11 @@ _NEVER_NS = 1 << 63
 class BusCondition:
     """The state of a bus; changes are logged.
 
-    Args:
-        name: of the bus, for people.
-        bus: the bus.
-
     Attributes:
-        state: live, silent, down ...
-        reason: of the state, or of trouble although frames come.
         since_ns: when both became so, CLOCK_MONOTONIC ns.
         heard_ns: when the bus last delivered frames.
         checked_ns: when the bus was last asked whether it is still there.
         speaks_from_ns: from when on its devices send of themselves; before, they only answer.
-        limits: how close the bus is to its limits.
-        news: logs changes.
     """
 
     def __init__(self, name: str, bus: Bus) -> None:
@@ -109,16 +101,10 @@ class BusLine:
     """A bus with the driver's object for it.
 
     Args:
-        name: as the user wrote it.
         ordinal: its place among the driver's buses.
-        adapter: the driver's object for this bus.
         bus: the bus itself, not open.
-        epoll: where the descriptor of the open bus is registered.
 
     Attributes:
-        link: handshakes on it.
-        connection: whether it is open.
-        condition: its state.
         patches: found on it, None until it was asked.
         patch_news: logs which of its patches fell silent, or are live again.
         suspects: keys of the patches that report errors.
@@ -158,7 +144,7 @@ class BusLine:
     def losses(self) -> tuple[int, ...]:
         """Numbers that change whenever frames are known to be lost: dropped, or not received."""
         counters = self.bus.counters
-        return counters.lost, counters.overflows, counters.bus_offs, self.connection.opened_ns
+        return counters.dropped, counters.overflows, counters.bus_offs, self.connection.opened_ns
 
     async def open(self) -> None:
         """Open the bus.
@@ -326,7 +312,6 @@ async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
     """Open all available buses at once: a slow one holds up no other. The others are waited for.
 
     Args:
-        lines: all buses of a driver.
         wait_for_one: wait also if none is available.
 
     Raises:

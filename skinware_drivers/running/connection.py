@@ -22,12 +22,7 @@ _OPENING_S = 10.0
 
 
 class SlowCall:
-    """A call in a thread that does not keep the program from ending.
-
-    Args:
-        name: of the thread.
-        call: what to do there.
-    """
+    """A call in a thread that does not keep the program from ending."""
 
     def __init__(self, name: str, call: Callable[[], object]) -> None:
         self._call = call
@@ -83,12 +78,6 @@ class SlowCall:
 
 class Connection:
     """The connection to one bus.
-
-    Args:
-        name: of the bus, for people.
-        bus: the bus.
-        epoll: where the descriptor of the open bus is registered.
-        pauses: between attempts to open it again.
 
     Attributes:
         lost: set while there is none.

@@ -74,13 +74,7 @@ class DataLoop:
     """The data path of a driver in its event loop.
 
     Args:
-        epoll: in which open buses are registered.
-        lines: the buses; the list may change.
-        ending: of the driver.
         on_patches: called with patches that fell silent, or are live again.
-
-    Attributes:
-        machine: counts what this machine drops.
     """
 
     def __init__(

@@ -27,9 +27,6 @@ class RequestDesk:
     """Carries out operations on the buses, and answers requests for new snapshots.
 
     Args:
-        server: of the requests.
-        lines: the driver's buses.
-        listen_only: nothing may be sent: operations are refused.
         changed: called after an operation with its bus, its patches, and whether it set them up again.
         ending: of the driver; errors outside of an operation end it.
     """
@@ -72,7 +69,6 @@ class RequestDesk:
 
         Args:
             oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
-            position: of the snapshot.
         """
         answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
         self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]

@@ -69,11 +69,7 @@ class Flow:
     """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable.
 
     Args:
-        generation: in service.
-        epoll_fd: in which open buses are registered.
         latency_s: the longest rest.
-        take: called in the loop when Python must read a bus.
-        fail: called with errors.
     """
 
     def __init__(

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch, is_read_natively
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine
@@ -62,13 +61,8 @@ class Generation:
 
     Attributes:
         lines: the buses; the list may change, their places do not.
-        decoder: turns frames into updates.
-        watch: marks doubtful modules.
-        publisher: turns updates into snapshots.
         period_s: nominal time between two updates, for the publisher.
-        batch: filled by the buses.
         begun_ns: when it began, CLOCK_MONOTONIC ns.
-        path: decodes and publishes.
         flows: C reads the buses that it can read (see ``running.flow``).
     """
 

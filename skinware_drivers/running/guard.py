@@ -27,8 +27,6 @@ def hook(name: str, *buses: str, of_all: bool = False) -> Iterator[None]:
     """Call a hook of an adapter or of its watch.
 
     Args:
-        name: of the hook.
-        buses: names of the buses that it is called for.
         of_all: it concerns all buses of the driver, also if it is called for one.
 
     Raises:
@@ -114,24 +112,17 @@ class Backoff:
     """Pauses between attempts, each twice as long as the one before.
 
     Args:
-        first_s: the first pause.
-        longest_s: the longest pause.
         at_once: the first attempt needs no pause.
     """
 
     def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
         self._first_s = first_s
-        self._longest_s = longest_s
+        self.longest_s = longest_s
         self._begin_s = 0.0 if at_once else first_s
         self._next_s = self._begin_s
 
-    @property
-    def longest_s(self) -> float:
-        """The longest pause; after so long without trouble, call ``begin_again``."""
-        return self._longest_s
-
     def next_s(self) -> float:
-        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self.longest_s)
         return pause_s
 
     def begin_again(self) -> None:

@@ -27,10 +27,6 @@ class Intake:
     """Takes frames when some have arrived, and then rests for a moment so that more are taken together.
 
     Args:
-        epoll: in which open buses are registered.
-        lines: the buses; the list may change.
-        empty_batch: returns the batch to fill.
-        digest: called with the filled batch.
         latency_s: the longest rest; may be changed.
         guard: makes a callback safe for the event loop (:meth:`.guard.Ending.guard`).
 

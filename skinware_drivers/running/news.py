@@ -100,7 +100,6 @@ class PatchChange(NamedTuple):
     """The changes of a bus since its last log line.
 
     Attributes:
-        bus: its name.
         silent: names of the patches that fell silent.
         live: names of the patches that are live again.
     """
@@ -122,7 +121,6 @@ class PatchNews:
     """Logs the changes of the patches of one bus, with the limit of :class:`BusNews`.
 
     Args:
-        bus: its name.
         clock: CLOCK_MONOTONIC ns.
     """
 
@@ -180,7 +178,6 @@ class Doubles:
     Single frames of two devices with one identifier look alike; their number gives them away.
 
     Args:
-        structure: what is in service.
         period_ns: the driver's period, above 0.
         clock: CLOCK_MONOTONIC ns.
     """
@@ -227,7 +224,6 @@ def share_of_time(bus: Bus, bits: float, passed_ns: int) -> float | None:
     """Share of a wire's time that bits took, 0 to 1; None where its bit rate is not known.
 
     Args:
-        bus: the bus.
         bits: of its bit rate, as ``wire_bits`` counts them.
         passed_ns: in what time, more than 0.
     """
@@ -238,8 +234,6 @@ class BusLimits:
     """Compares one bus with its limits once a second.
 
     Args:
-        name: of the bus, for people.
-        bus: the bus.
         clock: CLOCK_MONOTONIC ns.
 
     Attributes:
@@ -253,7 +247,7 @@ class BusLimits:
         self._clock = clock
         self._looked_ns = clock()
         self._bits = bus.wire_bits
-        self._lost = bus.counters.lost
+        self._dropped = bus.counters.dropped
         self._logged: set[str] = set()
         self.load: float | None = None
         self.load_from_ns = 0
@@ -271,9 +265,9 @@ class BusLimits:
             self._log_once("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
         if fill > HIGH_FILL:
             self._log_once("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little time")
-        if bus.counters.lost > self._lost:
-            lost = bus.counters.lost - self._lost
-            self._log_once("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+        if bus.counters.dropped > self._dropped:
+            dropped = bus.counters.dropped - self._dropped
+            self._log_once("dropped", f"{dropped} frames dropped: the receive buffer was full (or the adapter's queue)")
 
     @property
     def is_full(self) -> bool:
@@ -304,7 +298,6 @@ class MachineLimits:
     reach sockets; CAN frames too. The kernel counts those that do not fit in /proc/net/softnet_stat.
 
     Args:
-        source: the file to read.
         clock: CLOCK_MONOTONIC ns.
 
     Attributes:

@@ -28,12 +28,7 @@ Sample = Mapping[str, Any]
 
 
 def why_unused(layout: Layout, bus: Bus) -> list[str]:
-    """Return likely reasons why no data comes, in a few words each.
-
-    Args:
-        layout: of this bus.
-        bus: with samples of the unused frames.
-    """
+    """Return likely reasons why no data comes, in a few words each."""
     samples = sample_report(bus.samples.rows)
     reasons = _lengths(layout, samples)
     if bus.medium == "can":
@@ -128,10 +123,7 @@ class PatchCare:
     """Looks after the patches of one bus.
 
     Args:
-        line: the bus.
         generation: returns the generation in service; None: there is none yet.
-        listen_only: nothing may be sent.
-        join: requests another look at the structure.
         beside: starts a task of the driver.
     """
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Decoder, Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
 from skinware_drivers.polling import Watch
@@ -61,16 +60,26 @@ class Listeners:
     damaged: Callable[[int, bytes], None] = lambda _bus, _chunk: None
 
 
+class Named(NamedTuple):
+    """The frames of some rows.
+
+    Attributes:
+        module: (n,) module of each; from ``n_modules`` on: none.
+        kind: (n,) number of its kind; 255: none.
+    """
+
+    module: Rows
+    kind: npt.NDArray[np.uint8]
+
+
 class PathHooks:
     """The hooks of one data path.
 
     Args:
-        decoder, publisher, batch: of the path.
         rows, words: the batch and the state of the path in C.
         exchange: arrays for what changes between two calls.
 
     Attributes:
-        listeners: to be set.
         count_strangers: counts rows of frames that are of no module.
         error: raised by a hook; raised again when C has returned.
     """
@@ -117,6 +126,14 @@ class PathHooks:
         exchange.module_status[:], exchange.module_untouched[:] = watch.module_status, watch.module_untouched
         self._words.sees_all = watch.sees_all
 
+    def named(self, rows: slice) -> Named:
+        """Return what the frames of these rows are, of the batch that was decoded last."""
+        capacity = self._batch.capacity
+        return Named(
+            _view(self._words.entry, capacity, np.int64)[rows].copy(),
+            _view(self._words.kind, capacity, np.uint8)[rows].copy(),
+        )
+
     def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
         """Return a hook that keeps its exception until C has returned: an exception cannot go through C."""
 
@@ -152,9 +169,8 @@ class PathHooks:
     def _on_times(self) -> None:
         batch = self._batch
         new = slice(max(batch.start, batch.headroom), batch.stop)
-        entry = _view(self._words.entry, batch.capacity, np.int64)[new]
-        kind = _view(self._words.kind, batch.capacity, np.uint8)[new]
-        self._decoder.device_stamps.apply(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
+        module, kind = self.named(new)
+        self._decoder.device_stamps.apply(kind, module, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
         left = self.listeners.offer(_view(at, n, np.int64).copy())

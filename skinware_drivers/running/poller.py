@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from skinware.errors import BusSendError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Match
+from skinware_drivers.link import Link
 from skinware_drivers.polling import Poll
 from skinware_drivers.running.guard import Backoff
 
@@ -27,7 +28,6 @@ class _Place:
     """The polls at one place of the sequence.
 
     Attributes:
-        timer: their deadlines.
         asked_ns: when one was last sent, or would have been.
         silent_until_ns: none is sent before, because answers were missing.
         extra_s: time to wait for an answer beyond its timeout, because answers came late.
@@ -63,7 +63,6 @@ class Poller:
     answers come late.
 
     Args:
-        link: the bus.
         counters: of the bus; ``polls_missed`` and ``polls_unanswered`` are counted in them.
         check: called with the polls before the first question, and when their number or their times have changed.
     """

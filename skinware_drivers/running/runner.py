@@ -33,9 +33,7 @@ class Runner:
     """A driver on its buses.
 
     Args:
-        driver_type: name of the driver, for people.
         lines: name, adapter and (unopened) bus of every bus, in order.
-        name: the driver's name in the namespace.
         listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.
         wait_for_buses: if no bus is available at the start, wait for one.
         publish: ``cycle`` (when every live update group has arrived, or after a short wait), ``rate`` (at the adapter's
@@ -51,8 +49,6 @@ class Runner:
         lines: the buses; those that were removed keep their places.
         buses: adds and removes buses while the driver runs.
         builder: makes what is in service: the writer and the generation.
-        ending: whether the driver is to end.
-        ready: frames are being published.
     """
 
     def __init__(

@@ -29,11 +29,7 @@ class Serving:
     """Serves buses one by one.
 
     Args:
-        lines: all buses of the driver; the list may change.
-        listen_only: send nothing.
-        builder: builds a structure from what is attached to the buses.
         be_ready: called whenever a bus delivers for the first time.
-        ending: of the driver.
     """
 
     def __init__(

@@ -35,12 +35,7 @@ _FINDING_S = 0.02
 
 
 class Wires:
-    """The service with the wires of a driver. A sample has what went over one bus since the sample before.
-
-    Args:
-        identity: of the driver.
-        lines: its buses; the list may change.
-    """
+    """The service with the wires of a driver. A sample has what went over one bus since the sample before."""
 
     def __init__(self, identity: Identity, lines: Sequence[BusLine]) -> None:
         self._identity, self._lines, self._namespace = identity, lines, identity.namespace
@@ -104,7 +99,7 @@ class Wires:
             for batch in line.bus.tap.fetch() if not is_new else (memoryview(b""), *line.bus.tap.fetch()):
                 columns = writer.begin()
                 columns["bus"][()], columns["used"][()] = line.ordinal, len(batch)
-                columns["lost"][()] = line.bus.tap.lost
+                columns["missed"][()] = line.bus.tap.missed
                 columns["pieces"][: len(batch)] = np.frombuffer(batch, np.uint8)
                 writer.commit(now_ns())
 

@@ -17,7 +17,6 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -25,9 +24,10 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Patch, Poll, check_options, taxels
+from skinware_drivers import Link, Match, Module, Options, Patch, Poll, taxels
+from skinware_drivers.fields import Bits, Identifier, Packed, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout, Packed, Sentinel, Values
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -50,9 +50,7 @@ _C1, _C2, _DIVIDER_OHM = 121591.0, 0.878894, 1e4
 _Bytes = npt.NDArray[np.uint8]
 
 
-class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class AbilityHandOptions(Options, frozen=True):
     address: Annotated[int, Meta(ge=0, le=0xFF, description="of the hand")] = 0x50
     period_ms: Annotated[int, Meta(ge=2, description="time from question to question, ms")] = 10
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for views")] = "right"
@@ -61,9 +59,6 @@ class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         Literal["no", "published", "divider"],
         Meta(description="newton instead of counts, by the maker's uncalibrated formula; divider: with its other sign"),
     ] = "no"
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def _by_finger(header: int, body: bytes) -> Iterable[tuple[int, bytes]]:

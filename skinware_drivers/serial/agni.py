@@ -23,14 +23,14 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Link, Match, Module, Notice, Patch, Sensor, check_options, operation
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
+from skinware_drivers.fields import DeviceTime, Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -46,7 +46,7 @@ _TIMEOUT_S, _TRIES = 0.5, 3
 _ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unknown sensor"}
 
 
-class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AgniOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -65,9 +65,6 @@ class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "<u2"
     time_unit_us: Annotated[float, Meta(ge=0, description="unit of the device's time; 0: the time of receipt")] = 0.0
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 def command(number: int, arguments: bytes = b"") -> bytes:
     sent = _BEGIN + bytes((0, number)) + arguments
@@ -80,8 +77,6 @@ def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEG
 
 
 class AgniDriver(SerialAdapter[AgniOptions]):
-    """One device on a serial line."""
-
     framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
     commands = Unframed(1024)
     payload_size = _MOST_BYTES + 8

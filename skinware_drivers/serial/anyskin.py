@@ -13,24 +13,18 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE
 from skinware.status import Status
-from skinware_drivers import Frame, Layout, Module, Patch, Sentinel, Values, check_options, taxels
+from skinware_drivers import Frame, Layout, Module, Options, Patch, Sentinel, Values, taxels
 from skinware_drivers.serial import Packet, SerialAdapter
 
 
-class AnySkinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class AnySkinOptions(Options, frozen=True):
     mags: Annotated[int, Meta(description="magnetometers of the board", ge=1, le=64)] = 5
     period_ms: Annotated[int, Meta(description="nominal time between two messages, ms", ge=1)] = 10
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class AnySkinDriver(SerialAdapter[AnySkinOptions]):

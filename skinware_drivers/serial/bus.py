@@ -37,9 +37,7 @@ class SerialBus(KernelBus):
 
     Args:
         channel: path or URL; empty if the options name a USB device.
-        options: see :class:`skinware_drivers.serial.opening.SerialOptions`.
         payload_size: bytes of the longest body that fits into a batch; longer ones are counted as refused.
-        listen_only: refuse every ``send``.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.
@@ -82,7 +80,6 @@ class SerialBus(KernelBus):
         """Set the framing. Bytes that were received but not fetched are dropped.
 
         Args:
-            framing: how frames are received.
             commands: how they are sent, if in another way.
             baudrate: unless the name of the bus gives another; takes effect when the bus is opened next.
         """

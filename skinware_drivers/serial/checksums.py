@@ -24,7 +24,6 @@ class Checksum(ABC):
     """A checksum that frames carry.
 
     Attributes:
-        width: in bits.
         order: byte order in which it is sent.
     """
 

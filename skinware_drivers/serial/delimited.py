@@ -17,11 +17,7 @@ from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, chec
 
 
 class Stuffing(ABC):
-    """The coding of the bytes between two delimiters.
-
-    Attributes:
-        delimiter: the byte that ends a frame.
-    """
+    """The coding of the bytes between two delimiters."""
 
     delimiter: int
 
@@ -103,14 +99,11 @@ class Escaped(Stuffing):
     """Some bytes are replaced by an escape byte and another byte.
 
     Args:
-        delimiter: the byte that ends a frame.
-        escape: the escape byte.
         sent: the byte behind the escape byte, for each byte that a sender replaces.
         accepted: further replacements that a receiver accepts.
         opening: frames begin with a delimiter too.
 
     Attributes:
-        escape: the escape byte.
         meaning: the byte that each byte behind the escape byte stands for.
     """
 

@@ -20,16 +20,16 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Notice, Patch, check_options, taxels
+from skinware_drivers import Link, Match, Module, Notice, Options, Patch, taxels
+from skinware_drivers.fields import Byte, Identifier, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
 
@@ -45,7 +45,7 @@ _PERIOD_MS = {"binary": 10, "text": 31}  # as reported for 16 x 32 cells, and fo
 _FRAME = "pad_nominal"
 
 
-class FlexiTacOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FlexiTacOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -63,7 +63,7 @@ class FlexiTacOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pitch_mm: Annotated[float, Meta(gt=0, description="distance of neighbouring cells, for views")] = 2.0
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.shape and not all(0 < n <= _MOST_LINES for n in self.shape):
             raise ConfigurationError(f"option size={self.size}: 1 to {_MOST_LINES} rows and columns")
 

@@ -80,7 +80,6 @@ class Framed(NamedTuple):
 
     Attributes:
         identifier: number that distinguishes kinds of frames; 0 if the framing has none.
-        body: its content.
         end: bytes of the stream up to the end of the frame.
     """
 

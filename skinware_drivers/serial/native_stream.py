@@ -31,9 +31,7 @@ def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Str
     """Return a stream in C if C can find these frames, else in Python.
 
     Args:
-        framing: of the line.
         payload_size: bytes of the longest body; frames with longer ones are counted as refused.
-        counters: of the bus.
     """
     made = NativeStream if can_compile(framing) else PythonStream
     return made(framing, payload_size, counters)
@@ -158,8 +156,6 @@ class NativeStream(Stream):
 
     Args:
         framing: of the line; ``can_compile`` must be true for it.
-        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
-        counters: of the bus.
     """
 
     def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:

@@ -79,8 +79,6 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
     """Open a port exclusively.
 
     Args:
-        path: device path or pyserial's URL.
-        options: of the bus.
         baudrate: bits per second.
 
     Raises:

@@ -59,16 +59,12 @@ _SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR)
 
 
 class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
     rate_hz: Annotated[
         float, Meta(ge=0, le=1e6, description="cycles per second, as set in the patches; 0: leave each patch's own")
     ] = 0.0
 
 
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
-    """One open patch on a serial line."""
-
     framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
     payload_size = MOST_PAYLOAD  # of the protocol: that of the patch is known only after it was asked
 

@@ -15,12 +15,11 @@ import asyncio
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware_drivers import Link, Match, Notice, Patch, Poll, check_options, operation
+from skinware_drivers import Link, Match, Notice, Options, Patch, Poll, operation
 from skinware_drivers.hand import Hand
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import (
@@ -35,7 +34,7 @@ from skinware_drivers.serial import (
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, Board
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, PaxiniBoard
 
 _HEADERS = 48
 """At least the bytes around the taxels in any body."""
@@ -53,7 +52,7 @@ _HEADER_OF_HIGH_SPEED = paxini_high_speed.version_request()[:8]
 _VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEADER_OF_HIGH_SPEED[5:])
 
 
-class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PaxiniOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -76,9 +75,6 @@ class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hand: Annotated[
         Literal["right", "left"], Meta(description="high-speed board: the hand with its modules, for their places")
     ] = "right"
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class PaxiniDriver(SerialAdapter[PaxiniOptions]):
@@ -103,7 +99,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
             report=self.tell,
         )
         self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
-        self._board: Board | None = None
+        self._board: PaxiniBoard | None = None
         self._is_asking = False
 
     @property
@@ -173,7 +169,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         await self._described.tare(link, patches)
 
     @property
-    def _described(self) -> Board:
+    def _described(self) -> PaxiniBoard:
         if self._board is None:
             raise BusError("the board was not found yet")
         return self._board
@@ -181,7 +177,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
     def _is_away(self) -> bool:
         return self._line is not None and self._line.fileno() < 0
 
-    async def _find(self, link: Link) -> Board:
+    async def _find(self, link: Link) -> PaxiniBoard:
         """Return the board of the options, or the one that streams or answers."""
         if self.options.board == "converter":
             return self._converter

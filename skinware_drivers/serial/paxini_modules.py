@@ -82,9 +82,7 @@ def module(number: int, points: int, *, key: int = 0, name: str = "") -> Module:
 
     Args:
         number: of the module on its bus; the uids of its taxels are ``number << 16`` and the next ones.
-        points: number of taxels.
         key: number by which frames name it.
-        name: for people.
     """
     first_uid = number << _UID_OF_MODULE
     of_taxels = taxels(points, *(t.name for t in _TAXEL_TYPES), first_uid=first_uid)
@@ -96,7 +94,6 @@ def values(points: int, taxels_at: int, resultant_at: int, step: int) -> list[Va
     """Return the places of a module's values in a payload.
 
     Args:
-        points: number of taxels.
         taxels_at: first byte of the taxels.
         resultant_at: first byte of the resultant.
         step: bytes from one axis of the resultant to the next; the first of them counts.
@@ -165,17 +162,15 @@ def nominal_places(slots: Sequence[Slot], hand: Hand) -> Geometry | None:
     return Geometry.joined(found) if found else None
 
 
-class Board(ABC):
+class PaxiniBoard(ABC):
     """One board on a line; the methods are those of a driver, see :class:`skinware_drivers.adapter.Adapter`.
 
     Attributes:
         framing: of its frames, as far as it is known.
         layout: of its frames, once it was described.
         geometry: nominal places of its modules; None: unknown.
-        period_s: time between two updates.
 
     Args:
-        period_s: time between two updates, as far as it is known.
         use: called with a framing for the line; bytes that are no whole frame yet are dropped.
         report: called with the notices of patches.
     """

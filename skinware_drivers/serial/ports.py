@@ -28,7 +28,6 @@ class Port(ABC):
     """An open serial line; no call blocks.
 
     Attributes:
-        note: advice about it.
         longest_wait: bytes that may wait until it takes them. 0: bytes that are written together stay together.
     """
 
@@ -64,7 +63,6 @@ class DescriptorPort(Port):
     """A tty or a socket.
 
     Args:
-        name: for messages.
         serial: pyserial's object, which owns the descriptor.
         hang_up: False: DTR and RTS keep their levels when it is closed.
     """
@@ -123,12 +121,7 @@ class DescriptorPort(Port):
 
 
 class ThreadedPort(Port):
-    """A port without a descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it.
-
-    Args:
-        name: for messages.
-        serial: pyserial's object, with short timeouts.
-    """
+    """A port without a descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it."""
 
     def __init__(self, name: str, serial: Any) -> None:
         self._name = name
@@ -238,9 +231,6 @@ class PtyPort(Port):
 
     Args:
         link: a symbolic link to the port; replaced if it is one.
-
-    Attributes:
-        path: the port.
 
     Raises:
         BusNotAvailable: no pseudo terminal, or the link cannot be made.

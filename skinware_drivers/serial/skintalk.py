@@ -12,23 +12,20 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Bits, Expand, Frame, Layout, Link, Module, Packed, Patch, Values, check_options, taxels
+from skinware_drivers import Bits, Expand, Frame, Layout, Link, Module, Options, Packed, Patch, Values, taxels
 from skinware_drivers.serial import Field, Packet, SerialAdapter, Unframed
 
 _START, _STOP = b"1", b"0"
 _Bytes = npt.NDArray[np.uint8]
 
 
-class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class SkintalkOptions(Options, frozen=True):
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
     cells: Annotated[int, Meta(description="cells of each patch", ge=1, le=16)] = 16
     negative: Annotated[
@@ -38,7 +35,7 @@ class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     period_ms: Annotated[int, Meta(description="nominal time between two records of a cell, ms", ge=1)] = 20
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if not self.patches or len(set(self.patches)) < len(self.patches) or not set(self.patches) <= set(range(16)):
             raise ConfigurationError(f"patches {self.patches}: give different numbers of 0 to 15")
 

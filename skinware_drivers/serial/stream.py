@@ -152,13 +152,7 @@ class Stream(ABC):
 
 
 class PythonStream(Stream):
-    """A stream whose frames a framer finds.
-
-    Args:
-        framing: of the line.
-        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
-        counters: of the bus.
-    """
+    """A stream whose frames a framer finds."""
 
     def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:
         super().__init__(counters)

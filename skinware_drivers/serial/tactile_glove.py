@@ -12,26 +12,20 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Bits, Frame, Layout, Module, Packed, Patch, Values, check_options, taxels
+from skinware_drivers import Bits, Frame, Layout, Module, Options, Packed, Patch, Values, taxels
 from skinware_drivers.serial import Field, Packet, SerialAdapter
 
 _FIRST = 0x3C
 _MOST = 64
 
 
-class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class TactileGloveOptions(Options, frozen=True):
     taxels: Annotated[int, Meta(description="number of taxels, counted from 0", ge=1, le=_MOST)] = _MOST
     period_ms: Annotated[int, Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):

@@ -38,7 +38,6 @@ class WeissAdapter(SerialAdapter[OptionsT]):
     """One device, which reports its cells; :meth:`describe` keeps the report in ``_cells``.
 
     Attributes:
-        packet: its framing.
         answers: its answers; their status is u16 LE.
         timeout_s, tries: time to wait for an answer, and number of questions.
     """

@@ -21,7 +21,6 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -29,9 +28,10 @@ from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Module, Patch, check_options, operation, taxels
+from skinware_drivers import Link, Module, Options, Patch, operation, taxels
+from skinware_drivers.fields import Above, AnyFlag, DeviceTime, Identifier, Sentinel
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
@@ -49,7 +49,7 @@ _PARTS = ("proximal", "distal")
 _WHOLE = weiss_packet(_HEADER + 2 * _MOST_CELLS, covers=(3, -2), bare_when_empty=True)
 
 
-class WeissDsaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WeissDsaOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -61,9 +61,6 @@ class WeissDsaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(description="request run-length coded data, which begin at this byte of the payload: not certain"),
     ] = None
     period_ms: Annotated[int, Meta(ge=10, le=1000, description="expected time between two frames, ms")] = 100
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class _Matrix(NamedTuple):

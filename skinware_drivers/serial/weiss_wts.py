@@ -17,15 +17,15 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
-from skinware_drivers import Link, Module, Patch, Sensor, check_options, operation
-from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
+from skinware_drivers import Link, Module, Options, Patch, Sensor, operation
+from skinware_drivers.fields import Byte, DeviceTime, Identifier
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import Answers, Refused
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
@@ -44,7 +44,7 @@ _REASONS = {
 }
 
 
-class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WeissWtsOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -59,7 +59,7 @@ class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tare_payload: Annotated[str, Meta(description="payload of the command tare, in hexadecimal")] = ""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.rle and self.rle_offset is None:
             raise ConfigurationError(
                 "option rle: the two public programs that decode run lengths disagree on where they begin (byte 5 in"
@@ -72,8 +72,6 @@ class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
-    """One WTS on a serial line."""
-
     packet = weiss_packet(_HEADER + 2 * _MOST_CELLS)
     answers = Answers("sensor", _REASONS, dtype="<u2")
     timeout_s, tries = 0.5, 3

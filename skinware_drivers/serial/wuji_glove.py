@@ -16,15 +16,15 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
-from skinware_drivers import Link, Match, Module, Patch, Sensor, check_options, operation
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
+from skinware_drivers import Link, Match, Module, Options, Patch, Sensor, operation
+from skinware_drivers.fields import DeviceTime, Identifier, Sentinel, SequenceNumber
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -42,7 +42,7 @@ _ANSWERS = Answers(
 )
 
 
-class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WujiGloveOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -51,13 +51,8 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: leave the board's own")] = 0
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
-    """One board on a serial line."""
-
     framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),

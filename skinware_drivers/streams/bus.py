@@ -65,7 +65,6 @@ def parse_address(scheme: str, channel: str, *, default_port: int | None = None,
 
     Args:
         scheme: for messages, such as ``tcp``.
-        channel: of the bus' name.
         default_port: used if none is given; None: one must be given.
         needs_host: a host must be given, too.
 
@@ -118,14 +117,11 @@ class NetworkBus(SerialBus):
 
     Args:
         channel: ``HOST:PORT``, in the form of its scheme.
-        options: of the class ``options_class``.
 
     Raises:
         ConfigurationError: no such address, or an option is unknown or has a bad value.
 
     Attributes:
-        scheme: with which its name begins.
-        options_class: of its options.
         needs_host: a host must be given.
     """
 
@@ -166,10 +162,6 @@ class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ServerBus(SerialBus):
     """A program that sends by itself, perhaps to others as well, and is only read.
-
-    Args:
-        channel: of the bus' name.
-        options: see :class:`ServerOptions`.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value.

@@ -19,7 +19,7 @@ from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -70,7 +70,7 @@ _FRAMES = Packet(
 )
 
 
-class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class IcubEthOptions(Options, frozen=True):
     """Options of the driver: the CAN port, and those of ``roboskin`` that matter while only listening."""
 
     port: Annotated[Literal[1, 2], Meta(description="CAN port of the Ethernet board that the skin is on")] = 1
@@ -82,7 +82,7 @@ class IcubEthOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     learn_s: Annotated[float, Meta(gt=0, le=60, description="how long to learn which modules send, s")] = 1.0
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         self.of_roboskin()
 
     def of_roboskin(self) -> RoboskinOptions:

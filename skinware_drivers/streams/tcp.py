@@ -26,8 +26,6 @@ _WAITING_CALLERS = 4
 
 
 class TcpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a bus over TCP."""
-
     patience_s: Annotated[
         int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
     ] = 5
@@ -37,7 +35,6 @@ class TcpPort(DescriptorPort):
     """A connection.
 
     Args:
-        name: for messages.
         connection: stays the owner of the descriptor.
         patience_s: seconds without a sign of the other end until it is given up.
     """
@@ -63,7 +60,6 @@ class ListeningPort(Port):
 
     Attributes:
         caller: the connection; None: there is none.
-        address: at which it listens.
 
     Raises:
         BusNotAvailable: it cannot listen there.

@@ -21,7 +21,6 @@ import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -31,11 +30,12 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.fields import Identifier, Match, Sentinel
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, Poll, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
@@ -106,9 +106,7 @@ _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
 """Axes of sensors that have fewer than six; their other values are not connected."""
 
 
-class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class TesolloOptions(Options, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two questions, ms")] = 10
     timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
     ask: Annotated[
@@ -123,13 +121,8 @@ class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["by_row", "by_column"], Meta(description="order in which a grid's cells are sent: not documented")
     ] = "by_row"
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 class _Hand(NamedTuple):
-    """The hand, as it reports itself."""
-
     model: int
     firmware: bytes
     sensors: int

@@ -28,8 +28,6 @@ _ANY_HOST = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
 
 class UdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a bus over UDP."""
-
     local: Annotated[
         Annotated[int, Meta(ge=1, le=65535)] | None,
         Meta(description="port of this computer, for devices that send to a fixed one; default: any that is free"),

@@ -42,10 +42,6 @@ class WebSocketBus(ServerBus):
     64 KiB and more, and one that breaks off with the connection, are counted as refused. After a server has closed the
     connection, or sent no message for ``silence_s``, it is connected to again after growing pauses.
 
-    Args:
-        channel: the URL.
-        options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
-
     Raises:
         ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.
     """

@@ -42,7 +42,6 @@ class WebSocketPort(Port):
 
     Args:
         url: ``ws://HOST:PORT/PATH``.
-        address: host and port of it.
         patience_s: seconds without a sign of the other end until it is given up.
 
     Attributes:

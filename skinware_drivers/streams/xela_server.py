@@ -28,10 +28,11 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import DeviceTime, Identifier, Match, Reply, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match, Reply
-from skinware_drivers.options import check_options
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framed, Framer, Framing
@@ -57,7 +58,7 @@ class XelaMessages(Framing):
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
     def framer(self) -> Framer:
-        return _Messages()
+        return _SeenMessages()
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Refuse: nothing is sent to the server.
@@ -68,7 +69,7 @@ class XelaMessages(Framing):
         raise ValueError(f"XELA's server is only read ({identifier:#x}, {len(payload)} bytes)")
 
 
-class _Messages(Framer):
+class _SeenMessages(Framer):
     def __init__(self) -> None:
         super().__init__()
         self._seen: Seen = {}
@@ -172,9 +173,7 @@ _APART_M = 0.04
 _PITCH_M = 0.0047
 
 
-class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver."""
-
+class XelaServerOptions(Options, frozen=True):
     period_ms: Annotated[
         float, Meta(ge=1, le=10_000, description="nominal time between two messages of the server, ms")
     ] = 10
@@ -187,7 +186,7 @@ class XelaServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     ] = ()
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         for text in self.grids:
             if _GRID_TEXT.fullmatch(text) is None:
                 raise ConfigurationError(f"option grids: {text!r}: write NUMBER=ROWSxCOLUMNS, as 2=5x6")

@@ -27,9 +27,10 @@ from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.layout import Bits, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.options import check_options
+from skinware_drivers.fields import Bits, DeviceTime, Identifier, Match, Sentinel
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
+from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
@@ -54,9 +55,7 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Triangles of a board that have a place in the port's vector.
 
     Attributes:
-        board: its address, for people.
         first: place of the first value of its triangle 0, even if that is missing; below 0: before the vector.
-        triangles: their numbers.
         kind: ``triangle``, ``fingertip`` or ``palm``.
         thermal: channels that feel no touch, unless they are those of the kind.
     """
@@ -74,7 +73,7 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return NON_TACTILE[self.kind] if self.thermal is None else self.thermal
 
 
-class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class YarpOptions(Options, frozen=True):
     """Options of the driver.
 
     Raises:
@@ -95,7 +94,7 @@ class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         taken: set[int] = set()
         for run in self.triangles:
             for triangle, place in run.places():

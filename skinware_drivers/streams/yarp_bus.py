@@ -272,7 +272,6 @@ class YarpBus(ServerBus):
 
     Args:
         channel: ``HOST:PORT/NAME`` or ``/NAME``.
-        options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
 
     Raises:
         ConfigurationError: no such name, or an option is unknown or has a bad value.
@@ -310,7 +309,7 @@ class YarpBus(ServerBus):
             for start in range(0, len(messages), CHUNK):
                 self._hear(messages[start : start + CHUNK], time_ns)
         if isinstance(port, YarpPort):
-            self.counters.lost += port.passed_over
+            self.counters.dropped += port.passed_over
             port.passed_over = 0
 
 

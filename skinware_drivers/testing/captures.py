@@ -28,8 +28,6 @@ class CaptureTests:
     """One test for each capture in a folder.
 
     Attributes:
-        driver: the class of the driver.
-        folder: of the captures, with its subfolders.
         driver_options: options in place of those that the driver had during the capture.
     """
 

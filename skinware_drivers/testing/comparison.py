@@ -27,8 +27,6 @@ class Update:
     """New values of a module in a snapshot.
 
     Attributes:
-        frame: number of the snapshot in the record.
-        module: number of the module.
         burst: number of the burst of its device that it shows; None: it shows none.
     """
 
@@ -38,14 +36,7 @@ class Update:
 
 
 class ShownUpdates:
-    """The updates that a driver showed, each with its burst.
-
-    Args:
-        rig: a driver that ran.
-
-    Attributes:
-        updates: in order.
-    """
+    """The updates that a driver showed, each with its burst."""
 
     def __init__(self, rig: Running) -> None:
         self.rig = rig
@@ -147,7 +138,6 @@ class ShownUpdates:
 
         Args:
             spare: returns whether a burst at this time need not be shown.
-            because: the fault on the wire, for the message.
         """
         end_ns = self.rig.record.times_ns[-1] - 2 * self.rig.period_ns - _LATE_NS
         for module in range(self.structure.n_modules):

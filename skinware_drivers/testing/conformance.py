@@ -36,7 +36,6 @@ class DriverConformance(SilenceTests, TornTests, FaultTests, LifeTests, ValueTes
     pytest begins with the tests of the last base class.
 
     Attributes:
-        driver: the adapter class.
         emulator: emulated hardware for it; see this module's docstring.
         driver_options: options of the driver, as in a configuration file.
         emulator_options: options of the emulator, beside those that the tests set.

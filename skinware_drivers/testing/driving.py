@@ -137,8 +137,6 @@ def driving_lines(
 
     Args:
         lines: an adapter and an unopened bus for every bus.
-        name: of the driver in the namespace.
-        listen_only: send nothing.
         wait: begin the block when the driver publishes.
         publish: see :class:`skinware_drivers.running.runner.Runner`.
         wait_for_buses: see :class:`skinware_drivers.running.runner.Runner`.
@@ -185,7 +183,6 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
 
     Args:
         emulator: class or registered name of an emulator of serial devices.
-        options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = PtyBus("", payload_size=_LONGEST_WRITE)
@@ -199,7 +196,6 @@ def emulated_over_tcp(emulator: Any, **options: Any) -> Iterator[str]:
 
     Args:
         emulator: class or registered name of an emulator of serial or Modbus devices.
-        options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = TcpServerBus("127.0.0.1:0", payload_size=_LONGEST_WRITE)
@@ -213,8 +209,6 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
 
     Args:
         bus: not opened yet.
-        emulator: class of an emulator.
-        options: of the emulator.
     """
     given = msgspec.convert(options, emulator.Options, strict=False)
     hardware, control = emulator(given), _Control()
@@ -246,8 +240,6 @@ class EmulatedSkin(NamedTuple):
     """A driver that runs on emulated devices in this process.
 
     Attributes:
-        driver: the running driver.
-        reader: of the driver.
         bus: the bus. Call its ``vanish`` and ``come_back`` only within ``driver.do``.
         hardware: the devices, to be changed only within ``driver.do``; None: they are on a serial line, or on a bus of
             yours.
@@ -272,14 +264,10 @@ def emulated_skin(
     """Run a driver on emulated devices, or on a bus of your own, while the block runs.
 
     Args:
-        driver: registered name or class of the driver.
         emulator: class of the devices; by default the one registered under the driver's name, unless there is a
             ``bus``. Serial devices get a pseudo terminal.
-        name: of the driver in the namespace.
-        driver_options: options of the driver.
         bus: name of a bus (``vcan0``, a pseudo terminal). With ``emulator``, the devices are emulated on it; without,
             it has devices already.
-        emulator_options: options of the devices.
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver
     adapter = driver_class(msgspec.convert(dict(driver_options or {}), driver_class.Options, strict=False))

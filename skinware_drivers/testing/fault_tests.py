@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import closing
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +12,15 @@ import pytest
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
-from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.decoder import Updates
+from skinware_drivers.description import SkinTables
+from skinware_drivers.polling import Watch
 from skinware_drivers.testing.comparison import ShownUpdates
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, in_its_time, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import FrameLog
+from skinware_drivers.testing.vectors import DirectPath
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -145,13 +148,20 @@ class SilenceTests(Suite):
         heard, rig = play(scenario)
         wire, time_ns = np.concatenate([t.wire for t in heard.takes]), np.concatenate([t.time_ns for t in heard.takes])
         layout, half = rig.adapter.layout, len(wire) // 2
+        with closing(_path(rig, wire, Watch(heard.tables))) as path:
+            kind = path.feed_rows(wire, time_ns).kind
         for number, frame in enumerate(layout.frames):
-            decoder = Decoder([layout], heard.tables, [rig.adapter.period_s])
-            seen = _show(decoder, wire[:half], time_ns[:half], None)
-            silent_ns, before = decoder.state.newest_ns, decoder.state.group_time_ns.copy()
-            seen &= ~_show(decoder, wire[half:], time_ns[half:], number)
-            groups = np.unique(decoder.tables.structure.sensor_group[seen])
-            renewed = groups[decoder.state.group_time_ns[groups] > np.maximum(before[groups], silent_ns)]
+            log = _SensorLog(heard.tables)
+            with closing(_path(rig, wire, log)) as path:
+                path.feed_rows(wire[:half], time_ns[:half])
+                state, seen = path.decoder.state, log.has_values.copy()
+                before = np.maximum(state.group_time_ns, time_ns[:half].max())
+                log.has_values[:] = False
+                others = half + np.flatnonzero(kind[half:] != number)
+                path.feed_rows(wire[others], time_ns[others])
+                seen &= ~log.has_values
+                groups = np.unique(path.decoder.tables.structure.sensor_group[seen[:-1]])
+                renewed = groups[state.group_time_ns[groups] > before[groups]]
             require(
                 not len(renewed),
                 f"frames {frame.name!r} fell silent, but sensors that only they carry stay fresh: other frames fill the"
@@ -235,23 +245,23 @@ class SilenceTests(Suite):
                 )
 
 
-def _show(
-    decoder: Decoder, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], silent: int | None
-) -> npt.NDArray[np.bool_]:
-    """Show frames without those of one kind, and return (n_sensors,) bool: the sensors that they have values of."""
-    batch = FrameBatch(len(wire) + decoder.compiled.headroom, wire.dtype["payload"].shape[0], decoder.compiled.headroom)
-    decoder.put_back(batch)
-    rows = slice(batch.stop, batch.stop + len(wire))
-    batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0
-    batch.stop = rows.stop
-    if silent is not None:
-        _, kind, _ = decoder.name(batch)
-        keep = np.flatnonzero(kind != silent) + batch.start
-        left = batch.start + len(keep)
-        batch.wire[batch.start : left], batch.time_ns[batch.start : left] = batch.wire[keep], batch.time_ns[keep]
-        batch.stop = left
-    updates, _ = decoder.decode(batch)
-    decoder.state.show(updates)
-    found = np.zeros(decoder.tables.structure.n_sensors + 1, bool)
-    found[updates.sensors[updates.whole]] = True
-    return found[:-1]
+def _path(rig: Running, wire: npt.NDArray[np.void], watch: Watch) -> DirectPath:
+    adapter, size = rig.adapter, wire.dtype["payload"].shape[0]
+    return DirectPath(adapter.layout, watch.tables, size, period_s=adapter.period_s, rows=len(wire), watch=watch)
+
+
+class _SensorLog(Watch):
+    """Note which sensors whole updates have values of.
+
+    Attributes:
+        has_values: (n_sensors + 1,) bool; the last one: values without a sensor.
+    """
+
+    sees_all = True
+
+    def __init__(self, tables: SkinTables) -> None:
+        super().__init__(tables)
+        self.has_values: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_sensors + 1, bool)
+
+    def look(self, updates: Updates) -> None:
+        self.has_values[updates.sensors[updates.whole]] = True

@@ -122,9 +122,7 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
 
     Args:
         flavour: of the kernel, a key of ``IMAGES``.
-        command: the command with its arguments.
         timeout_s: time after which the guest is stopped.
-        folder: where the command runs.
 
     Returns:
         The command's exit status; 1 if the lab cannot run here; 124 after the timeout, or if the guest does not boot.

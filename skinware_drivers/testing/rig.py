@@ -79,10 +79,7 @@ class SnapshotLog:
     """Read every snapshot that a driver publishes, in order, as a user's program does.
 
     Attributes:
-        frames: the snapshots.
-        times_ns: times of their publication.
         keep: keep all snapshots; False: only the newest.
-        count: number of published snapshots.
     """
 
     def __init__(self, clock: HandClock) -> None:
@@ -112,16 +109,7 @@ class SnapshotLog:
 
 
 class Rig:
-    """One driver on one bus of emulated devices, in the time of ``clock``.
-
-    Attributes:
-        clock: the time.
-        adapter: the driver.
-        devices: the emulated hardware.
-        truth: the values that the devices feel.
-        wire: between driver and devices; it can damage frames.
-        bus: the bus.
-    """
+    """One driver on one bus of emulated devices, in the time of ``clock``."""
 
     def __init__(
         self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **emulated: Any
@@ -180,7 +168,6 @@ class Running(Rig):
     """A rig whose driver runs as in ``skin-driver``, while the ``async with`` block runs.
 
     Attributes:
-        record: the snapshots that it publishes.
         answers: number of frames that its handshakes took, or that came before it had a structure.
     """
 

@@ -66,8 +66,6 @@ class Suite:
     """A driver and its emulator.
 
     Attributes:
-        driver: the adapter class.
-        emulator: emulated hardware for it; see :mod:`.conformance`.
         driver_options: options of the driver, as in a configuration file.
         emulator_options: options of the emulator, beside those that the tests set.
     """
@@ -95,7 +93,7 @@ class Suite:
     @staticmethod
     def require_all_counted(rig: Running) -> None:
         counters = rig.counters()
-        came = counters["frames"] + counters["refused"] + counters["lost"]
+        came = counters["frames"] + counters["refused"] + counters["dropped"]
         if rig.adapter.medium == "can":
             require(came == rig.wire.frames, f"{rig.wire.frames} frames came, the bus counted {came}")
         layout = rig.adapter.layout

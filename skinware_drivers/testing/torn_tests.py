@@ -8,6 +8,7 @@ them go through the driver's layout in a few batches.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from math import gcd
 from typing import Any, NamedTuple
@@ -16,15 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.decoding.device_numbers import read_numbers
-from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
+from skinware_drivers.polling import Watch
+from skinware_drivers.running.path_hooks import Named
 from skinware_drivers.testing.comparison import ShownUpdates
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.rig import Running, in_its_time
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.vectors import DirectPath
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -98,7 +101,6 @@ class Delivery(NamedTuple):
     """Frames that a bus delivered at once.
 
     Attributes:
-        now_ns: time of the delivery.
         wire: (n,) as in a batch.
         time_ns: (n,) int64, stamps.
     """
@@ -113,7 +115,6 @@ class FrameLog:
 
     Attributes:
         takes: deliveries in order, without empty ones.
-        tables: the skin.
     """
 
     def __init__(self, rig: Running) -> None:
@@ -150,10 +151,6 @@ class Bursts(NamedTuple):
     """Some bursts of one patch.
 
     Attributes:
-        layout: of its frames.
-        tables: the skin.
-        period_s: time between two bursts.
-        size: number of frames of a burst.
         wire: (bursts * size,) frames, as in a batch.
         time_ns: (bursts * size,) int64.
     """
@@ -172,7 +169,6 @@ class Trouble:
 
     Attributes:
         first: the first lost frame.
-        lost: number of lost frames.
         held: the first frame that is held back until ``until_ns``, with all that follow; None: none is.
         until_ns: time at which the sender continues.
     """
@@ -190,14 +186,30 @@ class Trouble:
         return f"{words}, while the sender stood still for {held_ms:.3g} ms; then it caught up"
 
 
+class Marked(NamedTuple):
+    """Whole updates that were shown; (n,) each.
+
+    Attributes:
+        module: int64.
+        oldest_ns: int64, oldest stamp of the frames of each.
+        marks: int64; equal values of a module have equal marks.
+        flagged: bool: not shown as fresh.
+    """
+
+    module: Indices
+    oldest_ns: Indices
+    marks: Indices
+    flagged: npt.NDArray[np.bool_]
+
+    def take(self, which: npt.NDArray[np.bool_]) -> Marked:
+        return Marked(self.module[which], self.oldest_ns[which], self.marks[which], self.flagged[which])
+
+
 @dataclass
 class Outcome:
     """The result of all troubles.
 
     Attributes:
-        tried: number of troubles.
-        shown: number of updates that were shown as fresh.
-        torn: number of those that mix different bursts.
         first: the first trouble that tore an update.
     """
 
@@ -213,17 +225,12 @@ def record(
     """Return bursts of the first patch among the frames of a bus; None if there are too few.
 
     Args:
-        layout: of the bus.
-        tables: the skin.
-        period_s: time between two bursts.
         wire: (n,) frames in order, as in a batch.
         time_ns: (n,) int64.
-        bursts: number of bursts.
     """
     # a device's own time would say when frames were sent; bursts must be distinguished without it
     layout = replace(layout, frames=[replace(frame, time=None) for frame in layout.frames])
-    decoder = Decoder([layout], tables)
-    entry, kind, _ = decoder.name(_batch_of(decoder, wire, time_ns))
+    entry, kind = _named(layout, tables, wire, time_ns)
     own = np.flatnonzero((entry < tables.structure.n_modules) & (kind != 255))
     own = own[tables.structure.module_patch[entry[own]] == 0]
     same = np.flatnonzero((entry[own] == entry[own[:1]]) & (kind[own] == kind[own[:1]]))
@@ -240,8 +247,7 @@ def counter_values(recording: Bursts) -> Indices:
     layout = recording.layout
     if layout.cycle is None or not layout.cycle.counters:
         return np.zeros(0, np.int64)
-    decoder = Decoder([layout], recording.tables)
-    _, kind, _ = decoder.name(_batch_of(decoder, recording.wire, recording.time_ns))
+    _, kind = _named(layout, recording.tables, recording.wire, recording.time_ns)
     names = [frame.name for frame in layout.frames]
     numbers = [
         read_numbers(recording.wire["payload"][kind == names.index(member)], counter)
@@ -254,7 +260,6 @@ def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and count torn updates.
 
     Args:
-        recording: the frames.
         with_period: False: decode without knowing the period of the device.
     """
     outcome = Outcome()
@@ -263,7 +268,7 @@ def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
         troubles = list(_troubles_at(recording, _TROUBLE * recording.size + place, step))
         fresh, torn = find_torn(recording, *_suffer(recording, troubles), with_period=with_period)
         outcome.tried += len(troubles)
-        outcome.shown += len(fresh)
+        outcome.shown += len(fresh.module)
         outcome.torn += int(torn.sum())
         if torn.any() and outcome.first is None:
             number = (fresh.oldest_ns[torn][0] - recording.time_ns[0]) // _span_ns(recording)
@@ -281,11 +286,10 @@ def _step(size: int) -> int:
 
 def find_torn(
     recording: Bursts, rows: Indices, time_ns: Indices, *, with_period: bool = True
-) -> tuple[Updates, npt.NDArray[np.bool_]]:
+) -> tuple[Marked, npt.NDArray[np.bool_]]:
     """Return the updates that are shown as fresh when frames of a recording arrive, and which are torn.
 
     Args:
-        recording: the frames.
         rows: (n,) indices of frames, in order of arrival.
         time_ns: (n,) times of arrival.
         with_period: False: decode without knowing the period of the device.
@@ -293,12 +297,10 @@ def find_torn(
     Returns:
         The updates, and (n_updates,) bool: those that mix different bursts.
     """
-    layouts, tables, n_sensors = [recording.layout], recording.tables, recording.tables.structure.n_sensors
-    known = _marks(_decode(Decoder(layouts, tables), recording.wire, recording.time_ns), n_sensors)
-    decoder = Decoder(layouts, tables, [recording.period_s] if with_period else None)
-    updates = _decode(decoder, recording.wire[rows], time_ns)
-    fresh = updates.take(np.flatnonzero(~updates.status.any(axis=1)))
-    return fresh, ~np.isin(_marks(fresh, n_sensors), known)
+    known = _decode(recording, recording.wire, recording.time_ns, None)
+    shown = _decode(recording, recording.wire[rows], time_ns, recording.period_s if with_period else None)
+    fresh = shown.take(~shown.flagged)
+    return fresh, ~np.isin(fresh.marks, known.marks)
 
 
 def _span_ns(recording: Bursts) -> int:
@@ -331,22 +333,38 @@ def _suffer(recording: Bursts, troubles: Sequence[Trouble]) -> tuple[Indices, In
     return np.concatenate(rows), np.concatenate(times_ns)
 
 
-def _batch_of(decoder: Decoder, wire: npt.NDArray[Any], time_ns: Indices) -> FrameBatch:
-    batch = FrameBatch(len(wire), wire.dtype["payload"].shape[0], decoder.compiled.headroom)
-    batch.stop = batch.start + len(wire)
-    batch.wire[batch.start : batch.stop] = wire
-    batch.time_ns[batch.start : batch.stop] = time_ns
-    return batch
+def _named(layout: Layout, tables: SkinTables, wire: npt.NDArray[Any], time_ns: Indices) -> Named:
+    with closing(DirectPath(layout, tables, wire.dtype["payload"].shape[0], rows=len(wire))) as path:
+        return path.feed_rows(wire, time_ns)
 
 
-def _decode(decoder: Decoder, wire: npt.NDArray[Any], time_ns: Indices) -> Updates:
-    updates, _ = decoder.decode(_batch_of(decoder, wire, time_ns))
-    return updates.take(updates.whole)
+def _decode(recording: Bursts, wire: npt.NDArray[Any], time_ns: Indices, period_s: float | None) -> Marked:
+    layout, tables, size = recording.layout, recording.tables, wire.dtype["payload"].shape[0]
+    log = _UpdateLog(tables)
+    with closing(DirectPath(layout, tables, size, period_s=period_s, rows=len(wire), watch=log)) as path:
+        path.feed_rows(wire, time_ns)
+    return log.all
 
 
-def _marks(updates: Updates, n_sensors: int) -> Indices:
-    values = np.where(updates.sensors == n_sensors, 0, updates.values).astype(updates.values.dtype)
-    data = np.ascontiguousarray(values).view(np.uint8).reshape(len(updates), -1).astype(np.int64)
-    factors = np.random.default_rng(3).integers(1, 1 << 62, data.shape[1])
-    marks: Indices = data @ factors + updates.module * 0x9E37_79B9_7F4A_7C1
-    return marks
+class _UpdateLog(Watch):
+    """Write down all whole updates."""
+
+    sees_all = True
+
+    def __init__(self, tables: SkinTables) -> None:
+        super().__init__(tables)
+        none = np.zeros(0, np.int64)
+        self.all = Marked(none, none, none, none > 0)
+
+    def look(self, updates: Updates) -> None:
+        whole, sink = np.flatnonzero(updates.whole), self.tables.structure.n_sensors
+        values = np.where(updates.sensors == sink, 0, updates.values).astype(updates.values.dtype)[whole]
+        data = np.ascontiguousarray(values).view(np.uint8).reshape(len(whole), -1).astype(np.int64)
+        factors = np.random.default_rng(3).integers(1, 1 << 62, data.shape[1])
+        marks = data @ factors + updates.module[whole] * 0x9E37_79B9_7F4A_7C1
+        self.all = Marked(
+            np.append(self.all.module, updates.module[whole]),
+            np.append(self.all.oldest_ns, updates.oldest_ns[whole]),
+            np.append(self.all.marks, marks),
+            np.append(self.all.flagged, (updates.status[whole] != 0).any(axis=1)),
+        )

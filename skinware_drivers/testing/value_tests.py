@@ -16,12 +16,10 @@ from skinware_drivers.virtual.hand_clock import HandClock
 _BURSTS = 24
 _SILENCE_S = 1.5
 _RATE_TOLERANCE = 0.3
-_NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")
+_NOTHING_OF_THESE = ("dropped", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")
 
 
 class ValueTests(Suite):
-    """Values of good data."""
-
     @in_its_time
     async def test_every_value_is_right_and_in_order(self, clock: HandClock) -> None:
         """Each sensor shows its values, every burst is shown once, and no counter of faults grows."""

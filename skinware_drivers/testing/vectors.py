@@ -33,8 +33,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.counters import BusCounters, FramerCounters
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.layout import Layout
@@ -42,6 +41,7 @@ from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
+from skinware_drivers.running.path_hooks import Named
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.clock import run_in_its_time
@@ -90,15 +90,26 @@ class DirectPath:
 
     Args:
         layout: of the only bus.
-        tables: the skin.
         payload_size: longest payload, bytes.
+        period_s: nominal time between two updates of a module; None: cycles are joined whenever their frames come.
+        rows: the most frames that are fed at once.
+        watch: looks at updates; None: none does.
 
     Attributes:
         decoder: its ``state`` holds the values and counters after the frames so far.
     """
 
-    def __init__(self, layout: Layout, tables: SkinTables, payload_size: int) -> None:
-        self.decoder = Decoder([layout], tables)
+    def __init__(
+        self,
+        layout: Layout,
+        tables: SkinTables,
+        payload_size: int,
+        *,
+        period_s: float | None = None,
+        rows: int = 1,
+        watch: Watch | None = None,
+    ) -> None:
+        self.decoder = Decoder([layout], tables, None if period_s is None else [period_s])
         self._namespace = Namespace(f"direct-{os.getpid()}-{secrets.token_hex(4)}")
         self._writer = DriverWriter(
             "direct",
@@ -107,8 +118,8 @@ class DirectPath:
             patch_counters=ALL_PATCH_COUNTERS,
             namespace=self._namespace,
         )
-        publisher = Publisher(self._writer, self.decoder, Watch(tables), 1.0, by_cycle=False)
-        self._batch = FrameBatch(1, payload_size, self.decoder.compiled.headroom)
+        publisher = Publisher(self._writer, self.decoder, watch or Watch(tables), 1.0, by_cycle=False)
+        self._batch = FrameBatch(rows, payload_size, self.decoder.compiled.headroom)
         self._path = NativePath(self.decoder, publisher, self._batch)
 
     @property
@@ -122,6 +133,16 @@ class DirectPath:
         self._path.empty()
         self._batch.append(0, time_ns, identifier, payload)
         self._path.digest()
+
+    def feed_rows(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> Named:
+        """Decode frames as in a batch; return what they are."""
+        self._path.empty()
+        batch = self._batch
+        rows = slice(batch.stop, batch.stop + len(wire))
+        batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0
+        batch.stop = rows.stop
+        self._path.digest()
+        return self._path.named(rows)
 
     def close(self) -> None:
         self._writer.close()

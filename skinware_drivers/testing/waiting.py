@@ -37,8 +37,6 @@ def read_until(
     """Return the first snapshot that fulfils a condition; if none does in time, fail with the state of the last one.
 
     Args:
-        reader: of the driver.
-        condition: a test of a snapshot.
         within_s: longest time to wait, s.
     """
     end, last, count = time.monotonic() + within_s, None, 0

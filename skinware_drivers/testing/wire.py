@@ -31,11 +31,7 @@ class Stumbling:
     """A sender that loses runs of frames, stands still and catches up; all chance comes from one seed.
 
     Args:
-        period_ns: time between two bursts.
         frames: number of frames of a burst; up to twice as many are lost in a row.
-
-    Attributes:
-        stumbles: number of stumbles so far.
     """
 
     def __init__(self, period_ns: int, frames: int) -> None:
@@ -107,14 +103,10 @@ class Truth:
     """The source of an emulator's values, which keeps them.
 
     Args:
-        clock: the time.
         n_felt: number of values that each device feels.
-        pattern: the values.
         shown: returns the values that the protocol can send for values that were felt.
 
     Attributes:
-        n_values: number of values that each device sends.
-        bursts: the bursts so far, by device.
         remember: keep the bursts.
     """
 
@@ -155,16 +147,12 @@ class Interference:
     """Devices behind a wire with faults.
 
     Attributes:
-        hardware: the devices.
         fault: of some frames; None: none.
         every_ns: mean time between two faults.
         silent: nothing passes in either direction.
         foreign: identifiers of frames of other devices beside the data.
         keep: returns whether a frame passes.
         stumbling: holds frames back and loses some in a row; None: nothing does.
-        damages: the faults so far.
-        frames: number of frames that passed.
-        foreign_sent: number of frames of other devices among them.
         sent: frames that the driver sent to the devices.
         remember: keep ``sent``.
         identifiers: of the frames that passed, with their numbers.

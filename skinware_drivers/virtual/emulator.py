@@ -33,11 +33,10 @@ _RADIUS = 0.22
 """Radius of the pressed spot; the device is 1 wide."""
 
 
-class Press:
+class WanderingPress:
     """A wandering press on one device.
 
     Args:
-        seed: of the emulation.
         number: of the device; devices with other numbers feel other presses.
         places: (n, 2) of its sensors, 0 to 1.
     """
@@ -95,7 +94,7 @@ class Emulator(Stage[OptionsT]):
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
         super().__init__(options, log=log)
         self._source = source
-        self._press: dict[int, Press] = {}
+        self._press: dict[int, WanderingPress] = {}
         self._n_values = 0
 
     # A subclass defines these
@@ -165,7 +164,7 @@ class Emulator(Stage[OptionsT]):
         """Make the devices and everything else on the bus."""
         places = self.places()
         self._n_values = len(places)
-        self._press = {number: Press(self.options.seed, number, places) for number in self.numbers}
+        self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
         return super().power_up(now_ns)
 
     def check_frame(self, frame: CanFrame) -> None:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import msgspec
 from msgspec import Meta
 
-from skinware_drivers.options import check_options
+from skinware_drivers.options import Options
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Seconds = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=0)]
 
 
-class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatorOptions(Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Touch and faults; an emulator adds options for its devices.
 
     Raises:
@@ -47,6 +46,3 @@ class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     ] = ()
     restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
     boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted device ignores commands")] = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)

@@ -56,7 +56,6 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     ======================  ============================================================================================
 
     Attributes:
-        event: its kind.
         time_ns: CLOCK_MONOTONIC ns of the bus that carries the frames.
         board: number of the device; of ROBOSKIN boards, the CAN address.
         cycle: number of the device's burst since power-up, from 0.
@@ -99,9 +98,6 @@ def damaged_cycles(events: Iterable[Event]) -> set[tuple[int, int, int]]:
 class JsonLinesLog:
     """Write events to a file, one JSON object a line, each as soon as it happens.
 
-    Args:
-        path: the file; an existing one is replaced.
-
     Raises:
         ConfigurationError: the file cannot be written.
     """
@@ -114,7 +110,6 @@ class JsonLinesLog:
             raise ConfigurationError(f"cannot write the log {path}: {error.strerror}") from error
 
     def append(self, event: Event) -> None:
-        """Write one event."""
         self._file.write(self._encoder.encode(event) + b"\n")
 
     def close(self) -> None:

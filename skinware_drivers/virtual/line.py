@@ -32,8 +32,6 @@ class _EmulatedLine(Bus):
     """A bus of lines with emulated devices at the other end.
 
     Args:
-        channel: name of the emulator.
-        options: of the emulator, as texts.
         payload_size: longest body that fits into a batch.
         listen_only: refuse every ``send``.
 

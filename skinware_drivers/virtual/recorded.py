@@ -53,8 +53,6 @@ class Recorded(NamedTuple):
 
     Attributes:
         driver_type: as ``--driver`` takes it; empty: not in the file.
-        listen_only: it sent nothing.
-        options: of the driver for this bus.
     """
 
     driver_type: str = ""
@@ -67,7 +65,6 @@ class Clock(NamedTuple):
 
     Attributes:
         now_ns: returns CLOCK_MONOTONIC ns.
-        timer: makes the timers that wake readers.
     """
 
     now_ns: Callable[[], int] = time.monotonic_ns
@@ -122,7 +119,6 @@ class Conversation(Listener):
 
     Args:
         wanted: the registers to look for in the replies.
-        counters: of the bus.
         over_tcp: the recording is of a connection, not of a serial line.
     """
 
@@ -135,7 +131,6 @@ class Conversation(Listener):
         self._waiting: list[Message] = []
 
     def take(self, chunk: bytes, time_ns: int, *, is_sent: bool) -> None:
-        """Take recorded bytes."""
         if not self._over_tcp:
             self.heard(chunk, time_ns)
             return
@@ -274,7 +269,6 @@ def replayed_bus(
     """Make the bus ``replay`` of a recorded bus in the file ``channel``.
 
     Args:
-        channel: the file.
         options: see :class:`ReplayOptions`.
         payload_size: longest payload of the layout.
         listen_only: refuse to send, and wait for no question.
@@ -342,7 +336,6 @@ def first_of(wires: Sequence[WireTrack], start_s: float = 0.0) -> int:
     """Return the time of the first item on any of these wires, in the recording's CLOCK_MONOTONIC ns; 0: none.
 
     Args:
-        wires: of one recording.
         start_s: earliest time, s since the recording began.
     """
     firsts = (next(wire.items(start_s=start_s), None) for wire in wires)
@@ -359,7 +352,6 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     """Return a recorded wire.
 
     Args:
-        recording: that has it.
         bus: its name; empty: any.
         driver: its driver; empty: any.
 

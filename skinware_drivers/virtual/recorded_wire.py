@@ -88,7 +88,6 @@ class RecordedWire:
     """The devices at the other end of a recorded wire; see :class:`.hardware.EmulatedHardware`.
 
     Args:
-        items: of the recording, by time.
         first_ns: time of the recording, in its CLOCK_MONOTONIC, at which it begins.
         speed: 2.0: twice as fast.
         waits: for the questions that were asked in the recording.
@@ -139,7 +138,6 @@ class RecordedWire:
         return asked[0][0] if is_early else max(due_ns, asked[0][0])
 
     def emit(self, now_ns: int) -> list[WireFrame]:
-        """Return the items that are due."""
         found: list[WireFrame] = []
         self._looked_ns = now_ns
         while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._hurry(item, now_ns)):
@@ -224,7 +222,6 @@ class RecordedPort(Port):
     """A port that returns the bytes of the recording, read by read.
 
     Args:
-        wire: of the recording.
         clock: returns CLOCK_MONOTONIC ns.
         make_timer: makes the timer that wakes the reader; another clock needs another timer.
 

@@ -119,22 +119,13 @@ class _Scheduled(NamedTuple):
 class Stage(ABC, HasOptions[OptionsT]):
     """Emulated devices on one bus, powered up by the first call that has a time.
 
-    Args:
-        options: of the devices and their faults.
-        log: receives the :mod:`.events`, for example a list.
-
     Attributes:
         Options: class of the options; they become those of ``skin-emulate`` and of ``--bus virtual?...``.
-        medium: kind of bus.
-        numbers: of the devices.
         numbered_by: name of the option that has these numbers, or the one number; empty: no option has them.
         counted: names of the totals besides ``frames`` of ``emit``, ``bursts`` of devices, ``commands`` that a device
             obeyed or answered, ``silenced`` frames, and ``unheard`` frames of ``skip``.
         frame_faults: the damage that each option with a probability does to data frames.
         longest_queue: frames that a device keeps for the wire; more are lost.
-        wire: what the devices share.
-        log: receives the events.
-        counts: the totals.
         silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
         devices: by number, once powered up.
     """
@@ -224,9 +215,6 @@ class Stage(ABC, HasOptions[OptionsT]):
         """Hand the frames of a burst to the wire; faults happen here.
 
         Args:
-            device: that sends them.
-            identifiers: of the frames.
-            payloads: of the frames.
             time_ns: when they are ready, unless the option ``jitter_us`` delays them.
             usual: all have 8 bytes and 11-bit identifiers.
         """

@@ -72,7 +72,6 @@ class Wire:
     """The wire that the transmitters share.
 
     Attributes:
-        transmitters: all devices.
         heard: frames that went over the wire and were not fetched yet, oldest first.
         speed: in Mbit/s.
     """
@@ -155,11 +154,7 @@ class ForeignTraffic:
     """Other devices, which send at random moments, ``rate_hz`` frames a second on average.
 
     Args:
-        identifiers: of their frames.
         rate_hz: more than 0.
-        random: the source of chance.
-        transmitter: their place on the wire.
-        log: receives the events.
         counts: totals, of which ``foreign`` is counted.
         now_ns: when the devices begin.
     """

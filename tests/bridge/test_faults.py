@@ -89,7 +89,7 @@ class Witness:
         if number not in self.taken[-1:]:
             self.taken.append(number)
         assert self.taken == sorted(self.taken)
-        assert self._reader.lost + len(self.taken) == number - self.taken[0] + 1
+        assert self._reader.missed + len(self.taken) == number - self.taken[0] + 1
         self.is_fresh = bool(frame.fresh("pressure").all())
 
     def close(self) -> None:
@@ -283,6 +283,7 @@ def test_commands_that_cannot_be_carried_out_say_why_in_a_line(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.thorough
 def test_a_port_that_is_in_use_is_told_in_a_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -131,6 +131,7 @@ LIES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", LIES)
 def test_no_lie_ends_a_join_and_each_is_counted(namespace: Namespace, name: str) -> None:
     lie = LIES[name]
@@ -170,6 +171,7 @@ def test_the_rings_of_a_robot_have_one_limit() -> None:
     budget.reserve("b", 100)
 
 
+@pytest.mark.thorough
 def test_a_generation_that_swells_costs_no_more_than_it_may() -> None:
     packer = zlib.compressobj(9)
     bomb = generation(b"")[: 4 + len(about(tare="x"))] + packer.compress(bytes(300 << 20)) + packer.flush()
@@ -231,6 +233,7 @@ def test_every_message_with_other_bytes_is_read_or_refused(kind: tuple[type[Any]
         read_text(text[:at] + other + text[at + len(other) :], kind[0])
 
 
+@pytest.mark.thorough
 @given(st.text(max_size=300))
 def test_every_token_is_read_or_refused(text: str) -> None:
     for key in (text, f"skinware/live/{ROBOT}/{text}/{INSTANCE}", f"skinware/live/{ROBOT}/1/{text}"):
@@ -241,6 +244,7 @@ def test_every_token_is_read_or_refused(text: str) -> None:
 # -- the robot's end, and those that watch ------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_no_question_ends_a_robots_bridge_and_each_is_counted(namespace: Namespace) -> None:
     with network() as net, serving(net, namespace) as server:
         eve = NetLink(net)

@@ -135,6 +135,7 @@ def test_a_router_says_who_may_serve_and_who_may_call(namespace: Namespace, tmp_
                         assert service.call("tare", timeout_s=PATIENCE_S) == "tared"
 
 
+@pytest.mark.thorough
 def test_who_nobody_answers_is_told_why() -> None:
     ended = run("skin-bridge", "list", "--connect", at(free_port()))
     assert ended.returncode == 1

@@ -32,7 +32,7 @@ from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.service import ServiceReader
-from skinware.transfer.codec import CodedColumn, Decoder, Encoder
+from skinware.transfer.codec import CodedColumn, FrameDecoder, FrameEncoder
 from tests.bridge.rig import publish, structure
 from tests.streams.peers import free_port
 
@@ -77,6 +77,7 @@ class Peers:
         return round(ns - self.offset_ns - self.drift * (ns - self.at_ns))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("offset_ns", [0, 100 * MS, -3 * 3600 * NS_PER_S])
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
 def test_the_other_clock_is_found_and_its_error_told_at_every_moment(offset_ns: float, drift: float) -> None:
@@ -89,6 +90,7 @@ def test_the_other_clock_is_found_and_its_error_told_at_every_moment(offset_ns: 
             assert peers.clock.error_ns < 150_000 + 100_000  # what no clock can know, and some more
 
 
+@pytest.mark.thorough
 def test_the_error_stays_true_when_the_drift_changes() -> None:
     peers = Peers(0, 5e-6)
     for drift in (5e-6, 40e-6, -60e-6, 0):
@@ -241,7 +243,7 @@ def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
             frame = reader.read()
             message = raw_message(frame)
             assert split_frame(message) == (RAW, frame.generation, frame.slot, False)
-            encoder = Encoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
+            encoder = FrameEncoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
             coded = encoder.encode(frame)
             for keeps in (True, False):
                 expected = FrameMessage(CODED, frame.generation, memoryview(coded), keeps)
@@ -266,7 +268,7 @@ def test_frames_one_after_the_other_are_those_that_were_coded(namespace: Namespa
         with DriverReader("arm", namespace=namespace) as reader:
             segment = reader._ring.segment
             columns = [CodedColumn.of(column) for column in segment.layout.slot]
-            encoder, decoder = Encoder(columns), Decoder(columns, segment.layout.slot_stride)
+            encoder, decoder = FrameEncoder(columns), FrameDecoder(columns, segment.layout.slot_stride)
             for number in range(60):
                 frames = writer.begin(from_last=True)
                 frames["values"][:] = generator.integers(0, 65536, 256) if number % 3 else 5

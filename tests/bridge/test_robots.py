@@ -22,6 +22,7 @@ def driver(namespace: Namespace) -> DriverWriter:
     return DriverWriter("arm", structure(), namespace=namespace, rate_hz=50)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mode", ["push", "pull"])
 def test_two_robots_of_one_name_are_told_and_never_mixed(namespace: Namespace, mode: str) -> None:
     with ExitStack() as stack:
@@ -84,6 +85,7 @@ def state(watcher: Watcher) -> str:
     return "" if summary is None else summary.drivers["arm"].state
 
 
+@pytest.mark.thorough
 def test_each_robot_tells_how_it_is(namespace: Namespace) -> None:
     with ExitStack() as stack:
         net = stack.enter_context(network())

@@ -66,7 +66,7 @@ def driver(namespace: Namespace, operations: Mapping[str, Callable[..., object]]
         operations=operations,
         rate_hz=50,
         driver_type="virtual",
-        bus_counters=["lost", "read"],
+        bus_counters=["dropped", "read"],
         patch_counters=["late"],
     )
 
@@ -254,6 +254,7 @@ def test_a_part_vanishes_and_comes_back(net: Net, namespace: Namespace) -> None:
     assert "robot walle: no patch 'thumb'; there are: palm, wrist" in troubles(ends)
 
 
+@pytest.mark.thorough
 def test_another_part_under_the_same_name_is_never_seen_under_the_old_structure(net: Net, namespace: Namespace) -> None:
     """The region has other sensors of each generation; a value tells of which sensor it is."""
     wish = Wish(in_regions=("tips",), regions=(Region("tips", module=("palm, triangle 1",)),))
@@ -293,7 +294,7 @@ def test_lost_is_that_of_the_robot(net: Net, namespace: Namespace) -> None:
         with DriverReader("hand", namespace=ends.here, timeout_s=PATIENCE_S) as reader:
             publish(writer)
             wait_until(lambda: int(reader.read().values[0]) == writer.sequence - 1)
-            before = reader.lost
+            before = reader.missed
             net.loses = lambda kind, _key: kind == "frame"
             offered = net.offered
             for number in range(1, 8):
@@ -302,7 +303,7 @@ def test_lost_is_that_of_the_robot(net: Net, namespace: Namespace) -> None:
             net.loses = lambda _kind, _key: False
             publish(writer)
             wait_until(lambda: int(reader.read().values[0]) == writer.sequence - 1)
-            assert reader.lost - before == 7
+            assert reader.missed - before == 7
 
 
 def test_operations_are_those_of_the_whole_driver(net: Net, namespace: Namespace) -> None:

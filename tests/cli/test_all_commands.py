@@ -100,6 +100,7 @@ def test_an_unknown_driver_or_namespace_is_a_failure(line: str, elsewhere: bool)
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.thorough
 def test_calm_names_the_driver_that_may_be_meant(namespace: Namespace) -> None:
     with FakeSkin("torso"), running("skin-calm", "torzo") as calm:
         wait_until(lambda: "There are" in calm.errors)

@@ -158,6 +158,7 @@ def test_a_probe_a_driver_and_the_truth(tmp_path: Path, capsys: pytest.CaptureFi
             assert (found.normal * truth.normal).sum(axis=1)[20:30].min() > 0.9
 
 
+@pytest.mark.thorough
 def test_topology_from_strokes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "map.toml"
     surface, sums = strokes()
@@ -182,6 +183,7 @@ def test_topology_from_strokes(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert f"Pieces: 1, of {known.sum()} sensors; not known: {(~known).sum()}" in file.read_text()
 
 
+@pytest.mark.thorough
 def test_strokes_of_a_running_skin_end_it(tmp_path: Path) -> None:
     file = tmp_path / "map.toml"
     surface = triangles(2)
@@ -234,6 +236,7 @@ def test_check_names_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
         assert done == {"event": "done", "file": str(file), "findings": 3, "compared": True}
 
 
+@pytest.mark.thorough
 def test_finger_from_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     surface = triangles(MODULES, patches=2)
     file = tmp_path / "skin.toml"
@@ -245,6 +248,7 @@ def test_finger_from_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert off_m(surface, found.position_m).mean() < 0.002
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_done_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "skin.toml"
     touch = ["touch", "--poses", "robot", "-o", str(file), "-T", "0"]

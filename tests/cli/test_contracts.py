@@ -23,13 +23,14 @@ def all_live(status: dict[str, Any]) -> bool:
     return all(part["state"] == "live" for part in (*status["buses"], *status["patches"]))
 
 
+@pytest.mark.thorough
 def test_skin_driver_tells_what_it_does() -> None:
     with running("skin-driver", *VIRTUAL) as driver:
         ready = driver.wait_for("ready")
         assert (ready["driver"], ready["sensors"], ready["modules"], ready["patches"]) == ("roboskin", 384, 32, 2)
         status = driver.wait_for("status", all_live)
         (bus,) = status["buses"]
-        assert (bus["name"], bus["state"], bus["lost"], bus["errors"]) == ("virtual?boards=7,8", "live", 0, 0)
+        assert (bus["name"], bus["state"], bus["dropped"], bus["errors"]) == ("virtual?boards=7,8", "live", 0, 0)
         assert bus["frames"] > 0
         assert [(p["name"], p["state"], p["orphans"]) for p in status["patches"]] == [
             ("board 7", "live", 0),
@@ -40,6 +41,7 @@ def test_skin_driver_tells_what_it_does() -> None:
         assert driver.process.returncode == 0
 
 
+@pytest.mark.thorough
 def test_sigterm_ends_a_driver_in_good_order(namespace: Namespace) -> None:
     with running("skin-driver", *VIRTUAL) as driver:
         driver.wait_for("ready")
@@ -103,6 +105,7 @@ def test_a_killed_driver_is_shown_as_dead_and_its_readers_live_on() -> None:
                 assert reader.read(newer_than=last, timeout_s=30).generation != last.generation
 
 
+@pytest.mark.thorough
 def test_output_into_a_pipe_that_closes_is_no_error() -> None:
     with running("skin-driver", *VIRTUAL) as driver:
         driver.wait_for("ready")
@@ -140,6 +143,7 @@ def test_mistakes_get_one_clear_line_and_the_right_exit_code(arguments: list[str
     assert words in result.stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("arguments", "code", "words"), [(["--bus", "no-such-can0"], 1, "CAN"), ([], 2, "which bus?")])
 def test_the_exit_code_is_that_of_the_process(arguments: list[str], code: int, words: str) -> None:
     result = run("skin-driver", *arguments)
@@ -167,6 +171,7 @@ def test_mistakes_in_a_file_say_where(tmp_path: Path, text: str, words: str) -> 
     assert words in result.stderr
 
 
+@pytest.mark.thorough
 def test_a_file_configures_buses_kinds_and_names(tmp_path: Path) -> None:
     path = tmp_path / "skin.toml"
     path.write_text(
@@ -185,6 +190,7 @@ def test_a_file_configures_buses_kinds_and_names(tmp_path: Path) -> None:
             assert reader.structure.module_kind[:6].tolist() == [b"fingertip"] * 5 + [b"triangle"]
 
 
+@pytest.mark.thorough
 def test_a_listener_takes_boards_in_on_a_hangup_signal(tmp_path: Path) -> None:
     """Told to listen only in the file, it sends nothing; SIGHUP makes it look again and does not end it."""
     path = tmp_path / "skin.toml"
@@ -207,6 +213,7 @@ def test_a_listener_takes_boards_in_on_a_hangup_signal(tmp_path: Path) -> None:
         assert driver.process.returncode == 0
 
 
+@pytest.mark.thorough
 def test_a_name_in_use_is_refused() -> None:
     with running("skin-driver", *VIRTUAL) as driver:
         driver.wait_for("ready")
@@ -215,6 +222,7 @@ def test_a_name_in_use_is_refused() -> None:
         assert "a running driver or service is called 'roboskin'" in result.stderr
 
 
+@pytest.mark.thorough
 def test_nobody_there_is_said() -> None:
     assert "Nothing runs here yet" in run("skin-info").stdout
     result = run("skin-dump")
@@ -223,6 +231,7 @@ def test_nobody_there_is_said() -> None:
     assert "no driver runs" in run("skin-top", "--plain", "-T", "1").stdout
 
 
+@pytest.mark.thorough
 def test_frames_of_another_python_can_program_are_decoded() -> None:
     """The first of the done-when list that needs no CAN in the kernel: multicast between two processes."""
     bus = "udp_multicast:239.74.163.2?port=43117"

@@ -53,6 +53,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -128,6 +129,7 @@ def test_no_room_is_one_line_and_leaves_nothing(file: Path, tmp_path: Path, form
     assert list(tmp_path.iterdir()) == [tmp_path / "walk.mcap"]
 
 
+@pytest.mark.thorough
 def test_no_permission_is_one_line(file: Path, tmp_path: Path) -> None:
     closed, unreadable = tmp_path / "closed", tmp_path / "unreadable.mcap"
     closed.mkdir(mode=0o500)

@@ -77,6 +77,7 @@ class MySkin(RoboskinDriver):
 """
 
 
+@pytest.mark.thorough
 def test_a_watch_that_fails_for_a_bus_that_joins_ends_it_too(tmp_path: Path) -> None:
     path, file = tmp_path / "my_skin.py", tmp_path / "torso.toml"
     path.write_text(UNWATCHED)

@@ -52,6 +52,7 @@ def told(capsys: pytest.CaptureFixture[str], command: click.Command, *arguments:
     return output.err if status else output.out
 
 
+@pytest.mark.thorough
 def test_it_runs_from_a_file_that_a_configuration_names(write: Write, tmp_path: Path) -> None:
     write("robot/finger.py", FINGER)
     file = Path(write("robot/hand.toml", 'driver = "./finger.py"\n[[bus]]\nname = "virtual"\n'))

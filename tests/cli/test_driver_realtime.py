@@ -29,6 +29,7 @@ def config_file(folder: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.thorough
 @needs_rights
 def test_a_running_driver_holds_what_was_asked_for() -> None:
     with running("skin-driver", *VIRTUAL, "--realtime", "fifo:50", "--cpus", str(CPU)) as driver:
@@ -43,6 +44,7 @@ def test_a_running_driver_holds_what_was_asked_for() -> None:
     assert "refused" not in driver.errors
 
 
+@pytest.mark.thorough
 @needs_rights
 def test_the_thread_of_a_python_can_bus_is_under_the_profile_too() -> None:
     """Else it would wait for a CPU while the loop waits for it."""
@@ -54,6 +56,7 @@ def test_the_thread_of_a_python_can_bus_is_under_the_profile_too() -> None:
             assert scheduling.threads_under(os.SCHED_FIFO, driver.process.pid) >= 2
 
 
+@pytest.mark.thorough
 @needs_rights
 def test_a_file_asks_for_it_and_the_command_line_wins(tmp_path: Path) -> None:
     path = config_file(tmp_path, f'realtime = "fifo:40"\ncpus = [{CPU}]')
@@ -68,6 +71,7 @@ def test_a_file_asks_for_it_and_the_command_line_wins(tmp_path: Path) -> None:
         assert scheduling.locked_kib(driver.process.pid) == 0
 
 
+@pytest.mark.thorough
 def test_cpus_alone_are_kept_and_nothing_else_is_asked_for() -> None:
     with running("skin-driver", *VIRTUAL, "--cpus", str(CPU)) as driver:
         driver.wait_for("ready")
@@ -75,6 +79,7 @@ def test_cpus_alone_are_kept_and_nothing_else_is_asked_for() -> None:
         assert scheduling.policy(driver.process.pid) == (os.SCHED_OTHER, 0)
 
 
+@pytest.mark.thorough
 def test_a_driver_without_rights_says_so_line_by_line_and_runs() -> None:
     arguments = without_rights(str(BIN / "skin-driver"), *VIRTUAL, "--realtime", "fifo:50", "--cpus", str(CPU))
     with running(*arguments) as driver:

@@ -14,6 +14,7 @@ from skinware.memory.namespace import Namespace
 from tests.commands import BIN, PATIENCE_S
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("asked_before", [False, True])
 def test_a_driver_ends_with_its_terminal_and_only_then(namespace: Namespace, asked_before: bool) -> None:
     ours, terminal = os.openpty()

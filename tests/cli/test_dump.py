@@ -47,8 +47,8 @@ def test_json_contract(capsys: pytest.CaptureFixture[str]) -> None:
     first = frames[0]["sequence"]
     assert [frame["sequence"] for frame in frames] == list(range(first, first + 5))
     for frame in frames:
-        assert frame.keys() == {"driver", "sequence", "acquired_ns", "age_ms", "lost", "values", "status"}
-        assert (frame["driver"], frame["lost"]) == ("torso", 0)
+        assert frame.keys() == {"driver", "sequence", "acquired_ns", "age_ms", "missed", "values", "status"}
+        assert (frame["driver"], frame["missed"]) == ("torso", 0)
         assert len(frame["values"]) == len(frame["status"]) == 96
         assert (frame["status"][4:7], frame["age_ms"] >= 0) == ([0, int(Status.STALE), 0], True)
     times = [frame["acquired_ns"] for frame in frames]
@@ -109,7 +109,7 @@ def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFix
         frames = dumped(capsys, "--rate", "50", "-n", "5")
     sequences = [frame["sequence"] for frame in frames]
     assert sequences == sorted(set(sequences))
-    assert frames[-1]["lost"] == sequences[-1] - sequences[0] - 4
+    assert frames[-1]["missed"] == sequences[-1] - sequences[0] - 4
 
 
 def test_without_a_name_the_only_driver_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,6 +121,7 @@ def test_without_a_name_the_only_driver_is_taken(capsys: pytest.CaptureFixture[s
             assert "has: a, b; give one as NAME" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with fake_process("dead") as process:
         kill(process)
@@ -180,6 +181,7 @@ def test_waits_for_the_driver_to_appear(
     started.pop().close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("more", [[], ["--rate", "100"]])
 def test_silence_fails_after_the_timeout(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a") as skin:
@@ -260,6 +262,7 @@ def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespa
         assert list(namespace.reader_files()) == []  # it took its announcement back
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", ["--json", "--counts"])
 def test_a_reader_of_our_output_may_go_away(form: str) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):
@@ -273,6 +276,7 @@ def test_a_reader_of_our_output_may_go_away(form: str) -> None:
         process.stderr.close()
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_said_in_one_line() -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))), open("/dev/full", "w", encoding="ascii") as full:
         result = subprocess.run([BIN / "skin-dump"], stdout=full, stderr=subprocess.PIPE, timeout=PATIENCE_S)

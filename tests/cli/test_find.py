@@ -187,6 +187,7 @@ def test_the_port_of_an_emulator_is_a_port(capsys: pytest.CaptureFixture[str], t
     assert "weiss_wts" in port["probe"]["asked"]
 
 
+@pytest.mark.thorough
 def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -90,6 +90,7 @@ def test_what_means_nothing_has_no_level() -> None:
     assert heat.NOT_CONNECTED * LEVELS + LEVELS <= BACKGROUND
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(
     modules=st.lists(st.integers(1, 20), min_size=1, max_size=6),

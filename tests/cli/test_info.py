@@ -64,12 +64,12 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert driver["age_ms"] >= 0
     assert driver["rate_hz"] > 0
     assert driver["buses"] == [
-        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
-        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
+        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "dropped": 2, "errors": 0, "unknown": 7},
+        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "dropped": 0, "errors": 0, "unknown": 0},
     ]
     (record,) = driver["readers"]
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
-    counts = {"frames", "lost", "overruns", "missed_periods", "rate_hz", "age_ms"}
+    counts = {"frames", "missed", "overruns", "missed_periods", "rate_hz", "age_ms"}
     assert record.keys() == {"service", "pid", "program", "kind", "wall", "cpu", "age", "lateness"} | counts
     assert driver["statistics"]["wall"]["count"] == 8
     assert driver["statistics"]["wall"]["worst_ns"] >= driver["statistics"]["wall"]["mean_ns"] > 0
@@ -220,6 +220,7 @@ def test_a_driver_that_has_published_nothing(capsys: pytest.CaptureFixture[str])
         assert "driver a: starting, nothing published yet" in text(capsys)
 
 
+@pytest.mark.thorough
 def test_a_dead_driver_stays_to_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
     with fake_process("a", "--patches", "1", "--modules", "2") as process:
         kill(process)
@@ -382,9 +383,9 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
         "  sensors: 80 pressure in counts, 16 temperature in degC",
     ]
     assert lines[6:9] == [
-        "  bus   state  frames  lost  unknown",  # no errors: not shown
-        "  can0  live    5,156     2        7",
-        "  can1  live        0     0        0",
+        "  bus   state  frames  dropped  unknown",  # no errors: not shown
+        "  can0  live    5,156        2        7",
+        "  can1  live        0        0        0",
     ]
     assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
@@ -404,6 +405,7 @@ def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
     assert "\x1b[31mproblem: \x1b[0mrefused" in map(shown, as_text(report))
 
 
+@pytest.mark.thorough
 def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:
     with FakeSkin("a", fake_structure(1, 1)) as skin:
         skin.publish()
@@ -420,6 +422,7 @@ def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:
             assert (watch.returncode, errors) == (0, b"")
 
 
+@pytest.mark.thorough
 def test_watch_redraws_a_terminal_and_waits_for_who_is_not_there_yet() -> None:
     ours, theirs = pty.openpty()
     watch = subprocess.Popen([BIN / "skin-info", "late", "--watch"], stdin=theirs, stdout=theirs, stderr=theirs)

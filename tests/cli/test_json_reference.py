@@ -38,7 +38,7 @@ from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.cli.test_calibrate import calm_skin, finger_presses, stroked_state, strokes
@@ -162,6 +162,7 @@ def printing(capsys: pytest.CaptureFixture[str]) -> Print:
     return run
 
 
+@pytest.mark.thorough
 def test_a_driver_and_those_that_look_at_it(
     printing: Print, namespace: Namespace, calm_namespace: Namespace, tmp_path: Path
 ) -> None:
@@ -200,6 +201,7 @@ def test_a_driver_and_those_that_look_at_it(
         check("`status`, `stopped`", status, driver.stop())
 
 
+@pytest.mark.thorough
 def test_patches_that_fall_silent() -> None:
     bus = "virtual?boards=7,8&restart=8&restart_after_s=1.5&boot_s=3"  # longer than a busy machine holds the driver up
     with running("skin-driver", "--bus", bus) as driver:
@@ -245,6 +247,7 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     check("`skin-find --udev`", *printing(find, "--udev"))
 
 
+@pytest.mark.thorough
 def test_what_a_doctor_finds(printing: Print, tmp_path: Path) -> None:
     skin = FakeSkin("torso")
     skin.break_some()
@@ -278,6 +281,7 @@ def test_health(printing: Print, namespace: Namespace) -> None:
         check("`skin-info --health`", *printing(info, "--health"))
 
 
+@pytest.mark.thorough
 def test_regions(printing: Print, tmp_path: Path) -> None:
     file = tmp_path / "regions.toml"
     skin = FakeSkin("torso", placed_structure())
@@ -291,6 +295,7 @@ def test_regions(printing: Print, tmp_path: Path) -> None:
         check("`skin-regions list`", *printing(regions, "list", str(file)))
 
 
+@pytest.mark.thorough
 def test_a_recording(printing: Print, tmp_path: Path) -> None:
     file = tmp_path / "skin.mcap"
     with publishing(FakeSkin("torso")):
@@ -362,6 +367,7 @@ def _is_known(status: dict[str, Any]) -> bool:
     return any(robot["clock"] and robot.get("drivers") for robot in status["robots"])
 
 
+@pytest.mark.thorough
 def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     own_domain(namespace, monkeypatch)
     with publishing(FakeSkin("torso")), running("skin-bridge", "ros2") as bridge:
@@ -370,6 +376,7 @@ def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
         check("`skin-bridge ros2`", *told, bridge.wait_for("router"))
 
 
+@pytest.mark.thorough
 def test_bridge_to_yarp() -> None:
     with robot(until_gone) as yarp, publishing(FakeSkin("torso")):
         with running("skin-bridge", "yarp", "--server", f"{LOCAL}:{yarp.server.port}", "--full-scale", "9") as bridge:
@@ -387,11 +394,13 @@ def _has_ages(services: dict[str, Any]) -> bool:
     return any(service["age_ms"]["p50"] is not None for service in services.values())
 
 
+@pytest.mark.thorough
 def test_view() -> None:
     with running("skin-view", "torso", "--port", "0", "--no-browser") as view:
         check("`skin-view`", view.wait_for("ready"))
 
 
+@pytest.mark.thorough
 def test_calibrate(printing: Print, tmp_path: Path) -> None:
     surface, _ = strokes()
     file = tmp_path / "skin.toml"
@@ -425,6 +434,7 @@ class _Stop:
         self.stopped = self.turns > 100
 
 
+@pytest.mark.thorough
 def test_press(printing: Print) -> None:
     with running("skin-driver", "--bus", VIRTUAL) as driver:
         driver.wait_for("ready")
@@ -452,7 +462,7 @@ def test_an_emulation() -> None:
     out = io.StringIO()
     bus = HostBus()
     stop = _Stop(bus)
-    options = RoboskinOptions(boards=(7,), streaming=True)
+    options = EmulatedRoboskinOptions(boards=(7,), streaming=True)
     emulation = Emulation(bus, EmulatedRoboskin(options), JsonReport(out), clock=lambda: bus.time_ns, poll=stop.wait)
     emulation.run(stop, bus_name="host", driver="roboskin", options=options)
     printed = [json.loads(line) for line in out.getvalue().splitlines()]

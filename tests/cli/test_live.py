@@ -46,6 +46,7 @@ def test_poll_tells_of_newer_frames_only() -> None:
         assert driver.report().life == "live"
 
 
+@pytest.mark.thorough
 def test_a_dead_driver_stays_until_its_file_goes() -> None:
     with closing(LiveDrivers(Namespace())) as drivers:
         with fake_process("a", "--patches", "1") as process:

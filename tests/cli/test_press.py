@@ -14,7 +14,7 @@ from skinware.cli.press import command as press
 from skinware.geometry import read_geometry
 from skinware_drivers.cli.emulate import command as emulate
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import run, running
 
@@ -29,6 +29,7 @@ def pressed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0
     return told.err if status else told.out
 
 
+@pytest.mark.thorough
 def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.CaptureFixture[str]) -> None:
     with running("skin-driver", "--bus", IDLE) as driver:
         driver.wait_for("ready")
@@ -53,6 +54,7 @@ def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.Capture
         assert told["pressed"][IDLE]["triangle"] == 4
 
 
+@pytest.mark.thorough
 def test_an_emulator_takes_presses_by_a_service_and_tells_where_it_is_pressed(
     capsys: pytest.CaptureFixture[str], namespace: Namespace
 ) -> None:
@@ -83,6 +85,7 @@ def test_it_says_why_nothing_can_be_pressed(capsys: pytest.CaptureFixture[str]) 
         assert "nothing in the namespace" in pressed(capsys, "0", "0", "0", status=1)
 
 
+@pytest.mark.thorough
 def test_of_several_one_must_be_named(capsys: pytest.CaptureFixture[str]) -> None:
     with running("skin-driver", "--bus", IDLE) as one, running("skin-driver", "--bus", IDLE, "--name", "two") as two:
         one.wait_for("ready")
@@ -110,7 +113,7 @@ def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: p
     arguments = ["--bus", BUS, "--boards", "7,9", "--geometry", str(file), "-T", "0"]
     assert exit_status(emulate, arguments) == 0
     written = read_geometry(file)
-    own = EmulatedRoboskin(RoboskinOptions(boards=(7, 9))).geometry()
+    own = EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7, 9))).geometry()
     assert written.type_name.tolist() == own.type_name.tolist()
     assert (set(written.frame), written.uid.tolist()) == ({"arm"}, own.uid.tolist())
     for name in ("position_m", "normal", "radius_m"):

@@ -45,7 +45,7 @@ def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespa
         stopped = recorder.stop(number)
         assert recorder.process.returncode == 0
     assert stopped["event"] == "stopped"
-    assert (stopped["file"], stopped["files"], stopped["lost"]) == (str(file), [str(file)], 0)
+    assert (stopped["file"], stopped["files"], stopped["missed"]) == (str(file), [str(file)], 0)
     assert stopped["messages"]["/skin/torso/frame"] == skin.writer.sequence
     assert stopped["bytes"] == file.stat().st_size
     with skinware.recording.open(file) as opened:
@@ -53,17 +53,19 @@ def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespa
         assert opened["torso"].read(["status"]).sequence.tolist() == list(range(1, skin.writer.sequence + 1))
 
 
+@pytest.mark.thorough
 def test_a_recording_of_nothing_is_whole_too(tmp_path: Path) -> None:
     file = tmp_path / "skin.mcap"
     with running("skin-record", "-o", str(file)) as recorder:
         recorder.wait_for("ready")
         stopped = recorder.stop()
-    assert (stopped["event"], stopped["file"], stopped["lost"]) == ("stopped", str(file), 0)
+    assert (stopped["event"], stopped["file"], stopped["missed"]) == ("stopped", str(file), 0)
     with skinware.recording.open(file) as opened:
         assert opened.is_whole
         assert opened.services == ()
 
 
+@pytest.mark.thorough
 def test_a_deleted_file_is_said_at_once(tmp_path: Path, namespace: Namespace) -> None:
     del namespace
     file = tmp_path / "skin.mcap"
@@ -87,7 +89,7 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert out.startswith(
         f"recording torso of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
     )
-    assert " MB, nothing lost\n" in out
+    assert " MB, nothing missed\n" in out
     assert "/skin/torso/frame: " in out
     data = file.read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -98,6 +100,7 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert capsys.readouterr().out.endswith("again.mcap: written; it was whole\n")
 
 
+@pytest.mark.thorough
 def test_a_signal_saves_the_past(tmp_path: Path) -> None:
     file = tmp_path / "fall.mcap"
     with publishing(FakeSkin("torso")), running("skin-record", "--last", "5s", "-o", str(file)) as recorder:
@@ -108,6 +111,7 @@ def test_a_signal_saves_the_past(tmp_path: Path) -> None:
         assert recorder.stop()["files"] == [str(file), str(tmp_path / "fall-2.mcap")]
 
 
+@pytest.mark.thorough
 def test_enter_saves_the_past(tmp_path: Path) -> None:
     ours, terminal = os.openpty()
     command = [str(BIN / "skin-record"), "--last", "5s", "-o", "fall.mcap"]
@@ -149,6 +153,7 @@ def take_terminal(terminal: int) -> None:
     fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
 
 
+@pytest.mark.thorough
 def test_no_permission_is_one_line(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o500)
@@ -226,6 +231,7 @@ def test_what_cannot_be_recovered_is_one_line(
     assert list(tmp_path.iterdir()) == before
 
 
+@pytest.mark.thorough
 def test_a_file_that_may_not_grow_ends_the_recording_with_one_line(tmp_path: Path) -> None:
     file = tmp_path / "skin.mcap"
     limit = 40_000
@@ -303,6 +309,7 @@ def test_sizes_and_times() -> None:
     assert [past(text) for text in ("60", "60s", "0.5s", "5min")] == [60, 60, 0.5, 300]
 
 
+@pytest.mark.thorough
 def test_recorders_are_readers_that_others_see(tmp_path: Path) -> None:
     with publishing(FakeSkin("torso")), running("skin-record", "-o", str(tmp_path / "x.mcap")) as recorder:
         recorder.wait_for("status", lambda status: "/skin/torso/frame" in status["messages"])

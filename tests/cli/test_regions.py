@@ -94,6 +94,7 @@ HOLE = 2 * 8 + 3
 LEFT, RIGHT = ([taxel for taxel in BLOCK if (taxel % 8 < 4) == is_left and taxel != HOLE] for is_left in (True, False))
 
 
+@pytest.mark.thorough
 def test_what_is_stroked_becomes_a_region_without_holes(tmp_path: Path) -> None:
     file = tmp_path / "regions.toml"
     file.write_text('format = "skinware-regions"\nversion = 1\n# by hand\n')
@@ -123,6 +124,7 @@ def test_what_is_stroked_becomes_a_region_without_holes(tmp_path: Path) -> None:
     assert "# by hand" in file.read_text()
 
 
+@pytest.mark.thorough
 def test_a_calmed_driver_is_painted_too(tmp_path: Path) -> None:
     """Its values are 0 at rest, without any noise."""
     file = tmp_path / "regions.toml"
@@ -141,6 +143,7 @@ def test_a_calmed_driver_is_painted_too(tmp_path: Path) -> None:
     assert read_regions(file).of(skin.structure, "pressure")["palm"] == slice(0, 2)
 
 
+@pytest.mark.thorough
 def test_ctrl_c_writes_nothing(tmp_path: Path) -> None:
     file = tmp_path / "regions.toml"
     skin = FakeSkin("torso", placed_structure())
@@ -154,6 +157,7 @@ def test_ctrl_c_writes_nothing(tmp_path: Path) -> None:
     assert not file.exists()
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_painted_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "regions.toml"
     here = ["paint", "palm", "-o", str(file), "-T", "0.1"]

@@ -33,6 +33,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_others_see_what_was_recorded(file: Path, namespace: Namespace) -> None:
     with running("skin-replay", str(file), "--loop", "--speed", "0.5") as player:
         ready = player.wait_for("ready")
@@ -66,6 +67,7 @@ def test_it_does_not_publish_beside_living_drivers_unless_it_is_asked_to(
         assert line.startswith(f"skin-replay: arm runs in namespace '{namespace.name}' too")
 
 
+@pytest.mark.thorough
 def test_two_replays_at_once_have_a_namespace_each(file: Path, namespace: Namespace) -> None:
     with running("skin-replay", str(file), "--loop") as first:
         first.wait_for("status", lambda status: status["frames"].get("torso", 0) > 0)
@@ -81,6 +83,7 @@ def test_two_replays_at_once_have_a_namespace_each(file: Path, namespace: Namesp
     shutil.rmtree(other.path)
 
 
+@pytest.mark.thorough
 def test_it_waits_for_programs_and_stays_at_its_end(file: Path, namespace: Namespace) -> None:
     options = "--paused", "--stay", "--times", "recorded"
     with skinware.recording.open(file) as opened:

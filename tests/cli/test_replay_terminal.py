@@ -103,6 +103,7 @@ def times_of_first_frames(file: Path) -> list[float]:
         return [moment.time_s for _ in range(3) if (moment := timeline.next())]
 
 
+@pytest.mark.thorough
 def test_keys_do_what_the_first_line_says(file: Path, namespace: Namespace) -> None:
     times_s = times_of_first_frames(file)
     with in_terminal(f"exec {FOREGROUND}", file) as screen:
@@ -136,6 +137,7 @@ def test_keys_do_what_the_first_line_says(file: Path, namespace: Namespace) -> N
     assert namespace.services() == []
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_it_and_the_terminal_is_as_it_was(file: Path, namespace: Namespace) -> None:
     with in_terminal(f"exec {FOREGROUND}", file) as screen:
         wait_until(lambda: "x0.5" in screen.text)
@@ -145,6 +147,7 @@ def test_ctrl_c_ends_it_and_the_terminal_is_as_it_was(file: Path, namespace: Nam
     assert namespace.services() == []
 
 
+@pytest.mark.thorough
 def test_in_the_background_of_a_terminal_it_goes_on_without_keys(file: Path) -> None:
     with in_terminal(f"set -m; {FOREGROUND} & trap 'kill $!' EXIT; wait", file) as screen:
         wait_until(lambda: told().get("time_s", 0) > 0)

@@ -86,6 +86,7 @@ def test_several_buses_in_their_time(file: Path) -> None:
     assert found == [0x473, 0x7FF, 0x7FE, 0x1234567, 0x100]
 
 
+@pytest.mark.thorough
 def test_it_loops_until_it_is_interrupted(file: Path) -> None:
     with running("skin-replay", str(file), "--wire", "--loop", "--bus", "can0=can+virtual:loop") as replay:
         replay.wait_for("ready")
@@ -95,6 +96,7 @@ def test_it_loops_until_it_is_interrupted(file: Path) -> None:
     assert stopped["frames"]["can0"] > 3
 
 
+@pytest.mark.thorough
 def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
     """A driver reads what was recorded as from its device; so does any program."""
     kind = load_driver("agni")
@@ -130,6 +132,7 @@ def test_what_makes_no_sense_is_refused(
     assert words in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.thorough
 def test_a_recording_without_wires_and_a_bus_that_is_not_there(file: Path) -> None:
     write_recording(Path("without.mcap"), lambda taps: None)
     nothing = run("skin-replay", "without.mcap", "--wire", "--bus", "vcan0")

@@ -38,6 +38,7 @@ def test_an_unknown_command_is_an_error_with_the_nearest_one(capsys: pytest.Capt
     assert "no command 'tpo'; did you mean 'top'?" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_a_command_runs_as_by_its_own_name() -> None:
     joined, alone = refused("skin", "info", "--json"), refused("skin-info", "--json")
     assert (joined.returncode, joined.stderr) == (alone.returncode, alone.stderr)
@@ -47,6 +48,7 @@ def test_a_command_runs_as_by_its_own_name() -> None:
     assert wrong.stderr.startswith("Usage: skin-info ")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("program", "words", "found"),
     [

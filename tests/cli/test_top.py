@@ -29,7 +29,7 @@ def test_a_line_per_driver(capsys: pytest.CaptureFixture[str]) -> None:
         first, second = lines(capsys, "--plain", "-T", "0.01")
     assert first.startswith("a  ")
     assert " Hz  age " in first
-    assert "sensors 24 (fresh 24, stale 0)  patches 1 live  lost 0  orphans 0" in first
+    assert "sensors 24 (fresh 24, stale 0)  patches 1 live  dropped 0  orphans 0" in first
     assert second == "b  starting, no frame yet  sensors 768"
 
 
@@ -95,6 +95,7 @@ def test_without_the_extra_a_person_is_told_and_gets_plain_lines(
     assert printed.out.startswith("a  starting")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(number: int) -> None:
     with FakeSkin("a"):
@@ -106,6 +107,7 @@ def test_signals_end_it_in_good_order(number: int) -> None:
         assert (process.returncode, errors) == (0, b"")
 
 
+@pytest.mark.thorough
 def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
     code = "import sys, skinware.cli.top; assert not {'textual', 'rich'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -120,6 +120,7 @@ def test_it_fits_every_terminal(size: tuple[int, int]) -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 def test_what_a_newcomer_sees_at_80_by_24() -> None:
     async def scene() -> None:
         skin = FakeSkin("torso")
@@ -138,7 +139,7 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
                 assert line(app, "head").startswith("skin-top   namespace ")
                 assert line(app, "title") == "torso: 4 patches, 640 pressure sensors"
                 assert line(app, "scale").startswith("change 0 ")
-                assert line(app, "detail") == "frames 5,156  lost 2  unknown 7  orphans 3  updates 640"
+                assert line(app, "detail") == "frames 5,156  dropped 2  unknown 7  orphans 3  updates 640"
                 drawn = picture(app)
                 assert len(drawn) == 12  # all of it, unscrolled
                 assert [text[:8].strip() for text in drawn[::3]] == ["board 7", "board 8", "board 9", "board 10"]
@@ -174,6 +175,7 @@ def test_what_does_not_fit_is_told_of() -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 def test_a_driver_dies_and_returns_changed() -> None:
     async def scene() -> None:
         async with shown() as (app, pilot):
@@ -194,6 +196,7 @@ def test_a_driver_dies_and_returns_changed() -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 def test_the_chosen_row_is_chosen_again_when_its_driver_comes_back() -> None:
     async def scene() -> None:
         with FakeSkin("other", fake_structure(1, 1)) as other:
@@ -292,6 +295,7 @@ def test_the_terminal_chooses_the_palette(
     assert SkinTop(Namespace())._heat_map._palette is palette
 
 
+@pytest.mark.thorough
 def test_the_mouse_chooses_and_points() -> None:
     async def scene() -> None:
         skin = FakeSkin("a", fake_structure(2, 1))
@@ -313,6 +317,7 @@ def test_the_mouse_chooses_and_points() -> None:
     go(scene)
 
 
+@pytest.mark.thorough
 def test_a_picture_that_does_not_fit_is_scrolled() -> None:
     async def scene() -> None:
         with FakeSkin("a", fake_structure(30, 16)) as skin:
@@ -399,6 +404,7 @@ def test_a_namespace_that_cannot_be_trusted_is_explained(namespace: Namespace) -
     go(scene)
 
 
+@pytest.mark.thorough
 def test_a_key_goes_from_region_to_region_where_there_are_any() -> None:
     async def scene() -> None:
         with publishing(FakeSkin("a", fake_structure(2, 2))):

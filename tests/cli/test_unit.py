@@ -38,6 +38,7 @@ def settings(unit: str) -> dict[str, list[str]]:
     return found
 
 
+@pytest.mark.thorough
 def test_it_is_for_the_program_that_prints_it() -> None:
     (command,) = settings(printed())["ExecStart"]
     assert shlex.split(command)[0] == str(BIN / "skin-driver")
@@ -49,6 +50,7 @@ def test_it_is_packed_with_the_package() -> None:
     assert any(fnmatch(f"data/{UNIT_FILE}", pattern) for pattern in patterns)
 
 
+@pytest.mark.thorough
 def test_systemd_finds_nothing_wrong_with_it(tmp_path: Path) -> None:
     if shutil.which("systemd-analyze") is None or not Path("/bin/kill").exists():
         pytest.skip("no systemd-analyze here, or not the /bin/kill that is on every machine that systemd runs")

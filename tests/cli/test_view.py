@@ -50,6 +50,7 @@ async def ready_at_once(_follower: object, _access: object, _host: str, _port: o
     ready(5)  # type: ignore[operator]
 
 
+@pytest.mark.thorough
 def test_other_machines_need_a_token() -> None:
     with running("skin-view", "--port", "0", "--no-browser", "--host", "0.0.0.0") as server:
         url = server.wait_for("ready")["url"]
@@ -62,11 +63,13 @@ def test_other_machines_need_a_token() -> None:
             page.pull()
 
 
+@pytest.mark.thorough
 def test_a_token_of_ones_own() -> None:
     with running("skin-view", "--port", "0", "--no-browser", "--token", "sesame") as server:
         assert server.wait_for("ready")["url"].endswith("/?token=sesame")
 
 
+@pytest.mark.thorough
 def test_a_port_that_is_in_use() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as other:
         port = str(other.getsockname()[1])
@@ -76,6 +79,7 @@ def test_a_port_that_is_in_use() -> None:
         assert result.stderr == f"skin-view: 127.0.0.1, port {port}: {why}\n"
 
 
+@pytest.mark.thorough
 def test_another_port_where_the_usual_one_is_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
     with running("skin-view", "--no-browser") as one, running("skin-view", "--no-browser") as other:
         assert one.wait_for("ready")["url"] != other.wait_for("ready")["url"]

@@ -35,6 +35,7 @@ def wiped(without: list[int]) -> list[list[int]]:
     return [pressed[::2], pressed[1::2]]
 
 
+@pytest.mark.thorough
 def test_it_ends_by_itself_when_all_have_answered() -> None:
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = values()
@@ -55,6 +56,7 @@ def test_it_ends_by_itself_when_all_have_answered() -> None:
             wipe.stop()
 
 
+@pytest.mark.thorough
 def test_interrupted_it_names_those_that_never_answered() -> None:
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = values()
@@ -77,6 +79,7 @@ def test_interrupted_it_names_those_that_never_answered() -> None:
         assert [one["uid"] for one in done["never"]] == STRUCTURE.sensor_uid[TAXELS[DEAD]].tolist()
 
 
+@pytest.mark.thorough
 def test_lines_for_people() -> None:
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = values()
@@ -91,6 +94,7 @@ def test_lines_for_people() -> None:
         assert "  board 7, triangle 3, taxel 9" in done.stdout.splitlines()
 
 
+@pytest.mark.thorough
 def test_in_a_terminal_one_line_tells_how_it_goes() -> None:
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = values()
@@ -105,6 +109,7 @@ def test_in_a_terminal_one_line_tells_how_it_goes() -> None:
         assert shown.count(b"\r0 of 40 answered\x1b[K") >= 1
 
 
+@pytest.mark.thorough
 def test_a_real_driver_is_wiped() -> None:
     """Somebody wanders over the emulated board, but not everywhere."""
     with running("skin-driver", "--bus", "virtual?boards=7") as driver:
@@ -136,6 +141,7 @@ def test_mistakes_get_one_clear_line(arguments: list[str], status: int, words: s
     assert words in done.stderr
 
 
+@pytest.mark.thorough
 def test_of_several_drivers_one_must_be_named() -> None:
     with publishing(FakeSkin("left", STRUCTURE)), publishing(FakeSkin("right", STRUCTURE)):
         done = run("skin-wipe", "-T", "1")

@@ -254,6 +254,7 @@ def hold(board: Path) -> None:
         path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
+@pytest.mark.thorough
 def test_locks_and_fake_announcements_neither_hide_a_death_nor_harm_who_looks(users: Users) -> None:
     holder = users.crew.start(hold, users.board.path)
     wait_until(lambda: bool(users.board.rows[3, READY]), PATIENCE_S)

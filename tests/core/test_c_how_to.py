@@ -48,6 +48,7 @@ def publish(writer: DriverWriter, value: int) -> None:
     writer.commit(1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", ["c99", "c++11"])
 def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     source = tmp_path / "touch.c"
@@ -69,6 +70,7 @@ def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: py
             assert next(lines) == "frame 1: 17.0 Pa over 5 of 6 taxels\n"
 
 
+@pytest.mark.thorough
 def test_the_writing_program(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     source, script = tmp_path / "fingers.c", tmp_path / "fingers.py"
     source.write_text(program_text("c", "/* fingers.c"))

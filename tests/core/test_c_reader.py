@@ -54,6 +54,7 @@ def test_the_header_has_the_bits_of_a_status() -> None:
     assert {name: int(value) for name, value in bits} == {bit.name: int(bit) for bit in Status}
 
 
+@pytest.mark.thorough
 def test_the_header_is_in_the_wheel(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     shutil.unpack_archive(built_wheel(tmp_path_factory), tmp_path, "zip")
     header = Path("skinware", "include", "skinware.h")
@@ -71,11 +72,18 @@ def as_json(array: np.ndarray[Any, Any]) -> list[Any]:
     return [x if math.isfinite(x) else "nan" if math.isnan(x) else "inf" if x > 0 else "-inf" for x in numbers]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dtype", ["u1", "<i2", "<u2", "<i4", "<f4"])
 def test_c_reads_what_python_reads(any_program: Path, dtype: str) -> None:
     made = structure(dtype=dtype)
     with DriverWriter(
-        "x", made, driver_type="test", bus_counters=("frames", "lost"), patch_counters=("cycles",), rate_hz=20, slots=5
+        "x",
+        made,
+        driver_type="test",
+        bus_counters=("frames", "dropped"),
+        patch_counters=("cycles",),
+        rate_hz=20,
+        slots=5,
     ) as writer:
         columns = writer.begin()
         generator = np.random.default_rng(1)
@@ -184,6 +192,7 @@ def test_a_writer_that_is_killed_and_restarted_all_the_time(program: Path) -> No
     ServiceWriter("x", {"values": ("u1", 1)}).close()
 
 
+@pytest.mark.thorough
 def test_a_killed_c_reader_is_nothing_to_the_writer(program: Path) -> None:
     stop = PROCESSES.Event()
     with running(write_flat_out, 3, 40, stop) as process:

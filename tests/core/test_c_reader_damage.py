@@ -22,6 +22,7 @@ from tests.compiling import compiled
 from tests.core.c_programs import SOURCE, STRAIN, fill, ring_file, run, structure, talking
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -132,6 +133,7 @@ WORDS = st.tuples(
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", ["sanitized", "sanitized copies"])
 def test_damage_of_any_kind_does_no_harm(
     language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
@@ -187,6 +189,7 @@ def test_damage_while_a_file_is_read_does_no_harm(
     path.unlink()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", ["c11", "c11 sanitized"])
 def test_an_owner_that_changes_a_table_during_a_call_does_no_harm(
     language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory

@@ -67,6 +67,7 @@ def test_a_stopped_process_is_alive_but_silent(program: Path) -> None:
     ServiceWriter("x", {"values": ("u1", 1)}).close()
 
 
+@pytest.mark.thorough
 def test_pause_resume_restructure_and_close_are_told_at_once(any_program: Path) -> None:
     with ServiceWriter("x", {"values": ("<i4", 3)}) as writer, talking(any_program, "follow", "x", LONG_MS) as talk:
 

@@ -141,6 +141,7 @@ for free in range(8):
 """
 
 
+@pytest.mark.thorough
 def test_a_program_without_descriptors_is_not_given_the_file_to_blame() -> None:
     with DriverWriter("x", Structure(**tables()), driver_type="test", bus_counters=["n"]) as writer:
         writer.begin()
@@ -269,6 +270,7 @@ def test_the_undamaged_files_are_attached(services: Files, kind: str, namespace:
     assert attempt(namespace, services[kind])
 
 
+@pytest.mark.thorough
 @FUZZ
 @given(data=st.data())
 def test_changed_bytes_never_do_harm(services: Files, data: st.DataObject) -> None:
@@ -287,6 +289,7 @@ def test_changed_bytes_never_do_harm(services: Files, data: st.DataObject) -> No
     attempt(namespace, bytes(damaged))
 
 
+@pytest.mark.thorough
 @FUZZ
 @given(
     kind=st.sampled_from(["plain", "schema", "driver"]),
@@ -324,6 +327,7 @@ def test_changed_fields_never_do_harm(services: Files, kind: str, changes: list[
     attempt(namespace, bytes(damaged))
 
 
+@pytest.mark.thorough
 @FUZZ
 @given(data=st.data())
 def test_any_length_is_refused(services: Files, data: st.DataObject) -> None:
@@ -334,6 +338,7 @@ def test_any_length_is_refused(services: Files, data: st.DataObject) -> None:
     assert not attempt(namespace, whole[:length].ljust(length, b"\0"))
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy's, about old names of dtypes
 @FUZZ
 @given(
@@ -373,5 +378,5 @@ def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(name
                 ):
                     with contextlib.suppress(SkinwareError):
                         take()
-                assert reader.statistics.lost >= 0
+                assert reader.statistics.missed >= 0
                 assert reader.rate_hz() is None or reader.writer_statistics.published >= 0

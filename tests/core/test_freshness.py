@@ -72,6 +72,7 @@ def test_a_frame_judges_by_the_rate_of_its_driver_or_as_it_is_told() -> None:
         assert not last.fresh("pressure", max_age_s=3600).any()
 
 
+@pytest.mark.thorough
 def test_a_stopped_driver_does_not_look_fresh() -> None:
     """SIGSTOP leaves the lock held and every status 0: only the age tells."""
     with fake_process("fake") as process, Skin() as skin, DriverReader("fake") as reader:

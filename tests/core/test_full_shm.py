@@ -98,6 +98,7 @@ print("went on")
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, for a /dev/shm of its own")
 def test_a_really_full_shm_stops_neither_readers_nor_requests() -> None:
     """In a mount namespace of its own, whose /dev/shm has 3 MB."""

@@ -174,6 +174,7 @@ groups = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=300)
 @given(group=groups)
 def test_no_data_raises_anything_else(group: dict[str, Any]) -> None:

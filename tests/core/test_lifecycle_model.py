@@ -107,7 +107,7 @@ class Reading:
             self.lost += max(0, sequence - self.taken - 1)
         self.frames += 1
         self.taken, self.begun = sequence, True
-        assert (self.reader.statistics.frames, self.reader.lost) == (self.frames, self.lost)
+        assert (self.reader.statistics.frames, self.reader.missed) == (self.frames, self.lost)
 
 
 class Lifecycle(RuleBasedStateMachine):
@@ -325,6 +325,7 @@ class Lifecycle(RuleBasedStateMachine):
                 assert reading.reader.paused == self.services[reading.name].paused
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(600)
 def test_lifecycle(request: pytest.FixtureRequest) -> None:
     run_state_machine_as_test(

@@ -262,6 +262,7 @@ def test_a_server_that_could_not_be_made_harms_no_fork(namespace: Namespace) -> 
         del kept
 
 
+@pytest.mark.thorough
 def test_a_namespace_that_is_there_is_not_given_to_another_group(namespace: Namespace) -> None:
     namespace.create()
     own = namespace.path.stat().st_gid

@@ -145,6 +145,7 @@ def strange() -> dict[str, str]:
     return refusals(attempts)
 
 
+@pytest.mark.thorough
 def test_a_stranger_sees_nothing(users: Users) -> None:
     found = users.ask(STRANGER, strange)
     assert "done" not in found.values(), found

@@ -84,6 +84,7 @@ def test_places_of_another_number_of_sensors_are_refused() -> None:
         fake_structure(1, 2).replace(geometry=Geometry.unknown(["pressure"], np.array([1000], np.uint64)))
 
 
+@pytest.mark.thorough
 def test_a_driver_publishes_the_file_that_its_configuration_names(tmp_path: Path) -> None:
     (text,) = re.findall(r"^```toml\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     (tmp_path / "torso.geometry.toml").write_text(text)
@@ -99,6 +100,7 @@ def test_a_driver_publishes_the_file_that_its_configuration_names(tmp_path: Path
         driver.process.send_signal(signal.SIGINT)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("by", ["--config", "--geometry"])
 def test_a_running_driver_reads_its_file_again(tmp_path: Path, by: str) -> None:
     places, config = some_places(tmp_path, 0x80500), tmp_path / "torso.toml"
@@ -134,6 +136,7 @@ def test_a_running_driver_reads_its_file_again(tmp_path: Path, by: str) -> None:
         driver.process.send_signal(signal.SIGINT)
 
 
+@pytest.mark.thorough
 def test_a_file_of_another_skin_or_none_is_told_of(tmp_path: Path) -> None:
     foreign = some_places(tmp_path, 5, type_name="heat")
     with running("skin-driver", "--bus", "virtual?boards=8", "--geometry", str(foreign)) as driver:

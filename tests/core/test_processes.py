@@ -61,6 +61,7 @@ def test_of_other_pid_namespaces_and_without_rights_nothing_is_known(monkeypatch
     assert not has_ended(ended)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, for pid namespaces")
 def test_a_proc_of_another_pid_namespace_makes_no_process_dead() -> None:
     program = """

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S, Periodic, Profile, _kernel, cpus_from_text, now_ns
-from skinware.realtime._kernel import cpus_as_text, online_cpus
+from skinware.realtime import NS_PER_S, Periodic, Profile, _profile, cpus_from_text, now_ns
+from skinware.realtime._profile import cpus_as_text, online_cpus
 from tests.apply_profile import LATER_KIB, command, result_of
 from tests.scheduling import may_have_fifo
 from tests.unprivileged import without_rights
@@ -20,6 +20,7 @@ NORMAL, FIFO_50 = [os.SCHED_OTHER, 0], [os.SCHED_FIFO, 50]
 needs_rights = pytest.mark.skipif(not may_have_fifo(50), reason="this user may not have SCHED_FIFO and locked memory")
 
 
+@pytest.mark.thorough
 def test_normal_needs_no_rights() -> None:
     cpu = max(os.sched_getaffinity(0))
     told, warnings = result_of(without_rights(*command("normal", cpus=str(cpu), strict=True)))
@@ -29,6 +30,7 @@ def test_normal_needs_no_rights() -> None:
     assert told["frozen"] > 1000
 
 
+@pytest.mark.thorough
 @needs_rights
 def test_fifo_gets_all_it_asks_for() -> None:
     cpu = min(os.sched_getaffinity(0))
@@ -39,6 +41,7 @@ def test_fifo_gets_all_it_asks_for() -> None:
     assert told["frozen"] > 1000
 
 
+@pytest.mark.thorough
 def test_without_rights_each_refusal_is_one_line_and_the_rest_is_done() -> None:
     cpu = min(os.sched_getaffinity(0))
     told, warnings = result_of(without_rights(*command("fifo:50", cpus=str(cpu))))
@@ -57,6 +60,7 @@ def test_without_rights_each_refusal_is_one_line_and_the_rest_is_done() -> None:
     assert told["frozen"] > 1000
 
 
+@pytest.mark.thorough
 def test_strict_raises_what_would_have_been_warnings() -> None:
     going_on, _ = result_of(without_rights(*command("fifo:50")))
     told, warnings = result_of(without_rights(*command("fifo:50", strict=True)))
@@ -68,7 +72,7 @@ def test_strict_raises_what_would_have_been_warnings() -> None:
 
 def test_refused_cpus_leave_the_old_ones() -> None:
     before = os.sched_getaffinity(0)
-    refusal = _kernel.set_cpus({1000})
+    refusal = _profile.set_cpus({1000})
     assert refusal is not None
     allowed = ",".join(map(str, sorted(before)))
     assert str(refusal).startswith("CPUs 1000 refused: outside the CPU set of this process's container or service")

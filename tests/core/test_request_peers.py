@@ -122,6 +122,7 @@ def _ask_for_ever(connection: socket.socket) -> None:
         connection.send(b'{"id":%d,"operation":"operations"}' % number)
 
 
+@pytest.mark.thorough
 def test_too_many_peers(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skinware.service._server._IDLE_NS", 1 << 62)  # none makes room while the others connect
     with on_request(), ServiceReader[Sample]("x") as reader:

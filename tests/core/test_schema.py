@@ -92,6 +92,7 @@ plain = st.one_of(
 structures = hnp.nested_dtypes(plain, max_itemsize=200)
 
 
+@pytest.mark.thorough
 @settings(max_examples=100, deadline=None)
 @given(dtype=structures, shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=4), data=st.data())
 def test_any_structure_and_shape(dtype: np.dtype[np.void], shape: tuple[int, ...], data: st.DataObject) -> None:

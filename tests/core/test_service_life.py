@@ -218,6 +218,7 @@ def test_a_dead_readers_announcement_is_removed_by_whoever_looks(
         assert [record.service for record in living_readers(namespace)] == ["y"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "look", [lambda _: ServiceWriter("x", SMALL).close(), lambda place: list(living_readers(place))]
 )

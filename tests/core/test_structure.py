@@ -30,6 +30,7 @@ def tables(**changes: Any) -> dict[str, Any]:
     }
 
 
+@pytest.mark.thorough
 @given(
     modules=st.lists(st.integers(0, 3), min_size=1, max_size=6),
     sensors=st.lists(st.tuples(st.booleans(), st.integers(0, 2**64 - 1)), min_size=1, max_size=40, unique=True),

@@ -92,6 +92,7 @@ def test_fresh_is_as_each_group_has_it() -> None:
         assert (status_now("live", frame) != 0).tolist()[:5] == [True, True, True, False, True]
 
 
+@pytest.mark.thorough
 def test_c_judges_as_python_does(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     source = tmp_path / "fresh.c"
     source.write_text(PROGRAM)

@@ -184,6 +184,7 @@ def applied(monkeypatch: pytest.MonkeyPatch) -> list[Rule]:
     return noted
 
 
+@pytest.mark.thorough
 def test_every_rule_makes_a_finding_here(applied: list[Rule], everything: list[Examination]) -> None:
     assert len(rules()) > 60
     assert [rule.what for rule in rules() if rule not in applied] == []
@@ -201,6 +202,7 @@ def advised(everything: list[Examination]) -> set[str]:
     return of_findings | {command for one in everything for note in one.not_looked for command in note.commands}
 
 
+@pytest.mark.thorough
 def test_every_advised_command_line_is_one_that_its_command_takes(
     everything: list[Examination], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,11 +223,13 @@ def test_every_advised_command_line_is_one_that_its_command_takes(
     assert len([line for line in commands if line.startswith("skin-")]) > 20
 
 
+@pytest.mark.thorough
 def test_no_advice_removes_folders_or_has_gaps(everything: list[Examination]) -> None:
     lines = advised(everything)
     assert [line for line in lines if "rm -" in line or "..." in line or "{" in line] == []
 
 
+@pytest.mark.thorough
 def test_buses_are_named_as_they_are_found(everything: list[Examination]) -> None:
     lines = advised(everything)
     assert {line for line in lines if line.startswith("skin-find ") and "udev" not in line} == {
@@ -235,6 +239,7 @@ def test_buses_are_named_as_they_are_found(everything: list[Examination]) -> Non
     }  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_operations_are_advised_of_drivers_that_have_them(everything: list[Examination]) -> None:
     readdressing = [line for line in advised(everything) if "set_address" in line]
     assert readdressing
@@ -261,6 +266,7 @@ def test_advice_reaches_the_namespace_that_was_looked_at(monkeypatch: pytest.Mon
             assert refused(*shlex.split(line)).returncode == 0, line
 
 
+@pytest.mark.thorough
 def test_rebaseline_mends_doubtful_taxels(alone: Path, namespace: Namespace) -> None:
     (alone / namespace.path.name).rmdir()
     (alone / namespace.path.name).symlink_to(namespace.path)

@@ -21,7 +21,7 @@ from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.cli.test_regions import placed_structure
@@ -87,7 +87,7 @@ class _TwoWithOneAddress:
     """Two boards with address 7 beside board 8, each with a clock of its own; the host hears all."""
 
     def __init__(self) -> None:
-        self._boards = [EmulatedRoboskin(RoboskinOptions(boards=boards)) for boards in ((7, 8), (7,))]
+        self._boards = [EmulatedRoboskin(EmulatedRoboskinOptions(boards=boards)) for boards in ((7, 8), (7,))]
         self._later_ns = 23_000_000
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
@@ -150,6 +150,7 @@ def test_every_status_of_a_sensor_is_told(status: Status) -> None:
     assert finding.evidence.startswith(f"status {str(status.name).lower().replace('_', ' ')}: board 7, triangle 1")
 
 
+@pytest.mark.thorough
 def test_frames_without_partners_and_foreign_ones(skins: Skins) -> None:
     skin = skins("roboskin", boards=(7, 8), lose=0.1, wrong_length=0.1, foreign_hz=500.0)
     lost = found_until(of("patches", "without their partners"))
@@ -262,6 +263,7 @@ def test_two_drivers_on_one_bus(alone: Path, namespace: Namespace) -> None:
 # -- programs -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_driver_that_was_killed_stopped_or_restarted() -> None:
     with fake_process("torso") as process:
         os.kill(process.pid, signal.SIGSTOP)

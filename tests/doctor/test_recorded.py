@@ -64,7 +64,7 @@ def test_nothing_is_wrong_with_a_healthy_one(tmp_path: Path) -> None:
     nothing_found(run_and_look)
     evidence = kept[-1]
     (driver,) = evidence.drivers
-    assert (driver.name, driver.life, driver.restarts, driver.frames_lost) == ("torso", "live", 0, 0)
+    assert (driver.name, driver.life, driver.restarts, driver.frames_missed) == ("torso", "live", 0, 0)
     assert driver.frames >= 15
     assert driver.timing.rate_hz == pytest.approx(20, rel=0.5)
     told = examine(evidence)
@@ -101,6 +101,7 @@ def test_losses_states_and_silent_patches_over_time(tmp_path: Path) -> None:
     assert not any(command.startswith("skin-info") for finding in findings.values() for command in finding.commands)
 
 
+@pytest.mark.thorough
 def test_losses_by_the_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver_log, "_HOUR_S", 0.1)
     skin = FakeSkin("torso", fake_structure(1))
@@ -138,6 +139,7 @@ def test_restarts_with_the_same_and_with_other_sensors(tmp_path: Path) -> None:
     assert len(driver.patches) == 3
 
 
+@pytest.mark.thorough
 def test_a_driver_that_died_while_it_was_recorded(tmp_path: Path) -> None:
     file = tmp_path / "walk.mcap"
     with fake_process("torso") as process, recording(file) as recorder:
@@ -148,6 +150,7 @@ def test_a_driver_that_died_while_it_was_recorded(tmp_path: Path) -> None:
     assert findings["the driver was killed"].severity == Severity.ERROR
 
 
+@pytest.mark.thorough
 def test_one_that_was_cut_or_damaged(tmp_path: Path) -> None:
     file = tmp_path / "walk.mcap"
     record(file, FakeSkin("torso"), *[lambda: None] * 8)
@@ -161,6 +164,7 @@ def test_one_that_was_cut_or_damaged(tmp_path: Path) -> None:
     assert "1 chunk damaged and left out" in findings["the recording is damaged"].evidence
 
 
+@pytest.mark.thorough
 def test_no_damage_is_too_much(tmp_path: Path) -> None:
     """Hostile files: each is examined or refused with one line."""
     file = tmp_path / "walk.mcap"
@@ -187,8 +191,8 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
         {"time_s": 3.0},
     ]
     events = [
-        {"event": "lost", "service": "torso", "count": 3, "time_s": 0.0},
-        {"event": "lost", "service": ["torso"], "count": "many", "time_s": 0.0},
+        {"event": "missed", "service": "torso", "count": 3, "time_s": 0.0},
+        {"event": "missed", "service": ["torso"], "count": "many", "time_s": 0.0},
         {"event": {"a": 1}, "time_s": 1.0},
         {"event": "unreadable", "service": "leg", "time_s": 1.0},
         {"time_s": 1.0},
@@ -197,11 +201,12 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
     monkeypatch.setattr(Recording, "events", property(lambda _: json.loads(json.dumps(events))))
     evidence, findings = seen(file)
     assert findings["the wall clock was set, or the machine slept"].evidence == "by +60.00 s"
-    assert findings["the recorder lost frames"].evidence.startswith("3 frames ")
-    assert evidence.drivers[0].frames_lost == 3
+    assert findings["the recorder missed samples"].evidence.startswith("3 samples ")
+    assert evidence.drivers[0].frames_missed == 3
     assert "a service could not be recorded" in findings
 
 
+@pytest.mark.thorough
 def test_taxels_that_are_noisy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the file alone: one taxel of a quiet skin is noisy for 25 s, recorded in one."""
     monkeypatch.setattr(recorded, "_LOOK_EVERY_NS", 0)

@@ -15,14 +15,14 @@ import numpy as np
 from skinware import Status
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
 from skinware_drivers.polling import Notice
 from skinware_drivers.virtual import Emulator
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import Event
+from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
 EXAMPLE_EDS = Path(str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds"))
@@ -114,7 +114,7 @@ class Bench:
         self.updates: list[tuple[int, int, list[int]]] = []
         self.notices: list[tuple[str, Notice]] = []
         self.patches: Sequence[Patch] = ()
-        self._decoder: Decoder | None = None
+        self._decoder: SpecifiedDecoder | None = None
         self._batch = FrameBatch(4096, self.adapter.payload_size)
         self._polled_ns: dict[int, int] = {}
         self._attending: asyncio.Task[None] | None = None
@@ -137,7 +137,7 @@ class Bench:
         self.patches = await self.during(self.adapter.describe(self.link))
         adapter = self.adapter
         tables = assemble([("bus", self.patches)], adapter.types, adapter.dtype)
-        self._decoder = Decoder([adapter.layout], tables)
+        self._decoder = SpecifiedDecoder([adapter.layout], tables)
         self._batch = FrameBatch(4096, adapter.payload_size, self._decoder.compiled.headroom)
         adapter.heard_by = self._tell
         self._attending = asyncio.create_task(adapter.attend(self.link))
@@ -151,7 +151,7 @@ class Bench:
         self.bus.close()
 
     @property
-    def decoder(self) -> Decoder:
+    def decoder(self) -> SpecifiedDecoder:
         assert self._decoder is not None
         return self._decoder
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-WHOLE = ("TestRoboskin", "TestAbilityHand", "TestTesollo", "TestFlexiTac")
+WHOLE = ("TestBarrett", "TestAbilityHand", "TestTesollo", "TestFlexiTac")
 """Classes for which a push runs all: CAN, serial with answers, TCP, serial alone."""
 LONG = (
+    "test_a_damaged_frame_costs_its_own_burst_only",
+    "test_a_listener_sends_nothing",
     "test_both_data_paths_do_the_same",
     "test_it_can_be_stopped_at_any_moment",
     "test_memory_does_not_grow",
+    "test_nothing_is_valid_before_the_first_data",
     "test_nothing_leaks",
+    "test_nothing_torn_is_shown_while_a_sender_stumbles",
 )
 
 

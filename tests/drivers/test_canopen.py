@@ -121,6 +121,7 @@ def test_errors_make_a_node_suspect_until_they_are_over(stage: Stage, caplog: py
     assert caplog.text.count("node 5 reports an error: Temperature (code 4210)") == 1
 
 
+@pytest.mark.thorough
 def test_emulated_nodes_report_errors_when_told_to() -> None:
     async def scenario() -> None:
         faults = {"faulty": (6,), "faulty_after_s": 0.5, "faulty_for_s": 0.2}
@@ -141,6 +142,7 @@ def test_a_node_that_boots_after_an_error_is_sound(stage: Stage) -> None:
     stage.read(lambda f: not f.status.any())
 
 
+@pytest.mark.thorough
 def test_a_node_that_somebody_stopped_is_stale_and_started_again(stage: Stage) -> None:
     stage.running.do(lambda: stage.hardware.receive(0x000, b"\x02\x05", stage.bus._clock()))
     stage.read(lambda f: f.patch_state[0] != LIVE)

@@ -73,6 +73,7 @@ def feeling(emulator: type[Emulator[Any]], felt: list[int]) -> type[Emulator[Any
     return Feeling
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("hand", HANDS.values(), ids=HANDS)
 def test_dead_and_saturated_hands_are_told(
     hand: Hand, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch

@@ -18,10 +18,10 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5Options, AllegroV5UdpDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, assemble
+from skinware_drivers.fields import Match
 from skinware_drivers.hand import FINGERS
-from skinware_drivers.link import Link, Match
+from skinware_drivers.link import Link
 from skinware_drivers.registry import NamedBus, load_driver
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips
@@ -29,15 +29,16 @@ from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from tests.drivers.bench import Bench, BenchLoop, Case, play
 from tests.drivers.frame_fuzzing import fuzz
 from tests.drivers.fuzzed import FUZZED, allegro
+from tests.specification.decoding import SpecifiedDecoder
 
 RIGHT = 0x27
 MS = 1_000_000
 
 
-def shown(adapter: AnyAdapter, *frames: tuple[int, str] | int) -> Decoder:
+def shown(adapter: AnyAdapter, *frames: tuple[int, str] | int) -> SpecifiedDecoder:
     """What is known after these frames; a number is a pause, ms."""
     tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
-    decoder = Decoder([adapter.layout], tables, [adapter.period_s])
+    decoder = SpecifiedDecoder([adapter.layout], tables, [adapter.period_s])
     batch = FrameBatch(4096, 8, decoder.compiled.headroom)
     time_ns = MS
     for frame in frames:
@@ -52,7 +53,7 @@ def shown(adapter: AnyAdapter, *frames: tuple[int, str] | int) -> Decoder:
     return decoder
 
 
-def seen(decoder: Decoder) -> list[int]:
+def seen(decoder: SpecifiedDecoder) -> list[int]:
     return [at for at, status in enumerate(decoder.state.status.tolist()) if status != Status.NEVER_SEEN]
 
 
@@ -208,6 +209,7 @@ def test_what_a_hand_has_is_heard(touch: str) -> None:
     assert patches == expected.patches
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("touch", ["10x4", "fingers"])
 @pytest.mark.parametrize("program_ms", [15, 40, 300])
 def test_how_often_a_hand_is_asked_is_learnt(touch: str, program_ms: int) -> None:
@@ -273,6 +275,7 @@ def asked(emulated: dict[str, Any], **options: Any) -> list[Patch]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("touch", TOUCH)
 @pytest.mark.parametrize("mute", [(), (0xB0,)])
 def test_what_a_hand_has_is_asked(touch: str, mute: Sequence[int]) -> None:
@@ -373,7 +376,7 @@ def test_the_serial_number_is_asked_for() -> None:
 # Allegro V5
 
 
-def pascals(decoder: Decoder) -> list[float]:
+def pascals(decoder: SpecifiedDecoder) -> list[float]:
     told: list[float] = decoder.tables.structure.physical(decoder.state.values, "pressure").tolist()
     return told
 
@@ -470,11 +473,11 @@ DATAGRAM = (
 )
 
 
-def of_datagrams(*datagrams: str) -> Decoder:
+def of_datagrams(*datagrams: str) -> SpecifiedDecoder:
     adapter = AllegroV5UdpDriver(AllegroV5Options())
     framer = adapter.framing.framer()
     tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
-    decoder = Decoder([adapter.layout], tables)
+    decoder = SpecifiedDecoder([adapter.layout], tables)
     batch = FrameBatch(64, adapter.payload_size)
     for number, datagram in enumerate(datagrams):
         for frame in framer.feed(bytes.fromhex(datagram)):

@@ -11,9 +11,9 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.canopen_objects import Entry, PdoMap, Tpdo, default_tpdos
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from tests.drivers.bench import EXAMPLE_EDS
+from tests.specification.decoding import SpecifiedDecoder
 
 U8, I8, U16, I16, U32, I32, REAL32, BOOLEAN = 5, 2, 6, 3, 7, 4, 8, 1
 
@@ -34,8 +34,8 @@ def tpdo(number: int, cob_id: int, *entries: tuple[int, int]) -> Tpdo:
     return made
 
 
-def decoded(made: PdoMap, *frames: tuple[int, str]) -> Decoder:
-    decoder = Decoder([made.layout], assemble([("bus", made.patches)], made.types, made.dtype))
+def decoded(made: PdoMap, *frames: tuple[int, str]) -> SpecifiedDecoder:
+    decoder = SpecifiedDecoder([made.layout], assemble([("bus", made.patches)], made.types, made.dtype))
     batch = FrameBatch(100, 8, decoder.compiled.headroom)
     for identifier, payload in frames:
         batch.append(0, 1, identifier, bytes.fromhex(payload))

@@ -140,6 +140,7 @@ def test_a_segment_with_the_wrong_toggle_is_no_answer() -> None:
         transfer(scripted(["4108100009000000"], ["1041424344454647"]), lambda client: client.read(0x1008))
 
 
+@pytest.mark.thorough
 def test_an_endless_object_is_given_up() -> None:
     toggle = iter([0, 16] * 100_000)
 

@@ -14,16 +14,16 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.barrett import BarrettDriver, BarrettOptions
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver, CyskinCpmOptions
 from skinware_drivers.can.xela import XelaDriver, XelaOptions
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
 from tests.sdk.driving import driving_lines
+from tests.specification.decoding import SpecifiedDecoder
 
 
-def decoded(adapter: AnyAdapter, *frames: tuple[int, str]) -> Decoder:
-    decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
+def decoded(adapter: AnyAdapter, *frames: tuple[int, str]) -> SpecifiedDecoder:
+    decoder = SpecifiedDecoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
     batch = FrameBatch(100, 8, decoder.compiled.headroom)
     for number, (identifier, payload) in enumerate(frames):
         batch.append(0, 1 + 130_000 * number, identifier, bytes.fromhex(payload))
@@ -33,11 +33,11 @@ def decoded(adapter: AnyAdapter, *frames: tuple[int, str]) -> Decoder:
     return decoder
 
 
-def values(decoder: Decoder, *sensors: int) -> list[int]:
+def values(decoder: SpecifiedDecoder, *sensors: int) -> list[int]:
     return [int(decoder.state.values[sensor]) for sensor in sensors]
 
 
-def seen(decoder: Decoder) -> list[int]:
+def seen(decoder: SpecifiedDecoder) -> list[int]:
     return [at for at, status in enumerate(decoder.state.status.tolist()) if status != Status.NEVER_SEEN]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+import pytest
+
 from skinware_drivers.finding.interfaces import CanAdapterFound, detect_adapters
 
 
@@ -33,5 +35,6 @@ def test_a_library_that_hangs_is_ended_and_told() -> None:
     assert "did not answer within 1 s" in found.problem
 
 
+@pytest.mark.thorough
 def test_the_real_search_comes_to_its_end() -> None:
     assert detect_adapters(60).problem == ""

@@ -61,6 +61,7 @@ NUMBERS = [
 replaced = st.tuples(st.integers(0, 200), st.sampled_from(NUMBERS))
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(skin=st.sampled_from(SKINS), changes=st.lists(replaced, min_size=1, max_size=6))
 def test_other_values(skin: str, changes: list[tuple[int, str]]) -> None:
@@ -71,6 +72,7 @@ def test_other_values(skin: str, changes: list[tuple[int, str]]) -> None:
     check({"skin.xml": " ".join(words).encode(), "wrapper.xml": WRAPPER.encode()})
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(
     skin=st.sampled_from(SKINS),
@@ -118,6 +120,7 @@ def element(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 trees = st.recursive(texts, element, max_leaves=20)
 
 
+@pytest.mark.thorough
 @settings(max_examples=150, deadline=None)
 @given(a=trees, b=trees)
 def test_other_trees(a: str, b: str) -> None:

@@ -26,6 +26,7 @@ def robot(robots: Path, geometry: Path) -> Import:
     return imported(robots / "iCubGenova02", geometry)[0]
 
 
+@pytest.mark.thorough
 def test_every_value_of_all_files_is_understood(robots: Path, geometry: Path) -> None:
     done, notes = imported(robots, geometry)
     assert [str(note) for note in notes.all() if note.level == "unknown"] == []
@@ -40,6 +41,7 @@ GIVEN_AGAIN, NO_BOOLEAN, STAY_OFF = "given again as", "neither true nor false", 
 ALL_OFF, NO_DEVICE, NO_KIND = "no triangle is switched on", "there is no skin device", "what the modules are"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
@@ -69,6 +71,7 @@ def test_every_part_is_there_with_the_triangles_that_its_files_enable(robot: Imp
     }
 
 
+@pytest.mark.thorough
 def test_what_is_written_is_what_the_driver_reads(robots: Path, geometry: Path, tmp_path: Path) -> None:
     for part in imported(robots, geometry)[0].parts:
         text = part.configuration()

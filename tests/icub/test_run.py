@@ -21,6 +21,7 @@ from tests.icub.test_positions import TRIANGLE, positions
 from tests.sdk.driving import read_until
 
 
+@pytest.mark.thorough
 def test_a_real_arm_lives(robots: Path, geometry: Path, tmp_path: Path) -> None:
     name = "right_arm-eb4-j4_15-skin"
     bus = "virtual?boards=14,13,12,11,10,9,8&pattern=idle&mtb3=14,13,12"
@@ -49,6 +50,7 @@ def test_a_real_arm_lives(robots: Path, geometry: Path, tmp_path: Path) -> None:
             assert boards == {"right_hand": {14}, "right_forearm": {12, 13}, "right_arm": {8, 9, 10, 11}}
 
 
+@pytest.mark.thorough
 def test_a_real_leg_on_two_buses_lives(robots: Path, geometry: Path, tmp_path: Path) -> None:
     name = "left_leg-eb10-skin"
     buses = ["virtual?boards=1-7&pattern=idle", "virtual?boards=8-13&pattern=idle"]
@@ -73,6 +75,7 @@ def test_a_real_leg_on_two_buses_lives(robots: Path, geometry: Path, tmp_path: P
             assert (of_foot & known).sum() == 250
 
 
+@pytest.mark.thorough
 def test_a_made_up_part_lives_with_what_its_files_enable(made: Made, tmp_path_factory: pytest.TempPathFactory) -> None:
     sets = board_sets("0 8 8 100 1 0xf0") + triangle_sets("0 8 0 3 1 2 0x2200", "0 7 15 15 0 2 0x2200")
     made.write("skin.xml", device(DEFAULTS + sets))
@@ -203,6 +206,7 @@ def test_a_file_that_is_named_must_be_of_use(made: Made, capsys: pytest.CaptureF
     assert "a.xml:1: not XML" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_options_of_the_file_are_not_lost_to_another_bus(made: Made) -> None:
     made.write("skin.xml", device())
     assert call(made.folder, "-o", made.folder) == 0
@@ -211,6 +215,7 @@ def test_options_of_the_file_are_not_lost_to_another_bus(made: Made) -> None:
     assert "--bus virtual: the file has options for can0 and none for this bus; change the name there" in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_bus_that_is_not_filled_in_is_refused_by_the_driver(made: Made) -> None:
     made.write("skin.xml", device().replace("socketcan", "ecan"))
     assert call(made.folder, "-o", made.folder) == 0

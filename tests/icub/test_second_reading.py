@@ -50,6 +50,7 @@ needs_robots = pytest.mark.skipif(not ROBOTS.is_dir(), reason=f"the real files a
 of_each_robot = pytest.mark.parametrize("robot", _robots() or [ROBOTS], ids=lambda path: path.name)
 
 
+@pytest.mark.thorough
 @needs_robots
 @of_each_robot
 def test_boards_are_told_what_the_files_say(robot: Path) -> None:

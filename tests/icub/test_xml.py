@@ -98,6 +98,7 @@ def test_bombs_are_refused_at_once(made: Made, text: str, words: str) -> None:
         read_xml(path, Notes())
 
 
+@pytest.mark.thorough
 def test_many_comments_and_attributes_are_read(made: Made) -> None:
     attributes = " ".join(f'a{n}="1"' for n in range(100_000))
     root = read_xml(made.write("a.xml", f"<a {attributes}>{'<!---->' * 300_000}<b/></a>"), Notes())

@@ -61,6 +61,7 @@ def test_a_real_leg_has_its_second_bus_first(robots: Path, geometry: Path, tmp_p
     assert (upper.length, lower.length, foot.length) == (1344, 768, 384)
 
 
+@pytest.mark.thorough
 def test_every_port_of_all_real_robots_can_be_read(robots: Path, geometry: Path, tmp_path: Path) -> None:
     for number, robot in enumerate(
         sorted(path.parent.parent for path in robots.rglob("skin") if path.parent.name == "wrappers")
@@ -80,6 +81,7 @@ def make(made: Made) -> None:
     made.write("torso.txt", positions([TRIANGLE] * 32))
 
 
+@pytest.mark.thorough
 def test_each_value_is_where_the_position_file_says(made: Made, tmp_path_factory: pytest.TempPathFactory) -> None:
     make(made)
     out = tmp_path_factory.mktemp("out")

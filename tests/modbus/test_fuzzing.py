@@ -12,6 +12,7 @@ from tests.specification.both_paths import hand_clock
 pytestmark = pytest.mark.usefixtures("namespace")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(4))
 def test_c_and_python_make_the_same_of_anything(seed: int) -> None:
     rng = random.Random(seed)

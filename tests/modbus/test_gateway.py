@@ -51,6 +51,7 @@ def until_newer(reader: DriverReader, frames: int) -> None:
         assert (frame.values == range(1000, 1000 + N)).all()
 
 
+@pytest.mark.thorough
 def test_programs_move_the_hand_while_its_skin_is_read(over: Any) -> None:
     failures: list[str] = []
 
@@ -112,6 +113,7 @@ def question(number: int, place: int = PLACE) -> bytes:
     return struct.pack(">HHHBBHH", number, 0, 6, 1, 3, place, 1)
 
 
+@pytest.mark.thorough
 def test_who_hangs_up_in_the_middle_disturbs_nobody(over: Any) -> None:
     with shared(over) as (port, driving, reader):
         for number in range(30):
@@ -130,6 +132,7 @@ def test_who_sends_no_modbus_is_hung_up_on(way: str) -> None:
         until_newer(reader, 2)
 
 
+@pytest.mark.thorough
 def test_floods_and_programs_that_take_no_replies_starve_neither_skin_nor_others(over: Any) -> None:
     stop = threading.Event()
 

@@ -7,6 +7,7 @@ import pytest
 from tests.modbus.hostile import FUZZED, fuzz
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("namespace")
 @pytest.mark.parametrize("over_tcp", [False, True], ids=["rtu", "tcp"])
 @pytest.mark.parametrize("name", FUZZED)

@@ -121,6 +121,7 @@ def test_questions_and_replies_are_recorded(over: Any, tmp_path: Path) -> None:
         wait_until(lambda: counted(driving)["state"] == "live")
 
 
+@pytest.mark.thorough
 def test_a_recorded_wire_is_decoded_again(over: Any, tmp_path: Path) -> None:
     """The server raises all registers before each first read: the replay shows values that were seen, and in order."""
     file = tmp_path / "palm.mcap"
@@ -313,6 +314,7 @@ def test_the_traffic_of_another_master_is_shown_and_nothing_is_sent() -> None:
 # Commands
 
 
+@pytest.mark.thorough
 def test_the_commands() -> None:
     name, file = f"modbus:tcp://{LOCAL}:{free_port()}", str(Path(__file__).parent / "array_file.py")
     with running("skin-emulate", "--driver", file, "--bus", name) as devices:

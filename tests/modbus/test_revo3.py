@@ -135,6 +135,7 @@ def test_the_emulated_hand_answers_as_the_table_says(mapping: Any, read: str, an
 # What the hand says of itself decides
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("hand", "counts", "kinds"),
     [
@@ -186,6 +187,7 @@ class Changing(EmulatedRevo3):
         return self.starts > 1 or super()._sends_sums(device)
 
 
+@pytest.mark.thorough
 def test_a_hand_that_sends_something_else_after_a_restart_is_described_again(caplog: Any) -> None:
     caplog.set_level("INFO")
     with emulated_skin("revo3", Changing, restart=(1,), restart_after_s=2) as skin:

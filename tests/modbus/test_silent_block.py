@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pytest
 
 from skinware import Status
 from skinware_drivers.modbus import Registers
@@ -32,6 +33,7 @@ class OfTwoBlocks(Suite):
     emulator = EmulatedInTwoBlocks
 
 
+@pytest.mark.thorough
 def test_only_the_taxels_of_the_silent_block_are_stale() -> None:
     async def scenario(clock: HandClock) -> None:
         async with OfTwoBlocks().running(clock) as rig:

@@ -11,6 +11,7 @@ from tests.serial.fuzzing import Script
 from tests.specification.both_paths import hand_clock
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(4))
 def test_what_waits_in_the_kernel_is_taken_and_counted(seed: int) -> None:
     rng = random.Random(seed)

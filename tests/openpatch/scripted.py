@@ -9,12 +9,13 @@ from typing import Any
 
 from skinware.errors import HandshakeTimeout
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, assemble
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.fields import Match, Reply
+from skinware_drivers.link import Link
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from tests.openpatch import wire
+from tests.specification.decoding import SpecifiedDecoder
 
 Answer = Callable[[int, bytes], bytes | None]
 
@@ -60,11 +61,11 @@ def describe(answer: Answer) -> OpenPatchDriver:
 
 def decoded(
     said: wire.Said, messages: Sequence[tuple[int, bytes]], received_ns: Sequence[int] | None = None
-) -> Decoder:
+) -> SpecifiedDecoder:
     """A decoder that has seen some messages of a patch."""
     driver = OpenPatchDriver(OpenPatchOptions())
     patches = asyncio.run(driver.describe(ScriptedLink(answering(said.items()))))
-    decoder = Decoder([driver.layout], assemble([("bus", patches)], driver.types, driver.dtype))
+    decoder = SpecifiedDecoder([driver.layout], assemble([("bus", patches)], driver.types, driver.dtype))
     batch = FrameBatch(64, driver.payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
     times_ns = range(1, len(messages) + 1) if received_ns is None else received_ns

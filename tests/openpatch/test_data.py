@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware import Status
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from tests.openpatch import wire
 from tests.openpatch.scripted import data, decoded
@@ -42,6 +42,7 @@ def test_data_of_a_wrong_form_is_not_shown(payload: bytes, is_module: bool) -> N
     assert counters["unknown"] == 1 + (not is_module)  # a kind that there is not, a module that there is not
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=100)
 @given(st.lists(st.integers(0, 65535), min_size=1, max_size=30), st.data())
 def test_of_a_damaged_stream_only_whole_messages_are_shown(samples: list[int], more: st.DataObject) -> None:

@@ -121,6 +121,7 @@ def sayings(draw: st.DrawFn) -> wire.Said:
     return wire.Said(draw(NAMES), "7", draw(NAMES), (10, 10, 10), types, kinds, [(0, 1), *modules])
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=40)
 @given(sayings(), st.data())
 def test_every_description_and_its_data_come_out_as_they_were_said(said: wire.Said, more: st.DataObject) -> None:
@@ -153,6 +154,7 @@ def test_every_description_and_its_data_come_out_as_they_were_said(said: wire.Sa
     assert structure.module_kind.tolist() == [kind[0].encode() for kind in of_module]
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_damaged_descriptions_are_understood_or_refused(more: st.DataObject) -> None:

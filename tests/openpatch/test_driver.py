@@ -54,6 +54,7 @@ def values_of(module: int, n: int, sample: int) -> npt.NDArray[np.int64]:
     return 5 * module + 3 * np.arange(n) + sample
 
 
+@pytest.mark.thorough
 def test_a_hand_with_all_it_says_of_itself(firmware: Path) -> None:
     with Microcontroller(firmware, "hand", "0042") as patch, driven(patch) as (_, reader):
         frame = read_until(reader, is_fresh)
@@ -102,13 +103,13 @@ def test_no_module_is_torn_and_no_sample_lost(firmware: Path) -> None:
     with Microcontroller(firmware, "hand") as patch, driven(patch, rate_hz=100) as (_, reader):
         read_until(reader, is_fresh)
         shown: list[int] = []
-        overlooked = -reader.lost
+        overlooked = -reader.missed
         for count, frame in enumerate(reader.in_order(timeout_s=30)):
             sample = samples_of(frame)[0]
             shown += [sample] if sample not in shown else []
             if count >= 100:
                 break
-        overlooked += reader.lost  # by this program, if the machine did not let it run
+        overlooked += reader.missed  # by this program, if the machine did not let it run
         assert sum((after - before) % 251 - 1 for before, after in pairwise(shown)) <= overlooked
         assert len(shown) > 50
         assert reader.patch_counters(frame)[0]["sequence_lost"] == 0

@@ -14,6 +14,7 @@ from tests.sdk.driving import driving_lines
 PAGE = Path(__file__).parents[2] / "docs/how-to/openpatch.md"
 
 
+@pytest.mark.thorough
 def test_the_sketch_of_the_page_is_a_patch(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     sketch = re.search(r"```cpp\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert sketch

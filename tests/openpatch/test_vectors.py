@@ -38,6 +38,7 @@ def run(firmware: Path, commands: Sequence[str]) -> list[bytes]:
     return said
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_the_header_says_what_the_vectors_say(language: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     firmware = program(HERE / "vectors.c", language, tmp_path_factory)

@@ -65,11 +65,13 @@ def hooks(source: Path) -> str:
     return run_in(source, "-c", program).splitlines()[-1]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiler")
 def test_a_build_asks_for_no_compiler_where_one_works(source: Path) -> None:
     assert "ziglang" not in hooks(source)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("reason", ["there is no compiler", "its headers are missing"])
 def test_a_build_asks_for_a_compiler_where_none_works(source: Path, bare: Path, reason: str) -> None:
     if reason == "its headers are missing":
@@ -78,6 +80,7 @@ def test_a_build_asks_for_a_compiler_where_none_works(source: Path, bare: Path, 
     assert hooks(source).count("ziglang>=") == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("bare")
 def test_a_build_that_got_no_compiler_says_what_to_install(source: Path) -> None:
     output = build(source, succeeds=False)
@@ -106,6 +109,7 @@ def test_a_build_beside_the_sources_changes_no_library_that_is_in_use(source: Pa
         assert not os.path.samestat(os.fstat(in_use.fileno()), library.stat())
 
 
+@pytest.mark.thorough
 def test_the_source_distribution_has_what_is_compiled(source: Path) -> None:
     run_in(source, "setup.py", "-q", "sdist")
     (archive,) = (source / "dist").iterdir()

@@ -28,6 +28,7 @@ MATRICES = fake_structure(1, 2, kind="2x5")
 REST, PRESSED = 240, 150
 
 
+@pytest.mark.thorough
 def test_a_program_presses_and_skips(tmp_path: Path) -> None:
     stem = tmp_path / "proof"
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
@@ -73,6 +74,7 @@ def test_a_program_presses_and_skips(tmp_path: Path) -> None:
         assert recording.drivers == ("hand",)
 
 
+@pytest.mark.thorough
 def test_it_starts_a_driver_and_captures_its_first_byte(tmp_path: Path) -> None:
     stem = tmp_path / "proof"
     own = ("--rest", "0.3", "--wait", "0.2", "--only", "palm", "-o", str(stem))
@@ -162,6 +164,7 @@ def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted:
         assert recording.is_whole
 
 
+@pytest.mark.thorough
 def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Path) -> None:
     """The driver does not come to an end with taring; then the report goes into a pipe that nobody reads yet."""
     report, is_taring, may_end = tmp_path / "proof.md", threading.Event(), threading.Event()
@@ -240,6 +243,7 @@ def test_what_cannot_be_written_is_said_before_somebody_walks(tmp_path: Path) ->
     assert f"{tmp_path / 'proof.json'}: exists already" in there.stderr
 
 
+@pytest.mark.thorough
 def test_a_driver_whose_author_prints_is_heard_nevertheless(tmp_path: Path, tcp_patch: Callable[..., str]) -> None:
     (tmp_path / "noisy.py").write_text(
         "from skinware_drivers.serial.weiss_wts import WeissWtsDriver\n\n\n"
@@ -262,6 +266,7 @@ def pressed(rest: Any, taxel: int) -> Any:
     return values
 
 
+@pytest.mark.thorough
 def test_without_a_driver_it_says_so() -> None:
     missed = run("skin-prove")
     assert missed.returncode == 1

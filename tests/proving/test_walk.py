@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 
 from skinware.errors import BusError
 from skinware_drivers.proving.proof import Check, Verdict
@@ -14,6 +15,7 @@ from tests.proving.rig import COLUMNS, NAMES, ROWS, EmulatedHand, N, PressingPer
 INDEX, MIDDLE = (f"hand, {name}" for name in NAMES)
 
 
+@pytest.mark.thorough
 def test_a_driver_in_order_is_proven() -> None:
     person = PressingPerson()
     proof = proven(person, straight())
@@ -28,6 +30,7 @@ def test_a_driver_in_order_is_proven() -> None:
     ]
 
 
+@pytest.mark.thorough
 def test_planted_faults_are_found() -> None:
     """Mirrored rows and a dead taxel of the index tip; two exchanged taxels of the middle tip."""
     wiring = straight()
@@ -42,6 +45,7 @@ def test_planted_faults_are_found() -> None:
     assert not proof.is_proven
 
 
+@pytest.mark.thorough
 def test_another_module_that_answers_is_named_and_one_that_is_not_wanted_is_skipped() -> None:
     wiring = np.roll(straight(), N)
     proof = proven(PressingPerson(skipped=[MIDDLE], ignored=["stroke down"]), wiring, patience_s=3.0)
@@ -71,6 +75,7 @@ def tared(on_tare: Callable[[EmulatedHand], None], **more: Any) -> Check:
     return check
 
 
+@pytest.mark.thorough
 def test_taring_is_tried_if_it_is_wanted() -> None:
     def tare(hand: EmulatedHand) -> None:
         hand.offset = 0
@@ -89,6 +94,7 @@ def test_taring_is_tried_if_it_is_wanted() -> None:
     assert "it is not at rest" in refused.seen
 
 
+@pytest.mark.thorough
 def test_taring_changes_a_device_so_nobody_has_to_want_it() -> None:
     tares: list[EmulatedHand] = []
     unasked = tared(tares.append, with_tare=False)

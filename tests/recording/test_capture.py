@@ -56,7 +56,7 @@ def test_a_capture_is_whole_and_begins_with_the_first_question(tmp_path: Path, n
     with running("skin-driver", *options, "--bus", "virtual", "--capture", str(path)) as driver:
         frames_come(driver, "weiss_wts")
         told = driver.stop(number)
-    assert told == {"event": "captured", "file": str(path), "bytes": path.stat().st_size, "lost": 0, "problem": ""}
+    assert told == {"event": "captured", "file": str(path), "bytes": path.stat().st_size, "missed": 0, "problem": ""}
     with skinware.recording.open(path) as recording:
         assert recording.is_whole
         assert recording.problems == []
@@ -73,6 +73,7 @@ def test_a_capture_is_whole_and_begins_with_the_first_question(tmp_path: Path, n
     assert (again.returncode, again.stdout.splitlines()[-1]) == (0, "equal")
 
 
+@pytest.mark.thorough
 def test_a_driver_that_is_killed_leaves_a_whole_capture(tmp_path: Path) -> None:
     path = tmp_path / "hand.mcap"
     with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", str(path)) as driver:
@@ -91,6 +92,7 @@ def test_a_driver_that_is_killed_leaves_a_whole_capture(tmp_path: Path) -> None:
         assert len(items_of(recording)) > 20
 
 
+@pytest.mark.thorough
 def test_what_nobody_understands_is_captured(tmp_path: Path) -> None:
     """The wrong driver for what is on the bus: nothing is published, and every frame is there."""
     path = tmp_path / "hand.mcap"
@@ -104,6 +106,7 @@ def test_what_nobody_understands_is_captured(tmp_path: Path) -> None:
         assert recording.about("barrett")["driver_type"] == "barrett"
 
 
+@pytest.mark.thorough
 def test_a_bus_on_which_nothing_comes_is_in_the_capture_too(tmp_path: Path) -> None:
     path = tmp_path / "hand.mcap"
     options = ("--driver", "xela", "--listen-only", "--bus", "virtual:barrett", "--capture", str(path))
@@ -162,6 +165,7 @@ def test_driver_and_options_come_from_the_file_unless_they_are_given(tmp_path: P
         assert driver.wait_for("ready")["sensors"] == 48
 
 
+@pytest.mark.thorough
 def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "hand.mcap"
     path.write_text("mine")

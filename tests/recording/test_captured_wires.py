@@ -78,6 +78,7 @@ class HeldUp(TcpBus):
             time.sleep((0.06, 0.15, 0.4)[self.asked // 10 % 3])
 
 
+@pytest.mark.thorough
 def test_a_driver_that_is_held_up_captures_what_is_decoded_to_the_same_values(tmp_path: Path) -> None:
     """It reads answers when it would have given them up; a replay that gave them as late would lose them."""
     kind, file = load_driver("tesollo"), tmp_path / "held.mcap"

@@ -87,6 +87,7 @@ def check_arrays(path: Path, table: Table) -> None:
         assert (read.shape, read.dtype, read.tobytes()) == (array.shape, array.dtype, array.tobytes()), name
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("format_name", ARRAYS)
 def test_arrays_are_those_of_the_recording(path: Path, tmp_path: Path, format_name: str) -> None:
     converted = convert(path, tmp_path / "x", format_name)
@@ -226,6 +227,7 @@ def _text(each: str | bytes) -> str:
 # -- what is selected ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_selection_has_what_was_asked_for_and_nothing_else(path: Path, tmp_path: Path) -> None:
     palm = Region("palm", "pressure", ("torso",), uid=(1000, 1001, 1024), patch=("board 9",))
     with skinware.recording.open(path) as opened_path:
@@ -286,6 +288,7 @@ def test_what_there_is_not_is_one_line(path: Path, tmp_path: Path, selection: Se
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("format_name", ARRAYS)
 def test_drivers_that_restart_and_change_are_tables_of_their_own(tmp_path: Path, format_name: str) -> None:
     file = tmp_path / "skin.mcap"
@@ -316,6 +319,7 @@ STRUCTURES = st.lists(FIELD, min_size=1, max_size=3).map(
 COLUMN = st.tuples(st.one_of(PLAIN, STRUCTURES), st.sampled_from([(), (0,), (1,), (5,), (2, 3)]))
 
 
+@pytest.mark.thorough
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     columns=st.dictionaries(st.text("abc_", min_size=1, max_size=4), COLUMN, min_size=1, max_size=3),
@@ -383,6 +387,7 @@ def test_columns_of_a_service_are_texts_too(tmp_path: Path, path: Path) -> None:
 # -- files that are not whole -------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_cut_or_damaged_recording_is_converted_as_far_as_it_is_whole(path: Path, tmp_path: Path) -> None:
     data = path.read_bytes()
     cut = tmp_path / "cut.mcap"

@@ -28,6 +28,7 @@ def original(tmp_path: Path, made: dict[str, bytes]) -> Original:
     return Original(file)
 
 
+@pytest.mark.thorough
 def test_damage_costs_the_chunk_in_which_it_is(original: Original, tmp_path: Path) -> None:
     generator = random.Random(7)
     found = [original.check(generator, tmp_path / "damaged.mcap") for _ in range(DAMAGES)]
@@ -35,6 +36,7 @@ def test_damage_costs_the_chunk_in_which_it_is(original: Original, tmp_path: Pat
     assert min(found) < len(original.frames)
 
 
+@pytest.mark.thorough
 def test_a_file_that_is_cut_off_is_made_whole(original: Original, tmp_path: Path) -> None:
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     for size in (len(original.data) - 1, len(original.data) - 500, len(original.data) * 2 // 3):
@@ -56,6 +58,7 @@ def test_a_file_that_is_cut_off_is_made_whole(original: Original, tmp_path: Path
     assert sorted(tmp_path.iterdir()) == [cut, tmp_path / "original.mcap"]
 
 
+@pytest.mark.thorough
 def test_what_is_damaged_is_left_out_when_it_is_made_whole(original: Original, tmp_path: Path) -> None:
     generator = random.Random(11)
     file, whole = tmp_path / "damaged.mcap", tmp_path / "whole.mcap"
@@ -78,6 +81,7 @@ def test_damage_is_told(original: Original, tmp_path: Path) -> None:
     assert recover(file, tmp_path / "whole.mcap").damaged == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("is_cut", [False, True])
 def test_damaged_times_before_a_chunk_change_nothing(original: Original, tmp_path: Path, is_cut: bool) -> None:
     """They are covered by no checksum, and told elsewhere too."""
@@ -98,6 +102,7 @@ def test_damaged_times_before_a_chunk_change_nothing(original: Original, tmp_pat
                 assert opened.is_whole is not is_cut
 
 
+@pytest.mark.thorough
 def test_a_chunk_that_lost_its_checksum_is_not_believed(original: Original, tmp_path: Path) -> None:
     file = tmp_path / "damaged.mcap"
     with McapSource(tmp_path / "original.mcap") as source:

@@ -144,6 +144,7 @@ def test_windows_have_the_skins_own_rate(made: Made, window: int, frames: int) -
     assert len(values) == int((1.99 - first_s) * 30) + 1
 
 
+@pytest.mark.thorough
 def test_a_driver_that_falls_silent_is_stale_and_old(tmp_path: Path) -> None:
     structure = fake_structure(1, 2)
     silent = table_of("torso", structure, [*range(50), *range(400, 450)])
@@ -210,6 +211,7 @@ def test_gaps_end_episodes(tmp_path: Path) -> None:
     assert np.array_equal(read.episode(1)[f"{TACTILE}torso.pressure"][0], physical(made.tables[0], "pressure")[100:102])
 
 
+@pytest.mark.thorough
 def test_several_recordings_are_one_set(made: Made, tmp_path: Path) -> None:
     structure = made.tables[0].structure
     assert structure is not None
@@ -225,6 +227,7 @@ def test_several_recordings_are_one_set(made: Made, tmp_path: Path) -> None:
     assert [(row["length"], row["tasks"]) for row in read.episodes] == [(50, ["walk"]), (25, ["x"])]
 
 
+@pytest.mark.thorough
 def test_a_change_of_structure_is_refused_or_several_sets(tmp_path: Path) -> None:
     small, large = fake_structure(1, 1), fake_structure(2, 1)
     tables = [
@@ -255,6 +258,7 @@ def test_a_change_of_structure_is_refused_or_several_sets(tmp_path: Path) -> Non
 # -- what is joined -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @settings(max_examples=200, deadline=None)
 @given(
     times=st.lists(st.integers(0, 60), min_size=1, max_size=12).map(sorted),
@@ -296,6 +300,7 @@ def write_joints(path: Path, base: str, seconds: Sequence[float]) -> npt.NDArray
     return angles.astype(np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("base", TIME_BASES)
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz"])
 def test_joints_are_joined_at_their_times(made: Made, tmp_path: Path, suffix: str, base: str) -> None:
@@ -381,6 +386,7 @@ def test_times_that_do_not_overlap(made: Made, tmp_path: Path) -> None:
         learn(made, LearningSet(intervals=[Interval(5, 6)]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -583,6 +589,7 @@ def test_an_episode_that_is_not_all_there_is_told(made: Made, tmp_path: Path) ->
 # -- large ones ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_many_files_and_batches_are_the_same_set(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     intervals = [Interval(n / 5, (n + 1) / 5) for n in range(9)]
     whole = learn(made, LearningSet(fps=50, window=3, intervals=intervals))
@@ -626,6 +633,7 @@ def test_statistics_of_parts_are_those_of_the_whole(lengths: list[int], kept: in
     np.testing.assert_allclose(told["q50"], np.quantile(exact[::step], 0.5, axis=0), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "_BATCH_BYTES", 1 << 16)
     monkeypatch.setattr(features, "_SAMPLE_ROWS", 40)

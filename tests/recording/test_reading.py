@@ -117,6 +117,7 @@ def test_sensors_of_a_type_or_a_region_alone(path: Path) -> None:
             torso.blocks(["x"])
 
 
+@pytest.mark.thorough
 def test_the_example(path: Path) -> None:
     example = Path(__file__).parents[2] / "examples" / "recording.py"
     done = subprocess.run(
@@ -220,6 +221,7 @@ def test_an_interrupted_writer_of_nothing_is_an_empty_recording(tmp_path: Path) 
         assert (opened.services, opened.is_whole, opened.duration_s) == ((), False, 0.0)
 
 
+@pytest.mark.thorough
 def test_without_the_packages_it_says_which_extra_is_needed() -> None:
     code = "import sys; sys.modules['mcap'] = None\nimport skinware.recording"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

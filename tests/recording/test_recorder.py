@@ -50,10 +50,11 @@ def test_a_driver_and_a_service_that_come_later_are_recorded_whole(path: Path, n
                 time.sleep(0.002)
             seen = publish(skin, 60)
             wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 60)
-        assert recorder.lost == 0
+        assert recorder.missed == 0
     with skinware.recording.open(path) as opened:
         assert opened.is_whole
-        assert (opened.services, opened.drivers, opened.lost, opened.problems) == (("pose", "torso"), ("torso",), 0, [])
+        assert (opened.services, opened.drivers) == (("pose", "torso"), ("torso",))
+        assert (opened.missed, opened.problems) == (0, [])
         assert recorded(opened, "torso") == seen
         torso, pose_track = opened["torso"], opened["pose"]
         assert torso.structure == skin.structure
@@ -77,7 +78,7 @@ def test_restarts_and_another_structure_are_followed(path: Path) -> None:
                 seen.append(publish(skin, 20))
                 number = sum(map(len, seen))
                 wait_until(lambda number=number: recorder.messages.get("/skin/torso/frame", 0) == number)  # type: ignore[misc]
-        assert recorder.lost == 0
+        assert recorder.missed == 0
     with skinware.recording.open(path) as opened:
         torso = opened["torso"]
         assert recorded(opened, "torso") == seen[0] | seen[1] | seen[2]
@@ -100,6 +101,7 @@ def test_restarts_and_another_structure_are_followed(path: Path) -> None:
         assert [layout.structures[0].n_patches for layout in layouts][-1] == 2
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_is_told(path: Path) -> None:
     with recording(path) as recorder:
         with fake_process("torso", "--rate", "50") as process:
@@ -112,6 +114,7 @@ def test_a_killed_driver_is_told(path: Path) -> None:
         assert list(opened.snapshots())[-1].layout.drivers == ("torso",)
 
 
+@pytest.mark.thorough
 def test_what_could_not_be_taken_is_told(path: Path) -> None:
     with FakeSkin("torso", slots=4) as skin, recording(path) as recorder:
         skin.publish()
@@ -119,11 +122,11 @@ def test_what_could_not_be_taken_is_told(path: Path) -> None:
         for _ in range(30):
             skin.publish(40)  # at once: the ring has 4 slots
             time.sleep(0.01)
-        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == 1201)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.missed == 1201)
     with skinware.recording.open(path) as opened:
         sequence = opened["torso"].read(["status"]).sequence.astype(int)
-        assert opened.lost == recorder.lost > 0
-        told = {event["before"]: event["count"] for event in opened.events if event["event"] == "lost"}
+        assert opened.missed == recorder.missed > 0
+        told = {event["before"]: event["count"] for event in opened.events if event["event"] == "missed"}
         gaps = np.diff(sequence, prepend=0)  # the first one of all may be lost too
         assert {int(sequence[at]): int(gaps[at]) - 1 for at in np.flatnonzero(gaps > 1)} == told
 
@@ -155,6 +158,7 @@ def test_the_past_is_kept_and_saved_when_it_is_wanted(path: Path) -> None:
             assert (np.diff(sequence) == 1).all()
 
 
+@pytest.mark.thorough
 def test_files_of_a_size_each_complete_and_the_oldest_removed(path: Path) -> None:
     target = Files(path, split_size=30_000, max_size=100_000)
     with FakeSkin("torso") as skin, recording(path, target) as recorder:
@@ -170,7 +174,7 @@ def test_files_of_a_size_each_complete_and_the_oldest_removed(path: Path) -> Non
             sequence = opened["torso"].read(["status"]).sequence
             assert following in (None, sequence[0])
             following = sequence[-1] + 1
-    assert recorder.lost == 0
+    assert recorder.missed == 0
     assert following == 601
 
 
@@ -286,6 +290,7 @@ def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pyt
         assert sequence.tolist() == list(range(sequence[0], sequence[-1] + 1))  # from the recorder's beginning on
 
 
+@pytest.mark.thorough
 def test_a_long_file_needs_no_more_memory_than_a_short_one(path: Path) -> None:
     file, channels = McapFile(path), Channels()
     for number in range(2000):
@@ -315,6 +320,7 @@ def test_a_summary_that_cannot_wait_on_the_disk_ends_the_recording(path: Path, m
         assert opened.is_whole
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="only root may mount a small disk")
 def test_a_real_full_disk(path: Path) -> None:
     disk = path.parent / "disk"

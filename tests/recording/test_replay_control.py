@@ -76,6 +76,7 @@ def newest(frames: list[tuple[float, str, dict[str, bytes]]]) -> dict[str, dict[
     return {service: contents for _, service, contents in frames}
 
 
+@pytest.mark.thorough
 def test_steps_to_and_fro_show_what_was_there(file: Path) -> None:
     frames = recorded(file)
     shown, steps = 1, random.Random(2)
@@ -118,7 +119,7 @@ def test_playing_goes_on_from_there_without_a_gap(file: Path) -> None:
                 if len(found) == len(expected):
                     break
             assert found == expected
-            assert torso.lost == 0
+            assert torso.missed == 0
             wait_until(lambda: control.call("replay")["paused"])  # it stays, at its end
             told = control.call("replay")
             assert told["time_s"] == told["duration_s"] >= frames[-1][0]
@@ -231,6 +232,7 @@ def test_times_of_then_can_be_kept(file: Path) -> None:
             assert frame.published_ns > frame.acquired_ns
 
 
+@pytest.mark.thorough
 def test_pauses_and_deaths_are_as_they_were(tmp_path: Path, namespace: Namespace) -> None:
     file = tmp_path / "skin.mcap"
     with recording(file) as recorder, FakeSkin("torso", fake_structure(1)) as torso:

@@ -55,7 +55,7 @@ def write_recording(path: Path, fill: Callable[[dict[tuple[str, str], WireTap]],
     chunk.add(*channels.of_all("/skin/clock"), 0, EPOCH_NS, b"{}")
     for (driver, bus), tap in taps.items():
         for number, batch in enumerate(tap.fetch()):
-            head = struct.pack("<QQqQ", 1, number, MONOTONIC_NS + _PUBLISHED_NS, tap.lost)
+            head = struct.pack("<QQqQ", 1, number, MONOTONIC_NS + _PUBLISHED_NS, tap.missed)
             chunk.add(*channels.of_wire(driver, bus), number, EPOCH_NS + _PUBLISHED_NS, head + bytes(batch))
     file.add(chunk.close())
     file.finish()
@@ -240,6 +240,7 @@ def test_two_drivers_on_one_bus_are_told_apart(recording: Callable[..., Recordin
     assert dict(export_candump(recording(fill), tmp_path / "wire.log").counts) == {"can0": 2, "can0_2": 2}
 
 
+@pytest.mark.thorough
 def test_what_is_cut_or_lost_is_told(recording: Callable[..., Recording], tmp_path: Path) -> None:
     def fill(taps: dict[tuple[str, str], WireTap]) -> None:
         keep(taps, "torso", "can0", [Sent(0, 0x100, bytes(8), flags=0x84)])

@@ -17,7 +17,7 @@ import pytest
 from skinware import DriverReader, Namespace
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError
-from skinware.ros2 import dds, types
+from skinware.ros2 import dds, messages
 from skinware.ros2.transport import Distro, NodeIdentity, Qos
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
@@ -60,6 +60,7 @@ def message(of: Running, topic: str, name: str, condition: Callable[[Any], bool]
     return found[0]
 
 
+@pytest.mark.thorough
 def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namespace, domain: int) -> None:
     skin = FakeSkin("arm", placed(fake_structure(2, 8)))
     skin.break_some()
@@ -88,6 +89,7 @@ def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namesp
         ours.wait_for("status", lambda event: event["drivers"]["arm"]["messages"] > 10)
 
 
+@pytest.mark.thorough
 def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, domain: int) -> None:
     info = ("ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo")
     with FakeSkin("arm", placed(fake_structure(1, 2))) as skin, bridge() as ours:
@@ -96,7 +98,7 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
         with peer(domain, "--look") as looking:
             found = looking.wait_for("publication", lambda event: event["topic"] == POINTS[0])
             assert found["type"] == "sensor_msgs::msg::dds_::PointCloud2_"
-            assert found["data"] == f"typehash={types.POINTS.hash};"
+            assert found["data"] == f"typehash={messages.POINTS.hash};"
         with peer(domain, "--listen-late", *info) as theirs:  # the two events have no order in one program
             told = message(
                 theirs,
@@ -110,6 +112,7 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
             assert of_node.node_namespace + of_node.node_name == node
 
 
+@pytest.mark.thorough
 def test_a_service_tares(namespace: Namespace, domain: int) -> None:
     with tareable(namespace), bridge("--tare") as ours:
         ours.wait_for("ready")
@@ -147,12 +150,13 @@ def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: 
             theirs.wait_for("message")
 
 
+@pytest.mark.thorough
 def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
     monkeypatch.setattr(dds, "_write_bytes", None)
     node = dds.DdsNode(NodeIdentity("skin", domain=domain))
     try:
-        with peer(domain, "--listen", "rt/x", types.SKIN_FRAME.name) as theirs:
-            publisher = node.publisher("/x", types.SKIN_FRAME, Qos())
+        with peer(domain, "--listen", "rt/x", messages.SKIN_FRAME.name) as theirs:
+            publisher = node.publisher("/x", messages.SKIN_FRAME, Qos())
             assert not publisher.is_wanted or theirs
             wait_until(lambda: publisher.is_wanted)
             sent = made_frame()

@@ -383,6 +383,7 @@ def hearing_elsewhere(graph: Graph, topic: Found) -> Iterator[tuple[int, Callabl
         process.communicate()
 
 
+@pytest.mark.thorough
 def test_publishers_and_services_that_come_and_go_leave_nothing(graph: Graph) -> None:
     skin, other = graph.skin, graph.other
     for _ in range(100):

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 
 from skinware import DriverReader, DriverWriter, Namespace, Status
 from skinware.conversion.ros_messages import Cdr
@@ -50,7 +51,7 @@ def test_every_frame_comes_to_who_wants_each(namespace: Namespace) -> None:
         graph.wanted = {FRAMES}
         heard_from(graph, FRAMES, skin)
         wait_until(lambda: graph.heard(FRAMES)[-1].sequence == skin.writer.sequence)
-        begin, lost = skin.writer.sequence, server.drivers()["arm"].lost
+        begin, lost = skin.writer.sequence, server.drivers()["arm"].missed
         for _ in range(50):
             skin.publish()
             wait_until(lambda: graph.heard(FRAMES)[-1].sequence == skin.writer.sequence)
@@ -59,7 +60,7 @@ def test_every_frame_comes_to_who_wants_each(namespace: Namespace) -> None:
         (sensors,) = graph.heard(SENSORS)
         assert sensors.generation == graph.heard(FRAMES)[-1].generation
         assert np.array_equal(sensors.uid, skin.structure.sensor_uid)
-        assert server.drivers()["arm"].lost == lost
+        assert server.drivers()["arm"].missed == lost
         assert graph.heard(POINTS) == []  # nobody wants them
 
 
@@ -78,14 +79,14 @@ def test_frames_that_were_too_fast_are_counted_only_for_who_wants_each(namespace
         skin.publish()
         told(graph, SENSORS)
         skin.publish(30)
-        assert server.drivers()["arm"].lost == 0
+        assert server.drivers()["arm"].missed == 0
         graph.wanted = {FRAMES}
         heard_from(graph, FRAMES, skin)
         heard_from(graph, FRAMES, skin)
 
         def lost_some() -> bool:
             skin.publish(30)  # at once: most of them cannot be taken
-            return server.drivers()["arm"].lost > 0
+            return server.drivers()["arm"].missed > 0
 
         wait_until(lost_some)
 
@@ -133,6 +134,7 @@ def last_status(graph: Graph) -> Any:
     return graph.heard(FRAMES)[-1].status
 
 
+@pytest.mark.thorough
 def test_what_a_killed_driver_leaves_is_stale_and_it_may_come_back(namespace: Namespace) -> None:
     with served(namespace) as (graph, server):
         graph.wanted = {FRAMES, "/diagnostics"}
@@ -153,6 +155,7 @@ def test_what_a_killed_driver_leaves_is_stale_and_it_may_come_back(namespace: Na
             wait_until(lambda: server.drivers()["arm"].state == "live")
 
 
+@pytest.mark.thorough
 def test_a_driver_that_hangs_is_stale_until_it_goes_on(namespace: Namespace) -> None:
     with fake_process("arm") as process, served(namespace) as (graph, server):
         graph.wanted = {FRAMES}

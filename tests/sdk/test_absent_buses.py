@@ -123,6 +123,7 @@ def test_a_bus_whose_devices_have_not_described_themselves_holds_up_no_other() -
         follow(reader, lambda f: f.structure.n_patches == 2 and not f.status.any())
 
 
+@pytest.mark.thorough
 def test_the_command_waits_if_it_is_told_to(tmp_path: Path) -> None:
     port = tmp_path / "port"
     file = tmp_path / "torso.toml"

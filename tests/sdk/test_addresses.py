@@ -13,10 +13,11 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch, wire_dtype
 from skinware_drivers.decoding.addresses import Addresses
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, join_types, taxels
-from skinware_drivers.layout import MOST_FRAMES, Bits, Byte, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Byte, Identifier, SequenceNumber
+from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout, Values
+from tests.specification.decoding import SpecifiedDecoder, slots_of
 
 TYPES = [PRESSURE.measured(unit="counts")]
 NODE = Bits(shift=8, width=8)
@@ -43,7 +44,7 @@ def tables_of(*buses: list[Patch], dtype: str = "<u2") -> SkinTables:
     return assemble([(f"bus{number}", found) for number, found in enumerate(buses)], TYPES, dtype)
 
 
-def run(decoder: Decoder, frames: Sequence[tuple[int, int, bytes]], payload_size: int = 8) -> list[int]:
+def run(decoder: SpecifiedDecoder, frames: Sequence[tuple[int, int, bytes]], payload_size: int = 8) -> list[int]:
     """Shows frames (bus, identifier, payload), all in one batch; the rows that were nobody's."""
     batch = FrameBatch(64 + len(frames), payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
@@ -65,7 +66,7 @@ def extended(node: int, part: int, noise: int = 0) -> int:
 
 
 def test_29_bit_identifiers_name_patch_and_module() -> None:
-    decoder = Decoder([Layout([EXTENDED])], tables_of(patches(3, 0xC8)))
+    decoder = SpecifiedDecoder([Layout([EXTENDED])], tables_of(patches(3, 0xC8)))
     foreign = run(
         decoder,
         [
@@ -86,7 +87,7 @@ def test_29_bit_identifiers_name_patch_and_module() -> None:
 def test_29_and_11_bits_side_by_side() -> None:
     standard = Frame("standard", (Identifier(0x100, mask=0x7F0),), (8,), Values(0, "<u2", 2), module=PART)
     layout = Layout([EXTENDED, standard])
-    decoder = Decoder([layout], tables_of(patches(0)))
+    decoder = SpecifiedDecoder([layout], tables_of(patches(0)))
     run(decoder, [(0, 0x100, numbers(1, 2)), (0, extended(0, 1), numbers(3, 4)), (0, extended(0, 0), numbers(5, 6))])
     assert decoder.state.values.tolist() == [5, 6, 3, 4]
 
@@ -96,7 +97,7 @@ def test_29_bits_are_one_kind_or_another_by_a_byte_and_lengths_are_checked() -> 
     head = Frame("head", (*when, Byte(0, 1)), (5,), Values(1, "<u2", 1, to=(0,)), NODE, PART)
     tail = Frame("tail", (*when, Byte(0, 2)), (5,), Values(1, "<u2", 1, to=(1,)), NODE, PART)
     layout = Layout([head, tail], Cycle(["head", "tail"], maximum_age_s=1.0))
-    decoder = Decoder([layout], tables_of(patches(5)))
+    decoder = SpecifiedDecoder([layout], tables_of(patches(5)))
     at = extended(5, 1)
     run(
         decoder,
@@ -111,6 +112,7 @@ def test_29_bits_are_one_kind_or_another_by_a_byte_and_lengths_are_checked() -> 
     assert decoder.state.bus_counters[0, :3].tolist() == [0, 1, 1]
 
 
+@pytest.mark.thorough
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=8, unique=True), st.data())
 def test_29_bit_look_up_is_what_the_fields_say(keys: list[int], data: st.DataObject) -> None:
     tables = tables_of(patches(*keys, modules=(0, 5, 15)))
@@ -125,7 +127,7 @@ def test_29_bit_look_up_is_what_the_fields_say(keys: list[int], data: st.DataObj
             max_size=30,
         )
     )
-    slots = addresses.slots(np.zeros(len(wire), np.uint16), np.array(wire, np.uint32))
+    slots = slots_of(addresses, np.zeros(len(wire), np.uint16), np.array(wire, np.uint32))
     for identifier, slot in zip(wire, slots.tolist(), strict=True):
         patch = keys.index(identifier >> 8 & 0xFF) if (identifier >> 8 & 0xFF) in keys else None
         if not identifier & EXTENDED_FLAG or identifier & 0x1FFF_0000 != 0x14F0_0000 or patch is None:
@@ -142,7 +144,7 @@ def test_every_bus_has_its_own_layout() -> None:
     layouts = [of(0x100, (0, 1)), of(0x100, (1, 0)), of(0x200, (0, 1)), None, of(0x100, (0, 1))]
     found = [patches(0, modules=(0,)) for _ in range(5)]
     found[3] = []
-    decoder = Decoder(layouts, tables_of(*found))
+    decoder = SpecifiedDecoder(layouts, tables_of(*found))
     foreign = run(
         decoder,
         [(bus, identifier, numbers(bus, identifier)) for bus in range(5) for identifier in (0x100, 0x200)],
@@ -156,7 +158,7 @@ def test_cycles_of_two_layouts_wait_for_the_next_batch_side_by_side() -> None:
         frames = [Frame(f"f{i}", (Identifier(first + i),), (8,), Values(0, "<u2", 1, to=(i,))) for i in range(2)]
         return Layout(frames, Cycle(["f0", "f1"], maximum_age_s=1.0))
 
-    decoder = Decoder([of(0x100), of(0x200)], tables_of(patches(0, modules=(0,)), patches(0, modules=(0,))))
+    decoder = SpecifiedDecoder([of(0x100), of(0x200)], tables_of(patches(0, modules=(0,)), patches(0, modules=(0,))))
     run(decoder, [(1, 0x200, numbers(1)), (0, 0x100, numbers(2))])
     assert decoder.state.values.tolist() == [0, 0, 0, 0]
     run(decoder, [(0, 0x101, numbers(3)), (1, 0x201, numbers(4))])
@@ -169,7 +171,7 @@ def test_frames_of_three_kilobytes() -> None:
     layout = Layout([Frame("data", (), (2 * count,), Values(0, "<u2", count))])
     assert layout.payload_size >= 2 * count
     assert wire_dtype(layout.payload_size)["length"].itemsize == 4
-    decoder = Decoder([layout], tables_of([Patch("p", [Module(taxels(count))])]))
+    decoder = SpecifiedDecoder([layout], tables_of([Patch("p", [Module(taxels(count))])]))
     values = np.arange(count, dtype="<u2")
     foreign = run(decoder, [(0, 0, values.tobytes()), (0, 0, values[:-1].tobytes())], layout.payload_size)
     assert foreign == []
@@ -179,7 +181,7 @@ def test_frames_of_three_kilobytes() -> None:
 
 def test_sequence_numbers_that_go_back_are_no_loss() -> None:
     layout = Layout([Frame("data", (Identifier(0x100),), (8,), Values(2, "<u2", 1), sequence=SequenceNumber(0, "<u2"))])
-    decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
+    decoder = SpecifiedDecoder([layout], tables_of(patches(0, modules=(0,))))
     sequence = [10, 11, 13, 12, 12, 65_535, 1, 0]
     run(decoder, [(0, 0x100, numbers(number)) for number in sequence[:3]])
     run(decoder, [(0, 0x100, numbers(number)) for number in sequence[3:]])
@@ -207,7 +209,7 @@ def test_identifiers_that_cannot_be_matched_are_refused() -> None:
         for bus in range(2)
     ]
     with pytest.raises(ConfigurationError, match="a driver takes 200: run several"):
-        Decoder(layouts, tables_of(patches(0), patches(0)))
+        SpecifiedDecoder(layouts, tables_of(patches(0), patches(0)))
 
 
 def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
@@ -216,7 +218,7 @@ def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
         for i in range(2)
     ]
     layout = Layout(frames, Cycle(["f0", "f1"], maximum_age_s=1.0))
-    decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
+    decoder = SpecifiedDecoder([layout], tables_of(patches(0, modules=(0,))))
     run(decoder, [(0, 0x101, numbers(1)), (0, 0x101, numbers(2))])
     assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
 
@@ -224,7 +226,7 @@ def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
 def test_a_wide_key_of_a_module_is_not_taken_for_one_of_the_next_patch() -> None:
     patch, module = Bits(shift=20, width=8), Bits(shift=0, width=20)
     frame = Frame("f", (Identifier(EXTENDED_FLAG, mask=0),), (8,), Values(0, "<u2", 2), patch=patch, module=module)
-    decoder = Decoder([Layout([frame])], tables_of(patches(0, 1, modules=(1,))))
+    decoder = SpecifiedDecoder([Layout([frame])], tables_of(patches(0, 1, modules=(1,))))
     foreign = run(
         decoder, [(0, EXTENDED_FLAG | 0x1_0001, numbers(9, 9)), (0, EXTENDED_FLAG | 1 << 20 | 1, numbers(1, 2))]
     )

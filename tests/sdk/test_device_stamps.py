@@ -8,10 +8,11 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Cycle, DeviceTime, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import DeviceTime, Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
+from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
 BEGIN_NS = 7_000_000 * MS
@@ -30,15 +31,18 @@ def frame(name: str, identifier: int, first_channel: int) -> Frame:
     )
 
 
-def decoder(layout: Layout, n_buses: int = 1) -> Decoder:
+def decoder(layout: Layout, n_buses: int = 1) -> SpecifiedDecoder:
     patch = Patch("tip", [Module(taxels(4))])
-    return Decoder([layout] * n_buses, assemble([(f"b{i}", [patch]) for i in range(n_buses)], [PRESSURE], np.uint16))
+    return SpecifiedDecoder(
+        [layout] * n_buses, assemble([(f"b{i}", [patch]) for i in range(n_buses)], [PRESSURE], np.uint16)
+    )
 
 
 def payload(value: int, stamp_ms: int, sequence: int) -> bytes:
     return np.array([value, value, stamp_ms & 0xFFFF], "<u2").tobytes() + bytes([sequence & 0xFF, 0])
 
 
+@pytest.mark.thorough
 def test_late_frames_have_the_time_of_their_values_and_gaps_are_counted_too() -> None:
     compiled = decoder(Layout([frame("one", 1, 0), frame("two", 2, 2)]), n_buses=2)
     batch = FrameBatch(64, 8, compiled.compiled.headroom)
@@ -81,7 +85,7 @@ def test_frames_that_wait_for_their_partners_are_told_their_time_once() -> None:
     assert compiled.device_stamps.clocks[0].repeated == 0
 
 
-def one_frame(compiled: Decoder, time_ns: int, stamp_ms: int) -> int:
+def one_frame(compiled: SpecifiedDecoder, time_ns: int, stamp_ms: int) -> int:
     """The time that the module has after it."""
     batch = FrameBatch(1, 8, compiled.compiled.headroom)
     batch.append(0, time_ns, 1, payload(0, stamp_ms, 0))

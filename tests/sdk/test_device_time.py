@@ -65,6 +65,7 @@ def converted(clock: DeviceClock, device: Run, batch: int = 7) -> Times:
     return told
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("drift", [-200e-6, -20e-6, 0.0, 50e-6, 200e-6])
 @pytest.mark.parametrize("stalls", [False, True])
 def test_times_are_the_true_ones_but_for_the_shortest_delay(drift: float, stalls: bool) -> None:
@@ -87,6 +88,7 @@ def test_the_times_are_steadier_than_the_receipt() -> None:
     assert np.percentile(abs(np.diff(device.received)[1500:] - 10 * MS), 99) > 1_000_000
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("unit_s", "modulo"), [(1e-3, 1 << 16), (1e-6, 1 << 24), (1e-4, 60_000), (1e-6, 1 << 32)])
 def test_stamps_wrap_around(unit_s: float, modulo: int) -> None:
     device = run(90, unit_s=unit_s, modulo=modulo, first_stamp=modulo - 1000, drift=100e-6)
@@ -96,6 +98,7 @@ def test_stamps_wrap_around(unit_s: float, modulo: int) -> None:
     assert abs(error[1500:] - 200_000).max() < 300_000 + unit_s * S
 
 
+@pytest.mark.thorough
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 1000), lost=st.floats(0, 0.9), repeated=st.floats(0, 0.3), batch=st.integers(1, 400))
 def test_lost_and_repeated_frames_change_nothing(seed: int, lost: float, repeated: float, batch: int) -> None:
@@ -121,6 +124,7 @@ def test_a_long_gap_of_several_turns() -> None:
     assert abs(error[-500:] - 200_000).max() < 2 * MS
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("uptime_s", [0.3, 20.0])
 @pytest.mark.parametrize("batch", [1, 13, 10_000])
 def test_a_device_that_restarts_is_followed_at_once(uptime_s: float, batch: int) -> None:

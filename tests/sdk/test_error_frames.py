@@ -103,6 +103,7 @@ error_frame = st.tuples(
 )
 
 
+@pytest.mark.thorough
 @given(st.lists(error_frame, max_size=30), st.integers(0, 30))
 def test_any_frames_in_any_batches_mean_the_same(frames: list[tuple[int, bytes]], cut: int) -> None:
     as_text = [(kind, payload.hex()) for kind, payload in frames]

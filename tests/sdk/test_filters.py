@@ -16,8 +16,9 @@ from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameB
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.socketcan import MOST_FILTERS, SocketCanBus
 from skinware_drivers.decoding.addresses import fewest, filters_of
-from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Byte, Condition, Identifier, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 
 EVERY_STANDARD = np.arange(2048, dtype=np.int64)
 
@@ -72,6 +73,7 @@ def test_fewer_filters_let_the_same_through(filters: list[Filter]) -> None:
     assert fewest(less) == less
 
 
+@pytest.mark.thorough
 def test_neighbours_become_one() -> None:
     assert fewest(Filter(identifier, 0x7FF) for identifier in range(0x400, 0x480)) == [Filter(0x400, 0x780)]
 

@@ -26,6 +26,7 @@ class Answering(RoboskinDriver):
         return True
 
 
+@pytest.mark.thorough
 def test_boards_that_find_no_room_are_not_taken_for_restarted(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,26 +15,12 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import (
-    Above,
-    Bits,
-    Byte,
-    Cycle,
-    Expand,
-    Flag,
-    Frame,
-    Identifier,
-    Layout,
-    Packed,
-    Sentinel,
-    SequenceNumber,
-    StatusBytes,
-    Values,
-)
+from skinware_drivers.fields import Above, Bits, Byte, Flag, Identifier, Packed, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from tests.specification.both_paths import require_same
+from tests.specification.decoding import SpecifiedDecoder
 
 TYPES = [PRESSURE.measured(unit="counts")]
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
@@ -42,8 +28,8 @@ ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
 
 def decode(
     layout: Layout, modules: Sequence[Module], dtype: str, frames: Sequence[tuple[int, bytes]], gap_ns: int = 1000
-) -> Decoder:
-    decoder = Decoder([layout], assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
+) -> SpecifiedDecoder:
+    decoder = SpecifiedDecoder([layout], assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
     batch = FrameBatch(256, layout.payload_size, decoder.compiled.headroom)
     decoder.put_back(batch)
     for number, (identifier, payload) in enumerate(frames):
@@ -117,6 +103,7 @@ def rows(module: int, count: int) -> tuple[list[Frame], Cycle]:
     return frames, Cycle([frame.name for frame in frames], maximum_age_s=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lost", [None, 0, 50, 120])
 def test_modules_whose_cycles_are_of_other_frames_and_long(lost: int | None) -> None:
     (short, first), (long, second) = rows(1, 3), rows(2, 100)
@@ -190,7 +177,7 @@ def test_frames_of_one_patch_and_one_module_alone() -> None:
         Patch("first", [Module(taxels(1, first_uid=key), key=key) for key in (5, 6)], key=1),
         Patch("second", [Module(taxels(1, first_uid=7), key=5)], key=2),
     ]
-    decoder = Decoder([layout], assemble([("bus", patches)], TYPES, "u1"))
+    decoder = SpecifiedDecoder([layout], assemble([("bus", patches)], TYPES, "u1"))
     batch = FrameBatch(8, 8, decoder.compiled.headroom)
     for identifier, value in ((0x345, 20), (0x7FF, 30), (0x181, 10), (0x182, 99)):
         batch.append(0, 1, identifier, bytes([value]))
@@ -237,7 +224,7 @@ def test_a_frame_of_a_wrong_length_or_an_unknown_module_is_counted_once(
 def test_frames_that_are_longer_than_all_of_the_layout(when: Sequence[Identifier | Byte]) -> None:
     """Rows can be longer than the layout's frames: a device answers questions over the same line."""
     layout = Layout([Frame("data", when, (20,), Values(0, "u1", 1))])
-    decoder = Decoder([layout], assemble([("bus", [Patch("patch", [Module(taxels(1))])])], TYPES, "u1"))
+    decoder = SpecifiedDecoder([layout], assemble([("bus", [Patch("patch", [Module(taxels(1))])])], TYPES, "u1"))
     batch = FrameBatch(10, 1000)
     for identifier in (0x100, 0x101):
         for length in (20, 21, 255, 256, 1000):
@@ -351,7 +338,7 @@ def test_sequence_numbers_tell_losses_and_repeats() -> None:
     layout = one(Values(1, "u1", 1), sequence=SequenceNumber(0, "u1"))
     numbers = [254, 255, 0, 3, 3]
     frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
-    decoder = Decoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
+    decoder = SpecifiedDecoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
     batch = FrameBatch(16, 8, decoder.compiled.headroom)
     for identifier, payload in frames:
         decoder.put_back(batch)

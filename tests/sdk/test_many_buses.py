@@ -26,6 +26,7 @@ from tests.sdk.driving import Driving, commands, driving, driving_lines, emulate
 pytestmark = pytest.mark.usefixtures("hurry")
 
 
+@pytest.mark.thorough
 def test_32_buses_with_the_same_addresses_on_each() -> None:
     buses = [emulated(boards=(7,), pattern="cycle") for _ in range(32)]
     lines = [(adapter(boards=(7,), period_ms=200), bus) for bus in buses]  # also a busy machine can emulate these
@@ -209,6 +210,7 @@ def test_a_slow_bus_that_was_removed_slows_nothing_down() -> None:
         assert runner.builder.generation.period_s == 0.02
 
 
+@pytest.mark.thorough
 def test_sighup_reads_the_buses_of_the_file_again(tmp_path: Path) -> None:
     file = tmp_path / "torso.toml"
     one, two = 'name = "virtual?boards=7"', 'name = "virtual?boards=8,9"'

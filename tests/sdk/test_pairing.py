@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
+from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
 PERIOD_NS = 20 * MS
@@ -44,7 +45,7 @@ class Device:
     maximum_age_ns: int
 
     @property
-    def decoder(self) -> Decoder:
+    def decoder(self) -> SpecifiedDecoder:
         frames = [
             Frame(
                 f"part {place}",
@@ -59,7 +60,9 @@ class Device:
         cycle = Cycle([f.name for f in frames], self.maximum_age_ns / 1e9, self.within, self.order, counter)
         modules = [Module(taxels(self.members, first_uid=10 * key), key=key) for key in range(MODULES)]
         types = [PRESSURE.measured(unit="counts")]
-        return Decoder([Layout(frames, cycle)], assemble([("bus", [Patch("p", modules)])], types, "i4"), [0.02])
+        return SpecifiedDecoder(
+            [Layout(frames, cycle)], assemble([("bus", [Patch("p", modules)])], types, "i4"), [0.02]
+        )
 
     def joined(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> tuple[list[list[int]], dict[str, int]]:
         """Serial numbers of the frames of each update, in the order of their places; and the patch's counters.
@@ -255,7 +258,7 @@ def test_what_is_known_to_be_lost_between_two_batches_joins_nothing() -> None:
     assert not len(decoder.decode(_empty(decoder, batch))[0])
 
 
-def _empty(decoder: Decoder, batch: FrameBatch) -> FrameBatch:
+def _empty(decoder: SpecifiedDecoder, batch: FrameBatch) -> FrameBatch:
     decoder.put_back(batch)
     return batch
 
@@ -276,6 +279,7 @@ def every_run(device: Device) -> list[tuple[int, int]]:
 ORDERS: tuple[Order, ...] = ("given", "ends_with", "any")
 
 
+@pytest.mark.thorough
 def test_without_a_counter_no_lost_run_joins_halves_whether_the_sender_catches_up_or_not() -> None:
     for order in ORDERS:
         device = Device(2, order, "module", 1, PERIOD_NS // (4 if order == "any" else 2))

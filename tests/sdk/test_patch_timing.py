@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,6 +17,7 @@ from tests.specification.publishing import count_timing
 times = st.integers(-10, 2**40) | st.sampled_from([0, 1, 2, 2**20 - 1, 2**20, 2**30, 2**31 - 1, 2**31, 2**50])
 
 
+@pytest.mark.thorough
 @given(st.lists(st.tuples(st.lists(st.booleans(), min_size=6, max_size=6), times, times), max_size=30))
 def test_as_many_and_where_the_plain_way_puts_them(frames: list[tuple[list[bool], int, int]]) -> None:
     structure = fake_structure(2, 3)

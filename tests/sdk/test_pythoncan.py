@@ -244,6 +244,7 @@ class MySkin(RoboskinDriver):
 """
 
 
+@pytest.mark.thorough
 def test_a_driver_ends_though_the_library_of_its_only_bus_hangs(tmp_path: Path) -> None:
     file = tmp_path / "my_skin.py"
     file.write_text(HANGING)

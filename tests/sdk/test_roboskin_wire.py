@@ -15,9 +15,9 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import assemble
+from tests.specification.decoding import SpecifiedDecoder
 
 Wire = tuple[int, int, bytes]  # time_ns, identifier, payload
 MS = 1_000_000
@@ -30,7 +30,9 @@ class Rig:
         self.driver = RoboskinDriver(RoboskinOptions(**options))  # type: ignore[arg-type]
         patches = self.driver.patches_set_up(boards)
         buses = [(f"bus{i}", patches) for i in range(n_buses)]
-        self.decoder = Decoder([self.driver.layout] * len(buses), assemble(buses, self.driver.types, self.driver.dtype))
+        self.decoder = SpecifiedDecoder(
+            [self.driver.layout] * len(buses), assemble(buses, self.driver.types, self.driver.dtype)
+        )
         self.batch = FrameBatch(4096, 8, self.decoder.compiled.headroom)
 
     def feed(self, frames: Sequence[Wire], bus: int = 0) -> list[int]:
@@ -215,6 +217,7 @@ def reference_pairs(wire: Sequence[Wire]) -> list[tuple[int, int]]:
     return pairs
 
 
+@pytest.mark.thorough
 @settings(max_examples=200, deadline=None)
 @given(
     frames=st.lists(st.tuples(st.integers(0, 2**32 - 1), st.binary(max_size=8), st.integers(0, 10**12)), max_size=40)

@@ -48,6 +48,7 @@ def test_every_public_name_has_a_docstring(place: str) -> None:
     assert list(undocumented(place)) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", FACES)
 def test_completion_offers_every_name_before_it_is_imported(place: str) -> None:
     code = f"import {place} as place; assert set(place.__all__) <= set(dir(place)), dir(place)"

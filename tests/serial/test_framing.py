@@ -30,6 +30,7 @@ def ending(example: Example) -> bytes:
     return b""
 
 
+@pytest.mark.thorough
 @settings(BUSY, max_examples=50)
 @given(name=names, data=st.data())
 def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
@@ -40,6 +41,7 @@ def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
     assert [(f.identifier, f.body) for f in found[: len(sent)]] == [(i, body) for i, body, _ in sent]
 
 
+@pytest.mark.thorough
 @settings(BUSY, max_examples=120)
 @given(name=names, data=st.data())
 def test_chunking_changes_nothing(name: str, data: st.DataObject) -> None:
@@ -49,6 +51,7 @@ def test_chunking_changes_nothing(name: str, data: st.DataObject) -> None:
     assert outcome(example.framing, chunks) == outcome(example.framing, [stream])
 
 
+@pytest.mark.thorough
 @settings(BUSY, max_examples=20)
 @given(name=names, data=st.data())
 def test_a_trickle_of_single_bytes_gives_the_same(name: str, data: st.DataObject) -> None:
@@ -65,6 +68,7 @@ CHECKED = [
 ]
 
 
+@pytest.mark.thorough
 @settings(BUSY, max_examples=80)
 @given(name=st.sampled_from(CHECKED), data=st.data())
 def test_whole_frames_behind_noise_are_found(name: str, data: st.DataObject) -> None:
@@ -119,6 +123,7 @@ def test_lengths_that_cannot_be_are_refused_at_once() -> None:
     assert (counters, pending) == ((6 + len(good), len(good), 0, 6, 1, 0, 1), 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [name for name, e in EXAMPLES.items() if isinstance(e.framing, Packet)])
 def test_no_length_leads_out_of_a_frame(name: str) -> None:
     """Every value of the smallest lengths, and of the largest."""

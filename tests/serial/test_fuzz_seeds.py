@@ -24,6 +24,7 @@ def seeds_of(name: str) -> list[bytes]:
     return [bytes.fromhex(line) for line in (SEEDS / f"{name}.hex").read_text().split()]
 
 
+@pytest.mark.thorough
 def test_every_framing_has_seeds() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     ours = {f"driver_{name}" for name in project["project"]["entry-points"]["skinware.drivers"]}

@@ -14,7 +14,6 @@ import pytest
 from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError, RequestFailed, StructureChanged
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.serial.framing import Framed
 from skinware_drivers.serial.paxini import PaxiniDriver, PaxiniOptions
@@ -28,6 +27,7 @@ from skinware_drivers.virtual.devices.paxini import EmulatedPaxini, EmulatedPaxi
 from tests.drivers.fuzzed import paxini
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
+from tests.specification.decoding import SpecifiedDecoder
 
 # Captured from the maker's program and a sensor
 VERSION_OF_3 = bytes.fromhex("55 AA 09 00 03 00 FB D4 17 00 00 64 00 AB")
@@ -65,8 +65,8 @@ def following(reader: DriverReader, condition: Callable[[DriverSnapshot], bool])
         return read_until(reader, condition)
 
 
-def decoded(adapter: PaxiniDriver, frames: Sequence[Framed]) -> Decoder:
-    decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
+def decoded(adapter: PaxiniDriver, frames: Sequence[Framed]) -> SpecifiedDecoder:
+    decoder = SpecifiedDecoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
     batch = FrameBatch(100, adapter.payload_size)
     for number, frame in enumerate(frames):
         batch.append(0, 1 + number, frame.identifier, frame.body)

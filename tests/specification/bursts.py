@@ -16,8 +16,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.decoding.skin_state import SkinState, Updates
+from skinware_drivers.decoding.decoder import SkinState, Updates
 from skinware_drivers.running.publisher import BurstPauses, Pace
+from tests.specification.decoding import join
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -79,7 +80,7 @@ class Bursts:
         self._left = most
         parts = [part for part in (self._held, updates) if part is not None]
         self._held = None
-        rest = self._skip_the_oldest(Updates.join(parts), most) if parts else None
+        rest = self._skip_the_oldest(join(parts), most) if parts else None
         while rest is not None:
             if self._left <= 0:
                 self._show_the_newest(rest)

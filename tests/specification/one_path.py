@@ -14,14 +14,14 @@ from skinware.memory.namespace import Namespace
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, read_own
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Decoder, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher
 from skinware_drivers.testing.defect import defect
+from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
 
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
@@ -110,6 +110,7 @@ class Way:
         decoder, watch, publisher, desk: as the runner has them.
     """
 
+    decoder_class: type[Decoder] = Decoder
     publisher_class: type[Publisher] = Publisher
 
     def __init__(
@@ -124,7 +125,7 @@ class Way:
         namespace: Namespace | str | None,
         payload_size: int,
     ) -> None:
-        self.decoder = Decoder(layouts, tables, periods_s)
+        self.decoder = self.decoder_class(layouts, tables, periods_s)
         self.writer = DriverWriter(
             name,
             self.decoder.tables.structure,
@@ -169,7 +170,7 @@ class Way:
         found |= {f"patches.{name}": getattr(publisher.patches, name) for name in _OF_PATCHES}
         found["sequence"] = publisher.writer.sequence
         found |= {
-            "last sequence numbers": decoder.sequences.last,
+            "last sequence numbers": decoder.last_sequence,
             "haste": decoder.haste,
             "unknown_identifiers": decoder.unknown_identifiers,
             "timing": publisher.timing.both,
@@ -208,7 +209,9 @@ class Way:
 class NumpyWay(Way):
     """The specification."""
 
+    decoder_class = SpecifiedDecoder
     publisher_class = SpecifiedPublisher
+    decoder: SpecifiedDecoder
     publisher: SpecifiedPublisher
 
     def empty(self) -> None:

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import now_ns
 from skinware.status import PatchState, Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.running.publisher import NEVER_NS, PatchTiming, Publisher
 from tests.specification.bursts import Bursts
+from tests.specification.decoding import SpecifiedState
 
 _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
@@ -20,6 +21,8 @@ _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
 class SpecifiedPublisher(Publisher):
     """A publisher that publishes by itself."""
+
+    state: SpecifiedState
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)

@@ -79,6 +79,7 @@ def test_what_is_no_bus_of_this_kind_is_said_to_be_none(namespace: object) -> No
     assert "one owner" in no_can.stderr
 
 
+@pytest.mark.thorough
 def test_who_is_behind_a_connection_is_asked_only_on_request(namespace: object) -> None:
     device = make_bus(f"tcp://{LOCAL}:{(port := free_port())}", payload_size=4096, for_devices=True)
     with emulated_on(device, load_emulator("weiss_wts")):

@@ -12,7 +12,8 @@ import pytest
 from skinware import Status
 from skinware.errors import BusError, ConfigurationError
 from skinware.status import PatchState
-from skinware_drivers.link import Link, Reply
+from skinware_drivers.fields import Reply
+from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.tesollo import _TIPS, TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.testing.driving import emulated_on, emulated_skin
@@ -102,6 +103,7 @@ def test_a_hand_behind_tcp(tips: str, dtype: type, kind: str, count: int, namesp
                     skin.reader.call("tare")
 
 
+@pytest.mark.thorough
 def test_a_hand_is_asked_for_its_model_over_tcp_only(namespace: object) -> None:
     port = free_port()
     device = make_bus(f"tcp://{LOCAL}:{port}", payload_size=4096, for_devices=True)

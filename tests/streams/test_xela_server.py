@@ -225,6 +225,7 @@ def test_impossible_options() -> None:
     assert (grid.rows, grid.columns) == (3, 5)
 
 
+@pytest.mark.thorough
 def test_the_emulated_server_is_one(namespace: object) -> None:
     with running("skin-emulate", "--driver", "xela_server", "--bus", f"websocket:ws://{LOCAL}:0") as server:
         where = server.wait_for("ready")["note"].removeprefix("listens on ")

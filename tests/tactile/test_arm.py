@@ -78,6 +78,7 @@ def test_pads_lie_within_their_triangle_and_the_other_channels_stay() -> None:
         assert np.allclose(nearest, 0.0065 / np.sqrt(3))
 
 
+@pytest.mark.thorough
 def test_more_boards_are_another_arm_and_none_is_where_another_is() -> None:
     surface = arm(range(-6, 8))
     assert distances(surface).min() > 0.005

@@ -147,6 +147,7 @@ def test_a_touch_has_its_value_without_delay_and_nothing_else_has_one() -> None:
     assert not bench.run(3.0).held.any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("load", [12, 25, 60, 120, 200])
 def test_the_end_of_a_touch_shows_at_once_however_firm_it_was(load: float) -> None:
     bench = Bench()
@@ -218,6 +219,7 @@ def test_values_without_steps_need_their_noise_measured_before_a_tare() -> None:
     assert bench.baseline.tare() == N
 
 
+@pytest.mark.thorough
 def test_hold_keeps_baselines_where_they_are_but_for_common_drift() -> None:
     bench = Bench(BaselineSettings(tau_s=1))
     bench.run(6)
@@ -324,6 +326,7 @@ def test_the_same_frame_twice_changes_nothing() -> None:
     assert np.array_equal(once[0].baseline, back.baseline), "nor one from before"
 
 
+@pytest.mark.thorough
 def test_bumps_do_not_make_a_held_load_look_released() -> None:
     bench = Bench()
     bench.run(6)
@@ -334,6 +337,7 @@ def test_bumps_do_not_make_a_held_load_look_released() -> None:
     assert all(seen)
 
 
+@pytest.mark.thorough
 def test_what_sagged_and_drifted_under_a_long_hold_is_no_contact_afterwards() -> None:
     bench = Bench()
     bench.run(6)
@@ -346,6 +350,7 @@ def test_what_sagged_and_drifted_under_a_long_hold_is_no_contact_afterwards() ->
     assert bench.run(0.3, on(5, load=8)).touched[5], "and it feels as before"
 
 
+@pytest.mark.thorough
 def test_a_second_contact_in_the_module_outlives_the_first() -> None:
     bench = Bench()
     bench.run(6)

@@ -142,6 +142,7 @@ def test_wrong_presses_are_named(wrong: float) -> None:
     assert 0.8 * wrong - 0.001 <= share <= wrong + 0.03
 
 
+@pytest.mark.thorough
 def test_confidence_is_what_it_says() -> None:
     """The part of the taxels that is within half a pitch, as estimated and as it is."""
     surface = arm((0, 1, 2))

@@ -104,6 +104,7 @@ def checked(surface: Surface, said: np.ndarray, topology: Topology) -> list[Find
     return check_strokes(geometry, surface.module, surface.patch, topology)
 
 
+@pytest.mark.thorough
 def test_nothing_is_found_in_a_right_geometry() -> None:
     surface, sums = flat()
     assert not checked(surface, surface.position_m, topology_of(sums))

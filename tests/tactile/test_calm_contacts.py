@@ -137,6 +137,7 @@ def test_when_the_driver_is_gone_nothing_is_touched(into: Namespace) -> None:
             read_until(contacts, lambda frame: len(frame.contacts) == 0)
 
 
+@pytest.mark.thorough
 def test_contacts_follow_another_structure(into: Namespace) -> None:
     with ExitStack() as driver:
         skin = FakeSkin("fake", placed_structure())

@@ -75,6 +75,7 @@ def calmed(into: Namespace, name: str = "health") -> Iterator[Calmed]:
             health.close()
 
 
+@pytest.mark.thorough
 def test_faults_are_published_and_marked(into: Namespace) -> None:
     with calmed(into) as skin, HealthReader(namespace=into) as reader:
         assert (reader.source.driver, len(reader.source.uid)) == ("fake", 768)
@@ -90,6 +91,7 @@ def test_faults_are_published_and_marked(into: Namespace) -> None:
         assert (report.kind[temperatures] == HealthKind.GOOD).all()
 
 
+@pytest.mark.thorough
 def test_another_skin_begins_anew(into: Namespace) -> None:
     with calmed(into) as skin, HealthReader(namespace=into) as reader:
         skin.go_on(SETTLED_NS)
@@ -100,6 +102,7 @@ def test_another_skin_begins_anew(into: Namespace) -> None:
         assert len(reader.source.uid) == 24
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("age_s", [0, 100_000])
 def test_what_is_known_is_there_after_a_restart(into: Namespace, tmp_path: Path, age_s: int) -> None:
     """Baselines are worth nothing after 10 minutes; what is broken is broken on the next day."""
@@ -120,6 +123,7 @@ def test_what_is_known_is_there_after_a_restart(into: Namespace, tmp_path: Path,
         np.testing.assert_array_equal(report.noise, before.noise)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("damage", ["missing", "shape", "of another scale"])
 def test_health_that_does_not_fit_is_begun_anew(
     into: Namespace, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
@@ -158,6 +162,7 @@ def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace)
     health.close()
 
 
+@pytest.mark.thorough
 def test_a_name_that_another_program_has_costs_only_the_service(
     into: Namespace, caplog: pytest.LogCaptureFixture
 ) -> None:

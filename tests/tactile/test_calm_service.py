@@ -89,7 +89,7 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
             assert np.flatnonzero(frame.physical("pressure")).tolist() == [10]
             assert frame.values[12] == 50
             assert frame.fresh("pressure")[10]
-            assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "lost", "errors", "unknown"]]
+            assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "dropped", "errors", "unknown"]]
             with DriverReader("fake") as source:
                 newest = source.read()
             assert abs(frame.acquired_ns - newest.acquired_ns) < 10e9
@@ -157,6 +157,7 @@ def calming_process(*options: str) -> Iterator[Any]:
         yield calm
 
 
+@pytest.mark.thorough
 def test_it_waits_for_a_driver_that_is_not_there_and_says_so() -> None:
     with calming_process() as calm:
         wait_until(lambda: "waiting for driver 'fake'" in calm.errors)
@@ -269,6 +270,7 @@ def test_a_driver_that_is_paused_or_has_no_period_is_no_trouble() -> None:
             wait_until(lambda: service.frames > taken + 3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -286,6 +288,7 @@ def test_mistakes_get_one_clear_line(arguments: list[str], words: str) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_stage_that_cannot_be_made_for_the_driver_ends_it(tmp_path: Path) -> None:
     path = tmp_path / "chain.toml"
     path.write_text('format = "skinware-chain"\nversion = 1\n[[stage]]\nstage = "baseline"\ntypes = ["temperature"]\n')
@@ -308,6 +311,7 @@ def running_text(*arguments: str) -> Iterator[Iterator[str]]:
         process.stdout.close()
 
 
+@pytest.mark.thorough
 def test_text_for_people(tmp_path: Path) -> None:
     path = tmp_path / "chain.toml"
     path.write_text(
@@ -319,6 +323,7 @@ def test_text_for_people(tmp_path: Path) -> None:
             assert into() in next(lines)
 
 
+@pytest.mark.thorough
 def test_the_calmed_driver_is_a_driver_for_every_command() -> None:
     with publishing(idle(FakeSkin())), calming():
         shown = json.loads(run("skin-info", "--namespace", into(), "--json").stdout)

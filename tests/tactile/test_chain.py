@@ -121,6 +121,7 @@ def test_an_amplifier_keeps_the_sign() -> None:
             AmplifierSettings(**wrong)
 
 
+@pytest.mark.thorough
 @given(st.data())
 def test_curves_are_what_interpolation_says(data: st.DataObject) -> None:
     knots = data.draw(st.integers(2, MOST_KNOTS))

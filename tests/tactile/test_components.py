@@ -48,6 +48,7 @@ def graphs(draw: st.DrawFn) -> tuple[int, list[tuple[int, int]]]:
     return n, pairs
 
 
+@pytest.mark.thorough
 @given(graphs(), st.data())
 def test_as_by_a_breadth_first_search(graph: tuple[int, list[tuple[int, int]]], data: st.DataObject) -> None:
     n, pairs = graph

@@ -12,12 +12,13 @@ from skinware.realtime import now_ns
 from skinware.tactile.contacts_service import ContactsWriter
 from tests.compiling import compiled
 from tests.core.test_c_how_to import lines_of
-from tests.tactile.skins import triangles
+from tests.tactile.skins import AT_ONCE, triangles
 from tests.tactile.test_contacts_service import structure
 
 SOURCE = Path(__file__).parents[2] / "examples" / "contacts.c"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("language", ["c99", "c++11"])
 def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
     language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
@@ -32,7 +33,7 @@ def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
         x, y, z = triangles(20, 20)[taxel].astype(np.float32).tolist()
         return f"{x:.3f} {y:.3f} {z:.3f} m"
 
-    with ContactsWriter(structure(), namespace=namespace, rate_hz=0.1) as writer:
+    with ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace, rate_hz=0.1) as writer:
         publish(writer, 400, t45=20.0)
         with lines_of(program, namespace.name) as lines:
             assert [next(lines), next(lines)] == ["1 contacts\n", f"  1: load 20 at {at(45)}\n"]

@@ -71,6 +71,7 @@ def test_two_fingers_pass_each_other_and_keep_their_identities(seed: int) -> Non
     assert not set(contacts.id.tolist()) & (identities[0] | identities[1])  # 2.5 s after both were lifted
 
 
+@pytest.mark.thorough
 def test_an_idle_skin_has_no_contacts_of_more_than_a_taxel() -> None:
     world = World(SURFACE, seed=1, noise=0.8, drift_per_min=3.0)
     sizes = [contacts.n.max(initial=0) for _, contacts in contacts_in(world, 20.0)]

@@ -63,6 +63,7 @@ def test_a_skin_that_is_touched_from_the_start_begins_and_shows_every_finger(see
     assert near / there > 0.98
 
 
+@pytest.mark.thorough
 def test_from_the_bus_to_a_contact_that_follows_a_finger(calm_namespace: Namespace, tmp_path: Path) -> None:
     state = ["--state", str(tmp_path / "state.npz")]
     with (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -10,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 from skinware.tactile.offsets import Groups
 
 
+@pytest.mark.thorough
 @given(st.data())
 def test_each_groups_median_is_that_of_its_members_that_count(data: st.DataObject) -> None:
     group = data.draw(hnp.arrays(np.intp, st.integers(1, 60), elements=st.integers(0, 12)))

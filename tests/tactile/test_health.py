@@ -92,6 +92,7 @@ def faulty() -> tuple[npt.NDArray[np.int64], HealthReport]:
     return taxels, judged(world, QUICK)
 
 
+@pytest.mark.thorough
 def test_every_fault_is_found_with_its_kind_and_nothing_else(
     faulty: tuple[npt.NDArray[np.int64], HealthReport],
 ) -> None:
@@ -177,6 +178,7 @@ def test_a_dead_taxel_is_found_under_a_hand_that_covers_thousands() -> None:
     assert report.shown[31 * 60 + 20] == pytest.approx(1)
 
 
+@pytest.mark.thorough
 def test_what_is_known_goes_with_the_taxels() -> None:
     """To another health of the same ones, in another order, and of one that is new."""
     surface = grid(1, 10, 10)
@@ -240,6 +242,7 @@ def test_what_was_mended_is_good_again() -> None:
     assert names(health.report().kind)[middle] == "good"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("touched", "tared_s"),
     [((-5, 7.0), None), ((-5, 7.0), 3.0), ((-5, 9.4), 8.0), ((7, 9.5), 8.0), ((7, 19.3), 8.0), ((1, 15.0), 2.0)],
@@ -261,6 +264,7 @@ def test_a_finger_that_leaves_what_was_tared_under_it_makes_no_noise(
     assert np.isfinite(report.noise).all(), "all was judged"
 
 
+@pytest.mark.thorough
 def test_taxels_that_stay_far_below_their_baselines_are_judged_as_well() -> None:
     """While baselines are held by an operator nothing follows them down."""
     world = World(grid(5, 4, 4), seed=1, rate_hz=20)
@@ -291,6 +295,7 @@ def still(values: list[list[float]], settings: HealthSettings, **how: object) ->
     return health.report()
 
 
+@pytest.mark.thorough
 def test_a_skin_without_noise_is_not_stuck_because_nothing_touches_it() -> None:
     report = still([[10.0, 10, 10, 10]] * 30, HealthSettings(stuck_s=10), limits=(0, 255))
     assert names(report.kind) == ["never_touched"] * 4
@@ -307,6 +312,7 @@ def test_a_skin_that_rests_at_the_end_of_its_range_is_not_clipped() -> None:
     assert not report.faulty.any()
 
 
+@pytest.mark.thorough
 def test_a_hard_press_that_lasts_is_no_fault() -> None:
     """At the end of the range, without any change: but what is beside it is pressed, too."""
     rustle = np.random.default_rng(1).integers(0, 3, (100, 5))

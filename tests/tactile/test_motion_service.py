@@ -88,6 +88,7 @@ def test_a_name_that_another_program_has(into: Namespace, caplog: pytest.LogCapt
             assert "no motion of 'fake': " in caplog.text
 
 
+@pytest.mark.thorough
 def test_the_command_takes_files_of_regions(into: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     file = tmp_path / "parts.toml"

@@ -35,6 +35,7 @@ normals = st.sampled_from([(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (
 taxel = st.tuples(st.tuples(coordinate, coordinate, coordinate), st.sampled_from("ab"), normals)
 
 
+@pytest.mark.thorough
 @given(st.lists(taxel, min_size=1, max_size=25), st.floats(0.2, 4.0))
 def test_as_by_looking_at_every_pair(
     taxels: list[tuple[tuple[float, ...], str, tuple[float, ...]]], radius: float

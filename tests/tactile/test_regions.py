@@ -170,6 +170,7 @@ selections = st.builds(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=60)
 @given(st.lists(selections, unique_by=lambda region: region.name, max_size=4))
 def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, regions: list[Region]) -> None:

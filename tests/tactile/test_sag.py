@@ -16,6 +16,7 @@ def sagging(seed: int) -> World:
     return World(triangles(12), seed=seed, rate_hz=20, drift_per_min=0.5, response=Response(sag=0.15))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seconds", [4, 30])
 @pytest.mark.parametrize("seed", range(4))
 def test_modules_round_a_contact_are_at_rest_when_it_is_over(seed: int, seconds: float) -> None:
@@ -33,6 +34,7 @@ def test_modules_round_a_contact_are_at_rest_when_it_is_over(seed: int, seconds:
             assert not calm.touched.any(), f"{time_s:.2f} s: {np.flatnonzero(calm.touched)}"
 
 
+@pytest.mark.thorough
 def test_a_touch_where_the_cover_has_sunk_is_seen_and_outlives_the_contact_that_made_it_sink() -> None:
     world = sagging(1)
     surface = world.surface
@@ -55,6 +57,7 @@ def test_a_touch_where_the_cover_has_sunk_is_seen_and_outlives_the_contact_that_
     assert not any(over)
 
 
+@pytest.mark.thorough
 def test_fingers_that_stroke_without_end_leave_nothing_behind_them() -> None:
     world = World(arm((2, 3)), rate_hz=20, sensitivity=12, drift_per_min=0.5, response=Response(sag=0.15))
     for board in (2, 3):

@@ -28,6 +28,7 @@ def test_what_is_not_there_cannot_be_imported() -> None:
         exec("from skinware.tactile import Contcats")
 
 
+@pytest.mark.thorough
 def test_nothing_is_imported_before_it_is_asked_for() -> None:
     code = (
         "import sys, skinware; assert not any(name.startswith('skinware.tactile') for name in sys.modules)\n"

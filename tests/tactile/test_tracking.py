@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.tracking import ContactKind
-from tests.tactile.skins import PITCH_M, placed, pressed, triangles
+from tests.tactile.skins import AT_ONCE, PITCH_M, placed, pressed, triangles
 
 FLAT = triangles(30, 40)
 NEIGHBOURS = neighbours(placed(FLAT))
@@ -26,7 +26,7 @@ class Scene:
 
     def __init__(self, rate_hz: float = 50.0, *, without_places: bool = False) -> None:
         geometry = None if without_places else placed(FLAT)
-        self.contacts = Contacts(len(FLAT), NEIGHBOURS, geometry)
+        self.contacts = Contacts(len(FLAT), NEIGHBOURS, geometry, tracking=AT_ONCE)
         self.period_ns = round(1e9 / rate_hz)
         self.time_ns = 1_000_000_000
 
@@ -241,6 +241,7 @@ def test_time_that_stands_still_or_goes_back_is_borne() -> None:
     assert np.isfinite(found.velocity_m_s).all()
 
 
+@pytest.mark.thorough
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, share: float) -> None:

@@ -51,6 +51,7 @@ def busy(seed: int = 3) -> World:
     return world
 
 
+@pytest.mark.thorough
 def test_same_seed_same_world_whatever_the_blocks() -> None:
     whole = busy().record(10)
     assert len(whole) == 500
@@ -403,6 +404,7 @@ def test_the_bench_is_what_it_says(drift: str, rate_hz: float) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_skinware_does_not_load_it() -> None:
     code = "import sys, skinware; sys.exit(any(name.startswith('skinware.tactile') for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

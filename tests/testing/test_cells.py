@@ -25,6 +25,7 @@ class TestCells(DriverConformance):
     emulator = EmulatedCells
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("driver", "words"),
     [

@@ -146,6 +146,7 @@ def tidy() -> Iterator[None]:
     wait_until(lambda: not any(thread.name in mine for thread in threading.enumerate()))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("tidy")
 @pytest.mark.parametrize(
     ("driver", "test", "arguments", "words"),
@@ -158,6 +159,7 @@ def test_it_is_found_and_named(driver: type[AnyAdapter], test: str, arguments: t
         getattr(suite, test)(*arguments)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("tidy", "namespace")
 def test_a_driver_that_computes_without_end_is_found_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "_LONGEST_TURN_S", 0.5)
@@ -178,6 +180,7 @@ def test_signs(test: str) -> None:
         getattr(suite, test)()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("driver", "emulator", "test", "words"),
     [

@@ -16,7 +16,8 @@ from skinware import PatchState, Status
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.delimited import COBS, Delimited
@@ -122,6 +123,7 @@ def test_asking_for_the_lab_where_there_is_none_says_what_is_missing(tmp_path: P
     assert "the CAN lab cannot run here" in pytest_in(tmp_path, "--skin-can-lab")
 
 
+@pytest.mark.thorough
 def test_what_a_test_leaves_behind_fails_it(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(
         "import threading, time\n"
@@ -131,6 +133,7 @@ def test_what_a_test_leaves_behind_fails_it(tmp_path: Path) -> None:
     assert "the test left behind: thread 'mine'" in pytest_in(tmp_path)
 
 
+@pytest.mark.thorough
 def test_a_test_that_failed_is_not_said_to_leave_anything_behind(tmp_path: Path) -> None:
     """The report of its failure keeps the reader, and with it the file that this has mapped."""
     (tmp_path / "test_it.py").write_text(
@@ -145,6 +148,7 @@ def test_a_test_that_failed_is_not_said_to_leave_anything_behind(tmp_path: Path)
     assert "left behind" not in told
 
 
+@pytest.mark.thorough
 def test_loading_the_plug_in_imports_nothing_of_skinware() -> None:
     code = "import sys, skinware_drivers.testing.plugin; print([m for m in sys.modules if m in ('skinware', 'numpy')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -46,6 +46,7 @@ BAD = (
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", BAD)
 def test_what_cannot_be_done_is_said_in_the_next_turn(serving: Serve, text: str) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 1))), serving() as url, page_of(url) as page:
@@ -76,6 +77,7 @@ def test_any_message_is_an_operation_or_refused(message: str | bytes) -> None:
         operation_of(message)
 
 
+@pytest.mark.thorough
 @given(st.recursive(st.none() | st.booleans() | st.floats() | st.integers() | st.text(), st.lists, max_leaves=5))
 def test_any_arguments_are_taken_or_refused(value: object) -> None:
     for name in ("next", "look", "exact", "names", "series", "tare", "wipe", "record", "replay"):

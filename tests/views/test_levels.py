@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -16,6 +17,7 @@ LIMITS = st.tuples(st.floats(-1e30, 1e30), st.floats(-1e30, 1e30))
 STATUS = arrays.arrays(np.uint8, 20)
 
 
+@pytest.mark.thorough
 @given(VALUES, STATUS, LIMITS)
 def test_any_values(
     values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], limits: tuple[float, float]

@@ -27,6 +27,7 @@ def pull_state(page: Page, name: str) -> object:
     return page.state[name]
 
 
+@pytest.mark.thorough
 def test_it_is_begun_and_ended_by_any_viewer(serving: Serve, page_folder: Path) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))), serving() as url, page_of(url) as one:
         assert pull_state(one, "recording") is None
@@ -36,7 +37,7 @@ def test_it_is_begun_and_ended_by_any_viewer(serving: Serve, page_folder: Path) 
         with page_of(url) as other:
             told = pull_state(other, "recording")
             assert isinstance(told, dict)
-            assert told["lost"] == 0
+            assert told["missed"] == 0
             assert told["s"] > 0
             other.say("record", action="stop")
             other.pull_until(lambda _: pull_state(other, "recording") is None)
@@ -47,6 +48,7 @@ def test_it_is_begun_and_ended_by_any_viewer(serving: Serve, page_folder: Path) 
         assert one.state["problems"] == []
 
 
+@pytest.mark.thorough
 def test_it_ends_whole_with_the_server(serving: Serve, page_folder: Path) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))):
         with serving() as url, page_of(url) as page:
@@ -57,6 +59,7 @@ def test_it_ends_whole_with_the_server(serving: Serve, page_folder: Path) -> Non
             assert opened.is_whole
 
 
+@pytest.mark.thorough
 def test_it_ends_whole_when_the_server_is_killed(
     tmp_path: Path, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ def replaying(file: Path, namespace: Namespace) -> Iterator[None]:
         yield
 
 
+@pytest.mark.thorough
 def test_all_that_a_page_can_ask_for(serving: Serve, recording: Path, namespace: Namespace) -> None:
     with replaying(recording, namespace), serving() as url, page_of(url) as page:
         page.pull_until(lambda _: page.state.get("replay"))

@@ -58,6 +58,7 @@ def beside_or_below(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]
 modules = st.lists(st.tuples(st.integers(0, 3), st.sampled_from(KINDS), st.integers(1, 14)), min_size=1, max_size=9)
 
 
+@pytest.mark.thorough
 @given(modules, modules)
 def test_no_two_lie_on_each_other(one: list[tuple[int, str, int]], other: list[tuple[int, str, int]]) -> None:
     scene = scene_of(a=structure_of(one), b=structure_of(other))

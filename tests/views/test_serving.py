@@ -88,6 +88,7 @@ def test_status_is_sent_when_it_changes(serving: Serve) -> None:
         assert picture["levels"][7] == 255
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_is_shown_and_one_that_comes_back_too(serving: Serve) -> None:
     with serving() as url, page_of(url) as page:
         with fake_process("torso", "--patches", "1") as process:
@@ -285,7 +286,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         page.state = {}
         page.pull_until(lambda _: page.state)
         (driver,) = page.state["drivers"]
-        assert (driver["state"], driver["sensors"], driver["lost"], driver["load"]) == ("live", 96, 2, 0.25)
+        assert (driver["state"], driver["sensors"], driver["dropped"], driver["load"]) == ("live", 96, 2, 0.25)
         assert [bus["name"] for bus in driver["buses"]] == ["can0", "can1"]
         assert [patch["bus"] for patch in driver["patches"]] == ["can0", "can0", "can1", "can1"]
         assert driver["patches"][3]["state"] == "stale"
@@ -296,7 +297,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         assert "1 of 96 sensors never seen" in texts
         stale = next(problem for problem in page.state["problems"] if problem["text"].startswith("board 10 is stale"))
         assert (stale["bus"], stale["patch"]) == ("can1", "board 10")
-        lost = next(problem for problem in page.state["problems"] if "frames lost" in problem["text"])
+        lost = next(problem for problem in page.state["problems"] if "frames dropped" in problem["text"])
         assert set(lost) == {"severity", "driver", "text"}  # of none alone
         assert (page.state["recording"], page.state["replay"]) == (None, None)
         assert json.dumps(page.state)

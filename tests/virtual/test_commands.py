@@ -86,6 +86,7 @@ def test_the_no_load_value_is_taken_over() -> None:
     assert rig.run_ms(60)[0].payload == bytes.fromhex("40 64 64 64 64 64 64 64")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("board_type", ["00", "10"], ids=["0", "only the low four bits count"])
 def test_the_board_type_is_four_bits(board_type: str) -> None:
     rig, plain = Rig(), Rig()

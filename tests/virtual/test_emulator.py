@@ -65,6 +65,7 @@ def test_bursts_keep_their_period_for_ever() -> None:
     assert rig.hardware.totals()["bursts"] == len(starts)
 
 
+@pytest.mark.thorough
 def test_a_press_comes_and_goes_and_an_idle_board_rests() -> None:
     felt = pressures(Rig(streaming=True).run_ms(8000))
     assert min(felt) == EmulatedXela.rest

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import pytest
+
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.wire import Transmission, Wire, frame_time_ns
 
@@ -37,6 +39,7 @@ def test_boards_begin_at_phases_of_their_own() -> None:
     assert all(0 < time_ms <= 50 for time_ms in first.values())
 
 
+@pytest.mark.thorough
 def test_one_frame_at_a_time_however_the_bursts_collide() -> None:
     rig = Rig(boards=tuple(range(1, 15)), streaming=True, foreign_hz=500, lose=0.02)
     frames = rig.run_ms(2000)
@@ -148,6 +151,7 @@ def test_a_time_before_the_last_one_changes_nothing() -> None:
     assert rig.run_ms(1)[0].time_ns > START_NS + 500 * MS
 
 
+@pytest.mark.thorough
 def test_a_period_shorter_than_the_burst_overflows_the_boards_queue_and_says_so() -> None:
     rig = Rig(pattern="cycle")
     rig.configure(period_ms=2)
@@ -164,6 +168,7 @@ def test_a_period_shorter_than_the_burst_overflows_the_boards_queue_and_says_so(
 # Nobody listens
 
 
+@pytest.mark.thorough
 def test_skipping_counts_what_went_unheard_and_cycles_go_on() -> None:
     heard, unheard = Rig(streaming=True, pattern="cycle"), Rig(streaming=True, pattern="cycle")
     count = len(heard.run_ms(60_000))

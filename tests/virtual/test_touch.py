@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from skinware.realtime import NS_PER_S
 from skinware_drivers.virtual.roboskin.firmware import Arithmetic
@@ -67,6 +68,7 @@ def test_thermal_pads_feel_warmth_and_no_pressure() -> None:
     assert abs(np.diff(pads, axis=0)).max() <= 4
 
 
+@pytest.mark.thorough
 def test_a_skin_that_nobody_touches_stays_in_range_for_an_hour_whenever_its_baseline_was_taken() -> None:
     seconds = np.arange(3600)
     offset = np.full((16, 1), DEFAULT_CDC_OFFSET)
@@ -79,6 +81,7 @@ def test_a_skin_that_nobody_touches_stays_in_range_for_an_hour_whenever_its_base
             assert 200 < sample.values.min() <= sample.values.max() < 255
 
 
+@pytest.mark.thorough
 def test_warmth_shows_in_taxels_that_are_not_compensated() -> None:
     def spread(skin_type: int) -> int:
         rig = Rig(pattern="idle")

@@ -133,6 +133,7 @@ def test_port_and_name_server_go_and_come_back(namespace: object, hand: tuple[Sk
         read_until(driver.reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.status.any())
 
 
+@pytest.mark.thorough
 def test_the_emulated_robot_is_one(namespace: object) -> None:
     with running("skin-emulate", "--driver", "yarp", "--bus", f"yarp://{LOCAL}:0{PORT}") as there:
         where = there.wait_for("ready")["note"].removeprefix("listens on ")

@@ -149,6 +149,7 @@ def test_what_is_no_skin_is_left_out_with_a_word(namespace: object, yarp: Robot)
         assert there.ports() == {}
 
 
+@pytest.mark.thorough
 def test_the_command(namespace: object, yarp: Robot) -> None:
     with contextlib.closing(Skin("hand")):
         with running("skin-bridge", "yarp", "--server", f"{LOCAL}:{yarp.server.port}") as bridge:

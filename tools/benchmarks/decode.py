@@ -5,7 +5,7 @@ kernel: its datagrams are ``struct can_frame``. The frames are those of 7 boards
 interleaved, with 1 % lost halves, wrong lengths and foreign identifiers. All drain the same frames in turns:
 
 * native: the compiled path from the socket into the ring of a ``DriverWriter``;
-* numpy: ``SocketCanBus.receive``, ``Decoder``, ``Publisher`` into such a ring;
+* numpy: ``SocketCanBus.receive``, ``SpecifiedDecoder``, ``Publisher`` into such a ring;
 * kernel: ``recvmmsg`` alone, with time stamps: nobody can be faster;
 * python-can: its ``Notifier`` with a listener that decodes each frame into the same kind of arrays.
 
@@ -36,11 +36,11 @@ from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.native import structs
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
 
 BOARDS = range(7, 14)
@@ -80,7 +80,7 @@ class Numpy:
         driver = RoboskinDriver(RoboskinOptions())
         patches = driver.patches_set_up(BOARDS)
         tables = assemble([("bench", patches)], driver.types, driver.dtype)
-        self.decoder = Decoder([driver.layout], tables)
+        self.decoder = SpecifiedDecoder([driver.layout], tables)
         self.writer = DriverWriter(
             "bench",
             tables.structure,
@@ -130,7 +130,7 @@ class Native(Numpy):
         if not self.bus.hand_over(self.batch, source):
             raise SystemExit("decode: the socket is not read natively")
         self.flow.rest_until_ns = 0
-        self.path.leave_soon()
+        self.path._words.must_leave = True
         self.path.run(self.flow)
         return int(source.frames)
 

@@ -35,9 +35,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from skinware import Namespace
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch, wire_dtype
-from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Bits, Frame, Layout, Values
+from skinware_drivers.fields import Bits
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
@@ -45,6 +45,7 @@ from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import fill_rows
 from tests.serial.framings import EXAMPLES
+from tests.specification.decoding import SpecifiedDecoder
 
 PARTS = ("memory", "pty", "rest")
 NAME = "cobs_crc"
@@ -123,9 +124,9 @@ def ours_decoded(stream: bytes, chunk: int) -> int:
     return found
 
 
-def make_decoder() -> Decoder:
+def make_decoder() -> SpecifiedDecoder:
     """Of one patch."""
-    return Decoder([LAYOUT], assemble([("line", [PATCH])], Skin.types, np.uint16))
+    return SpecifiedDecoder([LAYOUT], assemble([("line", [PATCH])], Skin.types, np.uint16))
 
 
 class ByteMachine:

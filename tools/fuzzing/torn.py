@@ -31,7 +31,8 @@ from skinware import Namespace
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Bursts, FrameLog, find_torn, record
@@ -120,7 +121,8 @@ def run(recording: Bursts, cycles: int, most: int, seed: int) -> tuple[int, int,
         rows = np.concatenate([rows for rows, _ in parts])
         time_ns = np.concatenate([time_ns + number * span_ns for number, (_, time_ns) in enumerate(parts)])
         fresh, is_torn = find_torn(recording, rows, time_ns)
-        sent, shown, torn = sent + VARIANTS_AT_ONCE * BURSTS * modules, shown + len(fresh), torn + int(is_torn.sum())
+        sent, shown = sent + VARIANTS_AT_ONCE * BURSTS * modules, shown + len(fresh.module)
+        torn += int(is_torn.sum())
     return sent, shown, torn
 
 

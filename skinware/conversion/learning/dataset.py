@@ -43,8 +43,6 @@ class DatasetWriter:
     Args:
         folder: of the dataset; it must not exist.
         fps: rows a second.
-        features: of a row, by name, besides those that all datasets have.
-        lengths: number of rows of each episode to come.
 
     Raises:
         MissingExtra: pyarrow is not installed.
@@ -65,11 +63,6 @@ class DatasetWriter:
 
     def add_episode(self, task: str, length: int, batches: Iterable[Batch]) -> None:
         """Write an episode.
-
-        Args:
-            task: description of the episode.
-            length: number of its rows.
-            batches: its rows, some at a time.
 
         Raises:
             OSError: it cannot be written.
@@ -218,8 +211,6 @@ class _FeatureStatistics:
     """Statistics of all features.
 
     Args:
-        features: by name.
-        lengths: of the episodes to come.
         most_bytes: bytes of rows kept for the quantiles of a feature.
     """
 

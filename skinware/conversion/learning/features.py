@@ -51,8 +51,6 @@ class SkinFeatures:
     """Features of a driver: values and status of each sensor type, and the age of its samples.
 
     Args:
-        service: name of the driver.
-        structure: of the driver.
         sensor_names: in the order of its values.
         window: number of samples in a row, the oldest first.
         period_ns: the driver's nominal period, 0 if it has none.
@@ -87,7 +85,6 @@ class SkinFeatures:
         """Return the features of t rows.
 
         Args:
-            frames: samples of the driver.
             numbers: (t, window) samples of each row, the newest last.
             rows_ns: (t,) time of each row, wall clock.
         """
@@ -127,7 +124,6 @@ class Frames:
     """Samples of a driver by number, read in one pass over its table.
 
     Args:
-        table: of the driver.
         times_ns: (f,) times of all samples, from the pass before.
         window: number of samples that stay available.
     """
@@ -192,7 +188,7 @@ class JoinedFeature:
 
     def __init__(self, joined: Joined) -> None:
         self._joined, self.name = joined, joined.name
-        if joined.is_of_images:
+        if joined.rows.ndim == 1:
             width, height = _png_size(Path(joined.rows[0]))[1:]
             self.description = Feature(IMAGE, (height, width, 3), ["height", "width", "channels"])
         else:
@@ -272,7 +268,6 @@ class Moments:
     """Moments of rows.
 
     Attributes:
-        count: number of rows.
         least, greatest, mean: (...) of each number of a row.
         squares: (...) sum of the squared differences from the mean.
     """
@@ -302,7 +297,7 @@ class Moments:
         )
 
 
-class Sample:
+class ChosenRows:
     """Evenly chosen rows of those that are added.
 
     Args:
@@ -340,17 +335,13 @@ class Statistics:
     """Statistics of the rows of a feature.
 
     Args:
-        shape: of a row.
-        dtype: of its numbers.
-        rows: number of rows to come.
         most_bytes: of the rows kept for quantiles.
-        per_item: rows that count as one: pixels of an image.
     """
 
     def __init__(
         self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int, per_item: int = 1
     ) -> None:
-        self._sample, self._per_item = Sample(shape, dtype, rows, most_bytes), per_item
+        self._sample, self._per_item = ChosenRows(shape, dtype, rows, most_bytes), per_item
         self._moments: Moments | None = None
 
     def add(self, rows: npt.NDArray[Any], moments: Moments) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from skinware.conversion.learning.joined import Joined, matched
 from skinware.conversion.learning.wanted import Interval, LearningSet
-from skinware.conversion.tables import TIME, Source, Table
+from skinware.conversion.tables import TIME, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -29,13 +29,7 @@ Times = npt.NDArray[np.int64]
 class TimedTable:
     """The times of a driver's samples, as long as its structure stayed the same.
 
-    Args:
-        table: of a driver.
-        structure: of the driver.
-
     Attributes:
-        name: of the table.
-        structure: as given.
         period_ns: the driver's nominal period, 0 if it has none.
         recorded_ns: (f,) time of publication of each sample, wall clock, as recorded.
         times_ns: (f,) the same, never going back.
@@ -61,7 +55,6 @@ class TimedTable:
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
     def window(self, wanted: LearningSet) -> int:
-        """Return the number of samples in a row."""
         return wanted.window or max(1, int(np.ceil(self.rate_hz / wanted.fps - 1e-3)))
 
     def runs(self, gap_s: float | None) -> Iterator[tuple[int, int]]:
@@ -73,12 +66,11 @@ class TimedTable:
 
 
 @dataclass(frozen=True)
-class Piece:
+class Stretch:
     """A time in which all drivers ran, each with one structure.
 
     Attributes:
         begin_ns, end_ns: wall clock, both in it.
-        tables: by driver.
     """
 
     begin_ns: int
@@ -95,18 +87,14 @@ class Episode:
     """Rows of a learning set that follow each other.
 
     Attributes:
-        recording: number of the recording.
-        task: its description.
         times_ns: (t,) of each row, wall clock.
-        piece: the drivers.
         frames: by driver, (t,) number of the newest sample at each row.
-        joined: by joined feature, (t,) its row.
     """
 
     recording: int
     task: str
     times_ns: Times
-    piece: Piece
+    piece: Stretch
     frames: Mapping[str, Times]
     joined: Mapping[str, Times]
 
@@ -118,10 +106,6 @@ class Planner:
     """Makes episodes of one recording.
 
     Args:
-        number: of the recording.
-        source: the recording, reduced to the selected drivers.
-        wanted: definition of the set.
-        joined: joined data, each with its times, wall clock.
         structures: of the recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:
@@ -135,7 +119,7 @@ class Planner:
     def __init__(
         self,
         number: int,
-        source: Source,
+        source: TableSource,
         wanted: LearningSet,
         joined: Sequence[tuple[Joined, Times]],
         structures: list[Structure],
@@ -178,11 +162,11 @@ class Planner:
 
     # -- pieces ---------------------------------------------------------------------------------------------------
 
-    def _pieces(self) -> Iterator[Piece]:
-        pieces = [Piece(0, 1 << 62, {})]
+    def _pieces(self) -> Iterator[Stretch]:
+        pieces = [Stretch(0, 1 << 62, {})]
         for name, tables in self._drivers.items():
             pieces = [
-                Piece(max(piece.begin_ns, begin_ns), min(piece.end_ns, end_ns), {**piece.tables, name: timed})
+                Stretch(max(piece.begin_ns, begin_ns), min(piece.end_ns, end_ns), {**piece.tables, name: timed})
                 for piece in pieces
                 for timed in tables
                 for begin_ns, end_ns in self._spans(timed)
@@ -197,7 +181,7 @@ class Planner:
             if first + more < end:
                 yield int(timed.times_ns[first + more]), int(timed.times_ns[end - 1])
 
-    def _check_whole(self, pieces: Sequence[Piece], where: str) -> None:
+    def _check_whole(self, pieces: Sequence[Stretch], where: str) -> None:
         """Refuse a change of structure unless several sets are wanted."""
         changed = [piece for before, piece in pairwise(pieces) if piece.structures != before.structures]
         if changed and not self._wanted.each_structure:
@@ -209,7 +193,7 @@ class Planner:
 
     # -- episodes -------------------------------------------------------------------------------------------------
 
-    def _in_interval(self, pieces: Sequence[Piece], interval: Interval, task: str) -> list[Episode]:
+    def _in_interval(self, pieces: Sequence[Stretch], interval: Interval, task: str) -> list[Episode]:
         begin_ns, end_ns = self._moment(interval.start_s), self._moment(interval.end_s) - 1
         inside = [piece for piece in pieces if piece.begin_ns <= end_ns and piece.end_ns >= begin_ns]
         self._check_whole(inside, f"the episode {interval}")
@@ -230,7 +214,7 @@ class Planner:
             )
         return episodes
 
-    def _episode(self, piece: Piece, begin_ns: int, end_ns: int, task: str) -> Episode | None:
+    def _episode(self, piece: Stretch, begin_ns: int, end_ns: int, task: str) -> Episode | None:
         limit_ns = round(self._wanted.limit_s * NS_PER_S)
         for _, times_ns in self._joined:
             begin_ns, end_ns = max(begin_ns, int(times_ns[0])), min(end_ns, int(times_ns[-1]) + limit_ns)

@@ -27,8 +27,6 @@ def message(content: bytes) -> bytes:
 
 
 class EmulatedAbilityHandOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     address: Annotated[int, Meta(ge=0, le=255, description="address of the hand")] = 0x50
 
 

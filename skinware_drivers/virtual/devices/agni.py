@@ -27,8 +27,6 @@ def message(number: int, body: bytes) -> bytes:
 
 
 class EmulatedAgniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the device."""
-
     sensors: Annotated[tuple[int, ...], Meta(description="number of values of each sensor")] = (16, 4)
 
 

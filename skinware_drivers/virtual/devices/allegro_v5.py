@@ -27,8 +27,6 @@ _JOINTS = 16
 
 
 class EmulatedAllegroV5Options(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     period_ms: Annotated[int, Meta(ge=1, description="time between two messages of a kind, ms")] = 10
 
 
@@ -54,8 +52,6 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
 
 
 class EmulatedAllegroV5TipsOptions(EmulatedAllegroV5Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     as_in_manual: Annotated[bool, Meta(description="identifiers of the manual, not those of real hands")] = False
     air_pa: Annotated[int, Meta(ge=0, description="pressure of an untouched fingertip, Pa")] = 0
 
@@ -86,8 +82,6 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two datagrams, ms")] = 3
 
 

@@ -17,8 +17,6 @@ from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptio
 
 
 class EmulatedAnySkinOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the board."""
-
     mags: Annotated[int, Meta(ge=1, le=64, description="magnetometers of the board")] = 5
 
 

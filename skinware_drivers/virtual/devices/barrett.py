@@ -20,8 +20,6 @@ _TOP_10, _FULL = 1, 2
 
 
 class EmulatedBarrettOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the pucks."""
-
     nodes: Annotated[tuple[int, ...], Meta(description="nodes of the pucks")] = (11, 12, 13, 14)
 
 

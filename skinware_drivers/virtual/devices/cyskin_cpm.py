@@ -20,14 +20,10 @@ _SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
 
 
 class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the finger."""
-
     period_ms: Annotated[int, Meta(ge=1, description="time between two sets, ms")] = 20
 
 
 class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
-    """One finger, device 0."""
-
     full_scale = 0xFFFF
     rest = 800
     swing = 6_000

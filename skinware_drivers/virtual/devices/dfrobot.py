@@ -17,8 +17,6 @@ from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptio
 
 
 class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the arrays."""
-
     units: Annotated[tuple[int, ...], Meta(description="numbers of the arrays")] = (1,)
     shapes: Annotated[tuple[Literal["4x8", "6x6"], ...], Meta(description="rows and columns of each, or of all")] = (
         "6x6",

@@ -18,8 +18,6 @@ from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptio
 
 
 class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the pad."""
-
     rows: Annotated[int, Meta(ge=1, le=64, description="rows of the pad")] = 12
     columns: Annotated[int, Meta(ge=1, le=64, description="columns of the pad")] = 32
     firmware: Annotated[Literal["binary", "text"], Meta(description="firmware of the pad")] = "binary"

@@ -28,8 +28,6 @@ def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_
 
 
 class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the boards."""
-
     boards: Annotated[tuple[int, ...], Meta(description="addresses of the skin boards")] = (1,)
     triangles: Annotated[int, Meta(ge=1, le=12, description="triangles of each board")] = 12
     skin: Annotated[int, Meta(ge=0, le=1, description="CAN port of the Ethernet board that they are on")] = 0
@@ -37,8 +35,6 @@ class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
 
 
 class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
-    """One Ethernet board."""
-
     full_scale = 255
     rest = 240
     swing = -150

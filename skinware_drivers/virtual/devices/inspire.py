@@ -22,8 +22,6 @@ _SHAPES = (*_FINGER * 4, *_THUMB, _PALM)
 
 
 class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand")] = 1
     zero: Annotated[tuple[int, ...], Meta(description="matrices that send only 0: 1 to 17, the last is the palm")] = ()
     swapped: Annotated[bool, Meta(description="send the low byte of a register first")] = False

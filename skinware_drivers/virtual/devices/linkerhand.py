@@ -116,7 +116,6 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         return range(0xB1, 0xB7 if self.options.palm else 0xB6)
 
     def _question(self, command: int) -> bytes:
-        """Return the question for a command; empty if the hand has no such command."""
         if command not in self._commands:
             return b""
         if self.options.touch in _OF_HAND:

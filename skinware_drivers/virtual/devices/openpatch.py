@@ -63,8 +63,6 @@ def unstuff(stuffed: bytes) -> bytes:
 
 
 class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the patch."""
-
     modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
     period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
     serial_number: Annotated[str, Meta(max_length=16, description="name of the patch")] = "1"

@@ -107,7 +107,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return of_board(device, command, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``data`` or ``answer``."""
         if self.options.board == "high_speed":
             return "data" if payload[:2] == b"\xaa\x56" else "answer"
         return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"

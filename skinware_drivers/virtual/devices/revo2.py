@@ -32,8 +32,6 @@ _N_VALUES = {"touch": 20, "pressure": 97, "array_pressure": 25, "force3d": 4 * 9
 
 
 class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 127
     side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     edition: Annotated[

@@ -37,8 +37,6 @@ _KIND = "4023"  # in the memory of a device: content of that register
 
 
 class EmulatedRevo3Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 1
     side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     mapping: Annotated[Literal["pressure", "matrix", "packed"], Meta(description="which registers it has")] = "pressure"

@@ -17,8 +17,6 @@ from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptio
 
 
 class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the patches."""
-
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches")] = (1, 2, 3, 4, 5, 6, 7, 8)
     cells: Annotated[int, Meta(ge=1, le=16, description="cells of each patch")] = 16
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two records of a cell, ms")] = 20

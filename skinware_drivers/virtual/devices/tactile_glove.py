@@ -16,8 +16,6 @@ from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptio
 
 
 class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the glove."""
-
     taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
 

@@ -20,8 +20,6 @@ _MODEL = {"1f": 0x1F02, "2f": 0x2F03, "3f": 0x3F02, "4f": 0x4F02, "5f": 0x5F22, 
 
 
 class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hand."""
-
     hand: Annotated[Literal["1f", "2f", "3f", "4f", "5f", "5f15"], Meta(description="model")] = "5f"
     tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes", "four_axes"], Meta(description="kind of sensors")] = (
         "tactile_m"
@@ -32,8 +30,6 @@ class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
 
 
 class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
-    """One hand, device number 1."""
-
     full_scale = 250
     swing = 220
     speed_mbit_s = 100
@@ -58,7 +54,6 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         return None
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``data`` or ``answer``."""
         return "data" if payload[2] == 1 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

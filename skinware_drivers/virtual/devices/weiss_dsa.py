@@ -26,15 +26,11 @@ def message(command: int, payload: bytes) -> bytes:
 
 
 class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the controller."""
-
     fingers: Annotated[int, Meta(ge=1, le=3, description="fingers, of two matrices each")] = 3
     period_ms: Annotated[float, Meta(ge=10, le=1000, description="time between two frames, ms")] = 100
 
 
 class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
-    """One controller, device number 1."""
-
     full_scale = 4095
     swing = 3500
 
@@ -64,7 +60,6 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
         return None
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``data`` or ``answer``."""
         return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

@@ -54,15 +54,11 @@ def message(command: int, payload: bytes) -> bytes:
 
 
 class EmulatedWeissWtsOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the sensor."""
-
     columns: Annotated[int, Meta(ge=1, le=32, description="cells in a row")] = 4
     rows: Annotated[int, Meta(ge=1, le=32, description="rows of cells")] = 8
 
 
 class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
-    """One sensor, device number 1."""
-
     full_scale = 4095
     swing = 3500
 
@@ -77,7 +73,6 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
         return message(command[3], struct.pack("<H", status) + answer)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``data`` or ``answer``."""
         return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

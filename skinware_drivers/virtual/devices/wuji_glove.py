@@ -27,8 +27,6 @@ def message(sync: int, body: bytes) -> bytes:
 
 
 class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the board."""
-
     hand: Literal["left", "right"] = "left"
     period_ms: Annotated[
         float, Meta(ge=1, le=1000, description="time between two frames until the host changes it, ms")
@@ -60,7 +58,6 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
         return message(0x57, command[4:8] + bytes([status]) + answer)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``data`` or ``answer``."""
         return "data" if payload[1] == 0x55 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

@@ -23,8 +23,6 @@ from skinware_drivers.virtual import (
 
 
 class EmulatedXelaOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the boards."""
-
     boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards")] = (1,)
     model: Annotated[
         Literal["4x4", "4x6"],

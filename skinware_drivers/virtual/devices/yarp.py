@@ -21,8 +21,6 @@ _TAGS = {3: 256 + 10, 4: 256 + 20}
 
 
 class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the port."""
-
     length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
     yarp: Annotated[
         Literal[3, 4], Meta(description="major version of its YARP, which decides how a list of doubles is marked")
@@ -32,8 +30,6 @@ class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fie
 
 
 class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
-    """One port."""
-
     full_scale = 255
     rest = 0
     swing = 150

@@ -29,7 +29,7 @@ _NO_ACKS_TO_RECALIBRATE = 5
 _INERTIAL = "inertial"  # the timer of the inertial sensors
 
 
-class Board(Device):
+class EmulatedBoard(Device):
     """One board.
 
     Defaults: icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp, ``setdefault`` and
@@ -37,17 +37,11 @@ class Board(Device):
 
     Args:
         address: on the bus, the ``number`` of the device, which commands can change.
-        stage: the emulator.
-        transmitter: its place on the wire.
         now_ns: time of power-up.
         phase: 0-1, when in its period a started board sends its first burst.
 
     Attributes:
-        stage: the emulator.
-        touch: of its skin.
-        faults: of its triangles.
         last_cycle: bursts after which it dies; None: it lives on.
-        inertial: its inertial sensors.
     """
 
     is_mtb3: ClassVar[bool]
@@ -95,7 +89,6 @@ class Board(Device):
         self._log_triangle(now_ns, triangle, fault)
 
     def on_timer(self, name: str, time_ns: int) -> None:
-        """Send what is due."""
         if name == _INERTIAL:
             for low, payload in self.inertial.messages(time_ns):
                 self._send(time_ns, INERTIAL, low, payload)

@@ -14,7 +14,7 @@ _PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
 _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
 
 
-class RoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The boards, their touch and their faults.
 
     Raises:
@@ -68,7 +68,6 @@ class RoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, 
         """Return the places of a list option as numbers.
 
         Args:
-            name: of the option.
             depth: 2 for (board, triangle), 3 for (board, triangle, taxel).
 
         Raises:

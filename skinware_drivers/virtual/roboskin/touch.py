@@ -17,7 +17,7 @@ from skinware.realtime import NS_PER_S
 from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, read_stage
 from skinware_drivers.virtual.hardware import Point, Pressing
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values on the wire, 0-255, instead of felt ones."""
@@ -52,9 +52,6 @@ _SENSORS = TRIANGLES * CHANNELS
 class PressedSkin:
     """The skin of all boards, and the presses on it.
 
-    Args:
-        options: of the boards.
-
     Raises:
         ConfigurationError: the file of the option ``stage`` cannot be used.
 
@@ -63,7 +60,7 @@ class PressedSkin:
         version: changes when the touch from now on does, other than with time.
     """
 
-    def __init__(self, options: RoboskinOptions) -> None:
+    def __init__(self, options: EmulatedRoboskinOptions) -> None:
         self.version: int = 0
         self._options = options
         numbers = [address - _FIRST_BOARD for address in options.boards]
@@ -188,7 +185,6 @@ class Touch:
     """The capacitances of one board.
 
     Args:
-        seed: of all boards.
         ordinal: of the board; others feel other presses.
         skin: of all boards, with the presses on it; None: an untouched board.
     """

@@ -26,10 +26,10 @@ from skinware_drivers import (
     Layout,
     Link,
     Module,
+    Options,
     Patch,
     SequenceNumber,
     Values,
-    check_options,
     operation,
     taxels,
 )
@@ -49,7 +49,7 @@ FILTERS = {"none": 0, "500": 1, "150": 2, "50": 3, "15": 4, "5": 5, "1.5": 6}
 SILENCE_MS = 0
 
 
-class OptoforceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class OptoforceOptions(Options, frozen=True):
     """Options of the driver."""
 
     model: Annotated[Literal["one", "four"], msgspec.Meta(description="sensors on the converter")] = "one"
@@ -57,9 +57,6 @@ class OptoforceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     filter_hz: Annotated[
         Literal["none", "500", "150", "50", "15", "5", "1.5"], msgspec.Meta(description="cut-off of the filter, Hz")
     ] = "15"
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class OptoforceDriver(SerialAdapter[OptoforceOptions]):

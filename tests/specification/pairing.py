@@ -1,20 +1,15 @@
-"""Join the frames of a cycle into updates, in order or by a counter; without a counter, by their punctuality."""
+"""Which frames belong together, in numpy: what ``pairing.c`` is compared with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.realtime import NS_PER_S
+from skinware_drivers.decoding.compiled import NEVER_NS, CompiledCycle, Punctuality
 from skinware_drivers.decoding.device_numbers import read_numbers
-from skinware_drivers.decoding.frame_kind import Assembly
-from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import Cycle, Frame
 
 Indices = npt.NDArray[np.int64]
 Places = npt.NDArray[np.uint8]
@@ -22,9 +17,8 @@ Flags = npt.NDArray[np.bool_]
 Groups = npt.NDArray[np.uint16]
 Bytes = npt.NDArray[np.uint8]
 
-_NEVER_NS = -(1 << 62)
-_MARGIN = 8
-"""One part in so many of the time by which a frame may be early or late is left for the spacing inside a cycle."""
+_COUNTER_BITS = 32
+_COUNTER_MASK = (1 << _COUNTER_BITS) - 1
 
 
 class Judgement(NamedTuple):
@@ -43,8 +37,8 @@ class Judgement(NamedTuple):
     spacing_ns: Indices
 
 
-class Punctuality:
-    """When each kind of frame of each module came last, and how long after the one before.
+def _judge(own: Punctuality, kind: Indices, time_ns: Indices) -> Judgement:
+    """Judge frames by their times.
 
     Two halves of different cycles come within the maximum age of each other only if the first was held up by at least a
     period minus that age. So each frame is judged by the time since the frame of its kind before:
@@ -58,55 +52,26 @@ class Punctuality:
     all must come in time: there, the end of a cycle and the beginning of the next look like one.)
 
     Args:
-        cycle: of the frames.
-        period_s: nominal time from one cycle of a module to the next; a module may always be slower.
-        n_modules: number of modules.
+        kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
+        time_ns: (m,) stamps.
     """
-
-    def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
-        self._n = len(cycle.members)
-        self.all_as_they_should = cycle.order != "given"
-        self.period_ns = round(period_s * NS_PER_S)
-        self.reach_ns = round(cycle.reach_s * NS_PER_S)
-        self.margin_ns = (self.period_ns - self.reach_ns) // _MARGIN
-        self.soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self.margin_ns
-        self.last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
-        self.spacings_ns = np.full(n_modules * self._n, self.period_ns, np.int64)
-
-    def judge(self, kind: Indices, time_ns: Indices) -> Judgement:
-        """Judge frames.
-
-        Args:
-            kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
-            time_ns: (m,) stamps.
-        """
-        order = np.argsort(kind, kind="stable")
-        kind, time_ns = kind[order], time_ns[order]
-        follows = np.flatnonzero(kind[1:] == kind[:-1]) + 1
-        before_ns, usual_ns = self.last_ns[kind], self.spacings_ns[kind]
-        before_ns[follows] = time_ns[follows - 1]
-        spacing_ns = time_ns - before_ns
-        spacing_ns[before_ns == _NEVER_NS] = self.period_ns
-        usual_ns[follows] = spacing_ns[follows - 1]
-        soon = spacing_ns <= self.soon_ns
-        late = spacing_ns >= 2 * np.maximum(usual_ns, self.period_ns) - self.reach_ns - self.margin_ns
-        held_up = late
-        if not self.all_as_they_should and late.any():
-            beside_ns = np.abs((spacing_ns + self.period_ns // 2) % self.period_ns - self.period_ns // 2)
-            held_up = late & (2 * beside_ns >= self.period_ns - self.reach_ns)
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
-
-    def remember(self, kind: Indices, time_ns: Indices, spacing_ns: Indices) -> None:
-        """Remember frames that came in this order and are not judged again."""
-        self.spacings_ns[kind] = spacing_ns
-        self.last_ns[kind] = time_ns
-
-    def forget(self, modules: Indices) -> None:
-        kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
-        self.last_ns[kinds] = _NEVER_NS
-        self.spacings_ns[kinds] = self.period_ns
+    order = np.argsort(kind, kind="stable")
+    kind, time_ns = kind[order], time_ns[order]
+    follows = np.flatnonzero(kind[1:] == kind[:-1]) + 1
+    before_ns, usual_ns = own.last_ns[kind], own.spacings_ns[kind]
+    before_ns[follows] = time_ns[follows - 1]
+    spacing_ns = time_ns - before_ns
+    spacing_ns[before_ns == NEVER_NS] = own.period_ns
+    usual_ns[follows] = spacing_ns[follows - 1]
+    soon = spacing_ns <= own.soon_ns
+    late = spacing_ns >= 2 * np.maximum(usual_ns, own.period_ns) - own.reach_ns - own.margin_ns
+    held_up = late
+    if not own.all_as_they_should and late.any():
+        beside_ns = np.abs((spacing_ns + own.period_ns // 2) % own.period_ns - own.period_ns // 2)
+        held_up = late & (2 * beside_ns >= own.period_ns - own.reach_ns)
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,22 +95,36 @@ class Pairs:
 
 
 class Pairing:
-    """Finds the cycles of one layout.
+    """Finds the whole cycles, the orphans and the frames that wait in a batch."""
 
-    Args:
-        cycle: its declaration.
-        places: (256,) place in the cycle of each kind of frame; ``n`` = not a member.
-        punctuality: separates cycles without a counter; None: only order and age do.
-    """
-
-    def __init__(self, cycle: Cycle, places: Places, punctuality: Punctuality | None = None) -> None:
+    def __init__(self, cycle: CompiledCycle) -> None:
+        self._cycle = cycle
         self._n = len(cycle.members)
-        self.order: Literal["given", "any", "ends_with"] = cycle.order
-        self.maximum_age_ns = round(cycle.maximum_age_s * NS_PER_S)
-        self._places = places
-        self._punctuality = punctuality
+        self._places = np.full(256, self._n, np.uint8)
+        self._places[cycle.members] = np.arange(self._n)
 
     def find(
+        self, entry: Indices, kind: Bytes, payload: Bytes, time_ns: Indices, is_module: Flags, severed: Flags
+    ) -> Pairs:
+        """Find the cycles in a batch.
+
+        Args:
+            entry: (m,) module of each frame, where ``is_module``.
+            kind: (m,) kind of each.
+            payload: (m, size) uint8.
+            time_ns: (m,) stamps.
+            is_module: (m,) bool: the frame is one of a known module.
+            severed: (m,) bool: the frame has waited for partners, and it is known that frames were lost since.
+        """
+        shared = entry
+        if self._cycle.counters:
+            shared = entry << _COUNTER_BITS
+            for number, counter in zip(self._cycle.members, self._cycle.counters, strict=True):
+                rows = np.flatnonzero((kind == number) & is_module)
+                shared[rows] |= read_numbers(payload[rows], counter) & _COUNTER_MASK
+        return self._find(shared, self._cycle.group_of_entry[entry], kind, time_ns, is_module, severed)
+
+    def _find(
         self, shared: Indices, group: Groups, kind: Places, time_ns: Indices, is_module: Flags, severed: Flags
     ) -> Pairs:
         """Find the members of cycles that follow each other without another frame of their group in between.
@@ -159,7 +138,7 @@ class Pairing:
             is_module: (m,) bool: the frame is one of a known module.
             severed: (m,) bool: the frame has waited for partners, and it is known that frames were lost since.
         """
-        n = self._n
+        n, punctuality = self._n, self._cycle.punctuality
         order = np.argsort(group, kind="stable")
         shared, group, time_ns = shared[order], group[order], time_ns[order]
         place = self._places[kind[order]]
@@ -168,24 +147,24 @@ class Pairing:
         place[severed[order]] = n
         out_of_time, doubtful, soon = np.zeros((3, len(place)), bool)
         judged = None
-        if self._punctuality is not None:
+        if punctuality is not None:
             members = np.flatnonzero(place < n)
             kinds = shared[members] * n + place[members]
-            judged = self._punctuality.judge(kinds, time_ns[members])
+            judged = _judge(punctuality, kinds, time_ns[members])
             soon[members], doubtful[members] = judged.soon, judged.doubtful
             out_of_time[members] = judged.soon | judged.held_up
-        if self.order == "given":
+        if self._cycle.order == "given":
             begun = self._find_begun(shared, place)
             starts, untrusted = self._trust(np.flatnonzero(begun & (place == n - 1)) - n + 1, out_of_time, doubtful)
         else:
             starts, untrusted = self._find_cycles(shared, place, out_of_time, doubtful)
-        in_time = time_ns[starts + n - 1] - time_ns[starts] <= self.maximum_age_ns
+        in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._cycle.maximum_age_ns
         used = np.zeros(len(order), bool)
         late, starts = np.union1d(starts[~in_time], untrusted), self._apart(starts[in_time])
         windows = starts[:, None] + np.arange(n)
         used[windows] = True
         ends = np.flatnonzero(np.append(group[1:] != group[:-1], True)) if len(group) else np.zeros(0, np.int64)
-        if self.order == "given":
+        if self._cycle.order == "given":
             ends = ends[begun[ends] & (place[ends] < n - 1)]
             waiting = np.concatenate([np.arange(end - int(place[end]), end + 1) for end in ends.tolist()] or [ends])
         else:
@@ -193,14 +172,15 @@ class Pairing:
         is_orphan = is_member & ~used
         is_orphan[waiting] = False
         late = self._apart(late[is_orphan[late[:, None] + np.arange(n)].all(axis=1)])
-        if self._punctuality is not None and judged is not None:
+        if punctuality is not None and judged is not None:
             is_waiting = np.zeros(len(place), bool)
             is_waiting[waiting] = True
             over = ~is_waiting[members]
-            self._punctuality.remember(kinds[over], time_ns[members][over], judged.spacing_ns[over])
+            punctuality.last_ns[kinds[over]] = time_ns[members][over]
+            punctuality.spacings_ns[kinds[over]] = judged.spacing_ns[over]
         rows = order[windows]
         last = rows[:, -1]
-        if self.order != "given":
+        if self._cycle.order != "given":
             rows = np.take_along_axis(rows, np.argsort(place[windows], axis=1), axis=1)
         orphans = order[is_orphan]
         by_arrival = np.argsort(np.concatenate([last, orphans]), kind="stable")
@@ -238,7 +218,7 @@ class Pairing:
             whole &= shared[j : m + j] == shared[:m]
             seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
         whole &= seen == (1 << n) - 1
-        if self.order == "ends_with":
+        if self._cycle.order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
         return self._trust(np.flatnonzero(whole), out_of_time, doubtful)
 
@@ -272,81 +252,3 @@ class Pairing:
                 keep[start : start + length] = True
             ends = ends[~fits]
         return np.flatnonzero(keep)
-
-
-_COUNTER_BITS = 32
-_COUNTER_MASK = (1 << _COUNTER_BITS) - 1
-
-
-class CompiledCycle:
-    """Finds the cycles of one layout.
-
-    Args:
-        cycle: its declaration.
-        frames: all kinds of frame.
-        members: the numbers of its members among them, in order.
-        assembly: reads them.
-        tables: the skin.
-        period_s: nominal time from one cycle to the next; None: not known.
-
-    Attributes:
-        members: as given.
-        assembly: as given.
-        sequence: the member whose sequence numbers are compared, and their place; None: there are none.
-    """
-
-    def __init__(
-        self,
-        cycle: Cycle,
-        frames: Sequence[Frame],
-        members: list[int],
-        assembly: Assembly,
-        tables: SkinTables,
-        period_s: float | None,
-    ) -> None:
-        self.members = members
-        self.assembly = assembly
-        self.counters = cycle.counters
-        sequences: Sequence[SequenceNumber | None] = self.counters or [frames[n].sequence for n in members]
-        self.sequence: tuple[int, SequenceNumber] | None = next(
-            ((member, each) for member, each in enumerate(sequences) if each is not None), None
-        )
-        structure = tables.structure
-        places = np.full(256, len(members), np.uint8)
-        places[members] = np.arange(len(members))
-        if cycle.within == "patch":
-            patches = np.arange(structure.n_patches + 1)
-            groups = np.concatenate([structure.module_patch, patches])
-        else:
-            groups = np.minimum(np.arange(structure.n_modules + structure.n_patches + 1), 0xFFFF)
-        self.group_of_entry = groups.astype(np.uint16)
-        self.punctuality: Punctuality | None = None
-        if period_s is not None and not self.counters:
-            self.punctuality = Punctuality(cycle, cycle.period_s or period_s, structure.n_modules)
-        self.pairing = Pairing(cycle, places, self.punctuality)
-
-    def find(
-        self, entry: Indices, kind: Bytes, payload: Bytes, time_ns: Indices, is_module: Flags, severed: Flags
-    ) -> Pairs:
-        """Find the cycles in a batch.
-
-        Args:
-            entry: (m,) module of each frame, where ``is_module``.
-            kind: (m,) kind of each.
-            payload: (m, size) uint8.
-            time_ns: (m,) stamps.
-            is_module: (m,) bool: the frame is one of a known module.
-            severed: (m,) bool: the frame has waited for partners, and it is known that frames were lost since.
-        """
-        shared = entry
-        if self.counters:
-            shared = entry << _COUNTER_BITS
-            for number, counter in zip(self.members, self.counters, strict=True):
-                rows = np.flatnonzero((kind == number) & is_module)
-                shared[rows] |= read_numbers(payload[rows], counter) & _COUNTER_MASK
-        return self.pairing.find(shared, self.group_of_entry[entry], kind, time_ns, is_module, severed)
-
-    def forget(self, modules: Indices) -> None:
-        """Forget the rhythm of modules that have restarted."""
-        if self.punctuality is not None:
-            self.punctuality.forget(modules)

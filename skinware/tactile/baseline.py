@@ -307,7 +307,8 @@ class Baseline:
         free = live & ~touches.touched & touches.has_settled
         spread = np.sqrt(offsets.noise2)
         if not touches.signed:
-            free &= ~self._surroundings.sagging & (touches.smooth > -settings.off_sigma * spread)
+            low = touches.smooth < -settings.off_sigma * spread
+            free &= ~self._surroundings.sagging & ~(self._surroundings.below & low)
         offsets.follow_common(deviation, free, passed_s)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
         off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
@@ -319,7 +320,7 @@ class Baseline:
         surroundings = self._surroundings
         held = surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
-            surroundings.sag(touches.smooth, off)
+            surroundings.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
             floor = np.where(touches.used > 0, np.float32(passed_s / RESETTLE_S), np.float32(passed_s / settings.tau_s))
@@ -389,7 +390,7 @@ class Baseline:
         if touches.signed:
             return np.zeros_like(live)
         low = live & (touches.smooth < -on)
-        due = self._surroundings.below(low, touches.smooth, passed_s, self._settings.recover_s)
+        due = self._surroundings.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
         if len(due) and not self._all_held:
             self._put(due, touches.smooth[due], deviation)
         return low

@@ -55,8 +55,10 @@ class Groups:
     def sum(self, values: npt.NDArray[np.generic]) -> Doubles:
         """Return (n_groups,) the sums of (n,) values."""
         if self._in_order:
-            return np.add.reduceat(values, self._starts, dtype=np.float64)
-        return np.bincount(self.group, values, self.n)
+            sums: Doubles = np.add.reduceat(values, self._starts, dtype=np.float64)
+        else:
+            sums = np.bincount(self.group, values, self.n).astype(np.float64)
+        return sums
 
     def median(self, values: Floats, counts: Flags) -> Floats:
         """Return (n_groups,) the medians of those of (n,) values that count; 0 where none does."""
@@ -222,10 +224,11 @@ class Offsets:
         np.copyto(innovation, 0, where=~taxels)
         slowly = -math.expm1(-passed_s / SLOW_S)
         expected = self.noise2 * np.float32(slowly / (2 - slowly)) + self.variance
-        drifts = self.slow * self.slow > np.float32(DRIFT_SIGMA**2) * expected
+        unlike = self.slow * self.slow / expected
+        drifts = unlike > np.float32(DRIFT_SIGMA**2)
         share = self.variance / total
         share = np.where(taxels, np.where(drifts, np.maximum(share, floor), share), np.float32(0))
-        of_gain = np.where(calm & ~drifts, self.cross / total, np.float32(0))
+        of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
         self.level += share * innovation
         self.gain += of_gain * innovation
         self.gain_variance -= of_gain * self.cross

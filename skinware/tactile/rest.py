@@ -97,7 +97,7 @@ class Rest:
         begins = measured & ~moving if refused else measured
         if not refused:
             self._clear()  # a taxel that sends later starts a new one
-        return Measured(*(array[begins] for array in found))
+        return Measured(found.taxels[begins], *(array[begins] for array in found[1:]))
 
     def _add(self, time_ns: int, values: Floats, usable: Flags, block_ns: int) -> bool:
         """Take a frame in; return whether a tenth ended, and there are ten of them."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from skinware.tactile.offsets import Groups
 from skinware.tactile.rule import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
 from skinware.tactile.touches import Touches
 
@@ -24,6 +25,7 @@ class Surroundings:
     Attributes:
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
         returned: (n,) uint8, how often each returned to where it had fallen from: touches may lower it.
+        below: (n,) bool, it is below its offset, and most of its patch is not.
         sagging: (n,) bool, it has sunk there: it comes back, and says nothing of drift.
     """
 
@@ -46,6 +48,7 @@ class Surroundings:
         self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
         self._n_held = 0
         self.busy: Flags = np.zeros(n, bool)
+        self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
     def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> Flags:
@@ -67,13 +70,19 @@ class Surroundings:
         self._n_held = int(np.count_nonzero(self.busy)) + int(np.count_nonzero(held))
         return held
 
-    def sag(self, smooth: Floats, off: Floats) -> None:
-        """Find the taxels that have sunk below their offsets since something touches their patch."""
+    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Groups) -> None:
+        """Find the taxels at rest that are below their offsets, unless most of their patch is: that is common."""
+        below = rests & (smooth < np.where(self.below, np.float32(0), np.float32(-0.5) * off))
+        if below.any():
+            common = patches.sum(below) > 0.5 * patches.sum(rests)
+            if common.any():
+                below &= ~common[self._patch]
+        self.below = below
         if self.busy.any():
+            self.sagging = below & self.busy
             self._sunk = np.where(self.busy, np.maximum(self._sunk, -smooth * self.sagging), np.float32(0))
-            self.sagging = self.busy & (smooth < np.where(self.sagging, np.float32(0), np.float32(-0.5) * off))
         elif self.sagging.any():
-            self.sagging = np.zeros_like(self.busy)
+            self.sagging = np.zeros_like(below)
 
     def _near(self, active: Rows) -> Flags:
         if self._neighbours is None:
@@ -86,7 +95,7 @@ class Surroundings:
         near[active] = True
         return near
 
-    def below(self, low: Flags, smooth: Floats, passed_s: float, after_s: float) -> Rows:
+    def recovered(self, low: Flags, smooth: Floats, passed_s: float, after_s: float) -> Rows:
         """Return the taxels that have been far below their offsets for ``after_s``, and do not sag."""
         if not low.any():
             self._below_s[:] = 0
@@ -117,7 +126,8 @@ class Surroundings:
         old_s, sunk = self._old_s[self._module[rows]], self._sunk[rows]
         returns |= (old_s > 0) & (old_s < SAG_RETURNS_S) & (sunk > 0)
         returns &= (self._sunk[rows] == 0) | (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
-        return rows[returns]
+        none: Rows = rows[returns]
+        return none
 
     def forget(self, taxels: Flags) -> None:
         """Drop what is known of some taxels."""

@@ -97,8 +97,8 @@ class Skin:
                 signal += add(time_s)
             if self.remainder:
                 signal += self._remains(truth)
-            values = self.step * np.rint((signal + self.idle) / self.step) if self.step else signal + self.idle
-            values = np.clip(values, 0 if self.step else -np.inf, self.maximum).astype(np.float32)
+            shown = self.step * np.rint((signal + self.idle) / self.step) if self.step else signal + self.idle
+            values = np.clip(shown, 0 if self.step else -np.inf, self.maximum).astype(np.float32)
             usable = self.random.random(shape) >= self.lost if self.lost else np.ones(shape, bool)
             yield (
                 time_s,
@@ -332,7 +332,10 @@ def _cup(skin: Skin) -> None:
         at = begin_s + np.array([0, 0.5, 300, 300.5])
         load, warm = np.zeros(TAXELS), np.zeros(TAXELS)
         load[12:22], warm[12:22], warm[6:12], warm[22:30] = 40, 8, 3, 3
-        skin.loads.append(lambda t, at=at, load=load: np.interp(t, at, [0, 1, 1, 0])[:, None, None] * load)
+
+        def press(t: Floats, at: Floats = at, load: Floats = load) -> Floats:
+            pressed: Floats = np.interp(t, at, [0, 1, 1, 0])[:, None, None] * load
+            return pressed
 
         def heat(t: Floats, begin_s: float = begin_s, warm: Floats = warm) -> Floats:
             up = np.where(t < begin_s, 0, 1 - np.exp(-np.maximum(np.minimum(t - begin_s, 300.0), 0) / 90))
@@ -340,6 +343,7 @@ def _cup(skin: Skin) -> None:
             got: Floats = now[:, None, None] * warm
             return got
 
+        skin.loads.append(press)
         skin.apart.append(heat)
 
 
@@ -352,7 +356,11 @@ def _humidity(skin: Skin) -> None:
 
 def _spikes(skin: Skin) -> None:
     """One frame in two hundred, on every taxel by itself."""
-    skin.apart.append(lambda t: 60.0 * (skin.random.random((len(t), skin.seeds, TAXELS)) < 0.005))
+
+    def spikes(t: Floats) -> Floats:
+        return np.where(skin.random.random((len(t), skin.seeds, TAXELS)) < 0.005, 60.0, 0.0)
+
+    skin.apart.append(spikes)
     skin.press(1, [30, 30.2, 250, 250.2], [0, 25, 25, 0])
 
 

@@ -17,13 +17,14 @@ if TYPE_CHECKING:
         DeviceTime,
         Flag,
         Identifier,
+        Match,
         Packed,
         Sentinel,
         SequenceNumber,
         StatusBytes,
     )
     from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
-    from skinware_drivers.link import Link, Match
+    from skinware_drivers.link import Link
     from skinware_drivers.operations import operation
     from skinware_drivers.options import NoOptions, Options
     from skinware_drivers.polling import Notice, Poll, Watch

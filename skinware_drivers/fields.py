@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from skinware.status import Status
-from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD, Filter
 
 _MOST_BITS = 32  # of a sequence number
 
@@ -226,3 +226,35 @@ class StatusBytes:
 
 
 AnyFlag = Flag | Sentinel | Above | StatusBytes
+
+
+class Reply(NamedTuple):
+    """A frame that answered."""
+
+    time_ns: int
+    identifier: int
+    payload: bytes
+
+
+class Match(NamedTuple):
+    """The frames that are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
+
+    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) always counts. If questions of other
+    programs begin like the answers, ``shortest`` excludes them: the least number of bytes of an answer.
+    """
+
+    value: int
+    mask: int = IDENTIFIER_MASK
+    prefix: bytes = b""
+    shortest: int = 0
+
+    @property
+    def filter(self) -> Filter:
+        """The filter that lets all frames with fitting identifiers through."""
+        return Filter(self.value, self.mask | EXTENDED_FLAG)
+
+    def fits(self, frame: Reply) -> bool:
+        """Return whether a frame is such an answer."""
+        value, mask = self.filter
+        is_from_there = frame.identifier & mask == value
+        return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest

@@ -16,7 +16,7 @@ from skinware.status import Status
 from skinware_drivers.bus import identifier_text
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.link import Match
+from skinware_drivers.fields import Match
 
 
 class Notice(enum.Enum):

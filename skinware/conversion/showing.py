@@ -273,14 +273,10 @@ class _Driver:
 
 
 class Viewers:
-    """Messages for viewers, beside the frames that they are made of.
+    """Messages for viewers, beside the frames that they are made of."""
 
-    Args:
-        rate_hz: of each driver, at most.
-    """
-
-    def __init__(self, *, json_state: bool = True, rate_hz: float = RATE_HZ) -> None:
-        self._json_state, self._period_ns = json_state, round(NS_PER_S / rate_hz)
+    def __init__(self, *, json_state: bool = True) -> None:
+        self._json_state, self._period_ns = json_state, round(NS_PER_S / RATE_HZ)
         self._drivers: dict[str, _Driver] = {}
 
     def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[ViewerMessage]:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -193,7 +194,7 @@ class Output:
 
 def outputs(table: Table) -> list[Output]:
     """Return all arrays of a table, and ``physical/TYPE``, values in its unit, for each sensor type."""
-    found = [Output(name, each, _unit(table, name), (name,), _itself(name)) for name, each in table.arrays.items()]
+    found = [Output(name, each, _unit(table, name), (name,), itemgetter(name)) for name, each in table.arrays.items()]
     structure = table.structure
     if structure is not None:
         values = COLUMNS + "values"
@@ -263,10 +264,6 @@ def _unit(table: Table, name: str) -> str:
         return "ns" if name.endswith("_ns") else ""
     column = name.removeprefix(COLUMNS)
     return table.origin.schema.columns[column].unit or ("ns" if column.endswith("_ns") else "")
-
-
-def _itself(name: str) -> Callable[[Block], npt.NDArray[Any]]:
-    return lambda block: block[name]
 
 
 def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDArray[Any]]:

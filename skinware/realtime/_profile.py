@@ -97,7 +97,8 @@ def set_cpus(cpus: Collection[int]) -> Refusal | None:
     except OSError as error:
         if error.errno not in (EINVAL, EPERM):
             raise
-    why = f"outside the CPU set of this process's container or service, which may use {_allowed_cpus()}"
+    allowed = _own_status("Cpus_allowed_list")
+    why = f"outside the CPU set of this process's container or service, which may use {allowed}"
     return Refusal(f"CPUs {cpus_as_text(cpus)}", why, "choose among these, or widen that set")
 
 
@@ -121,10 +122,6 @@ def _limits_line(limit: str) -> str:
 
 def _has_capability(number: int) -> bool:
     return bool(int(_own_status("CapEff"), 16) >> number & 1)
-
-
-def _allowed_cpus() -> str:
-    return _own_status("Cpus_allowed_list")
 
 
 def _own_status(key: str) -> str:

@@ -151,7 +151,8 @@ class Recorder:
                     if now_ns() >= report_ns:
                         report_ns = max(report_ns + _REPORT_NS, now_ns())
                         report()
-                    taken = self._bytes_waiting < _MOST_WAITING and self._collector.take()
+                    waiting = self._bytes_given - self._coder.bytes_done
+                    taken = waiting < _MOST_WAITING and self._collector.take()
                     if taken:  # take together the samples that come soon
                         time.sleep(min(_LONGEST_REST_NS, self._collector.slack_ns // 4) / NS_PER_S)
                     self._collector.wait(WAIT_SLICE_NS // 5)
@@ -184,10 +185,6 @@ class Recorder:
 
     def happened(self, event: dict[str, Any]) -> None:
         self._jobs.put(_Happened(event))
-
-    @property
-    def _bytes_waiting(self) -> int:
-        return self._bytes_given - self._coder.bytes_done
 
 
 @dataclass

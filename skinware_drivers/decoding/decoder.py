@@ -63,6 +63,20 @@ class Updates:
         """(n,) int64, the update group that stands for each."""
         return self.groups[:, 0]
 
+    def take(self, which: slice | npt.NDArray[Any]) -> Updates:
+        """Return some of the updates."""
+        return Updates(
+            self.module[which],
+            self.groups[which],
+            self.whole[which],
+            self.sensors[which],
+            self.values[which],
+            self.status[which],
+            self.oldest_ns[which],
+            self.newest_ns[which],
+            self.flagged,
+        )
+
 
 class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.

@@ -29,8 +29,8 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers import Flag, Frame, Identifier, Layout, Link, Match, Notice, Patch
+from skinware_drivers.fields import Reply
 from skinware_drivers.hand import Hand
-from skinware_drivers.link import Reply
 from skinware_drivers.serial import LRC, Field, Length, LengthTable, Packet, Refused, Split
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_modules import (

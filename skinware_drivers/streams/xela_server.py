@@ -28,10 +28,10 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.fields import DeviceTime, Identifier, Sentinel
+from skinware_drivers.fields import DeviceTime, Identifier, Match, Reply, Sentinel
 from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Frame, Layout, Values
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter

@@ -199,6 +199,7 @@ class Stage(ABC, HasOptions[OptionsT]):
     # A subclass may use these
 
     def reply(self, device: Device, frame: tuple[int, bytes], now_ns: int) -> None:
+        """Send one frame besides the data."""
         self.check_frame(frame)
         device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
@@ -243,6 +244,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.schedule(ready_ns, boot)
 
     def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
+        """Call ``action`` with the time when it has come."""
         self._scheduled.append(_Scheduled(time_ns, action))
         self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
 

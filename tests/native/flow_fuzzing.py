@@ -29,8 +29,8 @@ from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble, join_types
+from skinware_drivers.fields import Match
 from skinware_drivers.layout import Frame
-from skinware_drivers.link import Match
 from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.bus_line import BusLine

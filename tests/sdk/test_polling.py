@@ -21,9 +21,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.fields import Bits, Identifier
+from skinware_drivers.fields import Bits, Identifier, Match, Reply
 from skinware_drivers.layout import Frame, Layout, Values
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Poll, check_polls
 from skinware_drivers.running.poller import Poller

@@ -50,21 +50,6 @@ def join(parts: Sequence[Updates]) -> Updates:
     )
 
 
-def take(updates: Updates, which: slice | npt.NDArray[Any]) -> Updates:
-    """Return some of the updates."""
-    return Updates(
-        updates.module[which],
-        updates.groups[which],
-        updates.whole[which],
-        updates.sensors[which],
-        updates.values[which],
-        updates.status[which],
-        updates.oldest_ns[which],
-        updates.newest_ns[which],
-        updates.flagged,
-    )
-
-
 def slots_of(addresses: Addresses, bus: npt.NDArray[np.uint16], identifier: npt.NDArray[np.uint32]) -> Indices:
     slots: Indices = bus * np.int64(STANDARD_IDENTIFIERS) + identifier
     if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
@@ -185,9 +170,9 @@ class SpecifiedDecoder(Decoder):
         updates = join([part for part, _ in parts])
         newest_ns = updates.newest_ns
         if len(parts) > 1:
-            updates = take(updates, np.lexsort((np.concatenate([rows for _, rows in parts]), newest_ns)))
+            updates = updates.take(np.lexsort((np.concatenate([rows for _, rows in parts]), newest_ns)))
         elif (newest_ns[1:] < newest_ns[:-1]).any():
-            updates = take(updates, np.argsort(newest_ns, kind="stable"))
+            updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
 
     def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:

@@ -189,7 +189,8 @@ class _Set:
             self._sensors[name] = sensor_table(table)
         self._joined = [JoinedFeature(each) for each in joined]
         self._features: dict[str, Feature] = {}
-        for described in (*(skin.descriptions for skin in self._skins.values()), self._joined_descriptions()):
+        of_joined = {each.name: each.description for each in self._joined}
+        for described in (*(skin.descriptions for skin in self._skins.values()), of_joined):
             for name, feature in described.items():
                 if name in self._features:
                     raise ConfigurationError(f"two features are both {name!r}")
@@ -235,9 +236,6 @@ class _Set:
                 frames = readers[episode.piece.tables[name]].take(numbers)
                 batch |= skin.rows(frames, of_rows.reshape(wanted.shape), episode.times_ns[part])
             yield batch | joined_rows(self._joined, episode.joined, part)
-
-    def _joined_descriptions(self) -> dict[str, Feature]:
-        return {each.name: each.description for each in self._joined}
 
     def _write_beside(self, folder: Path) -> None:
         """Write what LeRobot's format lacks: the places of sensors, and the time of each episode."""

@@ -188,7 +188,7 @@ class JoinedFeature:
 
     def __init__(self, joined: Joined) -> None:
         self._joined, self.name = joined, joined.name
-        if joined.is_of_images:
+        if joined.rows.ndim == 1:
             width, height = _png_size(Path(joined.rows[0]))[1:]
             self.description = Feature(IMAGE, (height, width, 3), ["height", "width", "channels"])
         else:

@@ -58,10 +58,6 @@ class Joined:
         if len(backward):
             raise ConfigurationError(f"{self.path}: time goes back after row {backward[0] + 1}")
 
-    @property
-    def is_of_images(self) -> bool:
-        return bool(self.rows.ndim == 1)
-
     def times_ns(self, source: TableSource, *, is_only: bool) -> npt.NDArray[np.int64]:
         """Return the time of each row, (m,) ns since 1970, on the axis of the recording.
 

@@ -22,7 +22,8 @@ from skinware.geometry import Geometry
 from skinware.structure import Structure
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
-from skinware.tactile.tracking import ContactKind, TouchedBlobs, Tracker, TrackingSettings
+from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
+from skinware.tactile.tracks import TouchedBlobs
 
 MOST = 64
 """Most contacts of one frame; of more, those with the largest loads are kept."""
@@ -268,7 +269,9 @@ class Contacts:
         blobs = TouchedBlobs(
             taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"], is_sure, frames
         )
-        cut = np.zeros(count) if clipped is None else np.bincount(contact, clipped[taxels], count)
+        cut = np.zeros(count)
+        if clipped is not None:
+            cut += np.bincount(contact, clipped[taxels], count)
         unsure = np.full(count, np.nan) if uncertainty is None else np.bincount(contact, uncertainty[taxels], count)
         found |= {"clipped": cut, "uncertainty": unsure, "load_whole": self._whole(found, cut, load)}
         found |= self._tracker.follow(blobs, time_ns)._asdict()
@@ -322,6 +325,8 @@ class Contacts:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             seen = 1 - self._least / peak
             whole = np.where(seen >= _LEAST_SEEN, found["load"] / seen, np.nan)
+            if not cut.any():
+                return whole
             top = (peak / self._least**share) ** (1 / (1 - share))
             of_cut = found["n"] * top / np.log(top / self._least)
         return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)

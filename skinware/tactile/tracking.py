@@ -15,6 +15,7 @@ from skinware.tactile.tracks import (
     TRACK,
     Flags,
     Floats,
+    TouchedBlobs,
     Tracks,
     Whole,
     correct,
@@ -93,32 +94,6 @@ class TrackingSettings:
     steady: float = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class TouchedBlobs:
-    """The m blobs of touched taxels of a frame.
-
-    Attributes:
-        taxels: (a,) int64, the taxels of all of them.
-        blob: (a,) int64, the blob of each.
-        value: (a,) the value of each.
-        load, peak: (m,) sum and maximum of the values of each blob.
-        frame: (m,) int64, number of its coordinate frame, -1 for none.
-        cop_m: (m, 3) m, its centre; NaN if it is not known.
-        is_sure: (m,) bool, whether any of its taxels is touched for sure.
-        frames: (m,) int64, how many frames speak for it: 2 where :class:`.Onsets` found a taxel.
-    """
-
-    taxels: Whole
-    blob: Whole
-    value: Floats
-    load: Floats
-    peak: Floats
-    frame: Whole
-    cop_m: Floats
-    is_sure: Flags
-    frames: Whole
-
-
 class Tracked(NamedTuple):
     """The history of the m blobs of a frame.
 
@@ -175,10 +150,7 @@ class Tracker:
             return _NOTHING
         expected = expected_at(before, time_ns)
         overlap = self._overlap(blobs, size)
-        home = np.full(len(before), -1)
-        known, found = assign(self._gains(overlap, expected, blobs))
-        home[known] = found
-        self._join(home, overlap, expected, blobs, size)
+        home = self._homes(overlap, expected, blobs, size)
         self._meetings.begin(before, expected["place"], time_ns)
         is_joined = overlap >= 0.5
         expected["jumps"] = is_joined.sum(axis=1) > 1
@@ -216,18 +188,30 @@ class Tracker:
         overlap: Floats = shared / np.maximum(np.minimum(tracks["size"][:, None], size), 1)
         return overlap
 
-    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs) -> Gains:
+    def _homes(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
+        """(tracks,) the blob of each; -1: it has gone."""
+        tracks, touching = self._tracks, overlap > 0
+        way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
+        by_place = (way_m > self._pitch_m) | tracks["shared"]
+        if not by_place.any() and (touching.sum(axis=1) == 1).all() and (touching.sum(axis=0) == 1).all():
+            only: Whole = touching.argmax(axis=1)
+            return only  # nothing begins, ends or merges
+        home = np.full(len(tracks), -1)
+        known, found = assign(self._gains(overlap, expected, blobs, way_m, by_place))
+        home[known] = found
+        self._join(home, overlap, expected, blobs, size)
+        return home
+
+    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Gains:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m
         squares = np.einsum("ijk,ijk->ij", away, away)
-        way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
         reach_m = _DOUBT * without_nan(way_m) + _REACH_PITCHES * self._pitch_m
         if len(tracks) <= _MOST_FAST:
             reach_m = np.fmax(reach_m, _DOUBT * way_m + _GATE * np.sqrt(expected["spread"][:, 0]))
         misses = squares / (reach_m**2)[:, None]
         is_near = (misses <= 1) & (tracks["frame"][:, None] == blobs.frame)
-        by_place = (way_m > self._pitch_m) | tracks["shared"]
         is_sharing = (overlap > 0) & ~(by_place & is_near.any(axis=1))[:, None]
         is_rest = blobs.load < _REST * tracks["load"][:, None]
         sharing = np.where(is_rest, _LEFT, np.where(overlap >= 0.5, _STRONG, _WEAK)) + _CLOSENESS * overlap
@@ -333,7 +317,7 @@ class Tracker:
         """Update what is smoothed, and the kinds."""
         settings, pitch_m = self._settings, self._pitch_m
         here = np.flatnonzero(tracks["home"] >= 0)
-        now = tracks[here]
+        now = tracks if len(here) == len(tracks) else tracks[here]
         passed_s = np.zeros(len(here))
         known = here < len(before)
         passed_s[known] = np.maximum(time_ns - before["seen_ns"][here[known]], 0) / NS_PER_S
@@ -351,7 +335,8 @@ class Tracker:
         is_sliding = is_steady & (np.linalg.norm(now["motion"], axis=1) >= slowest)
         is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
         now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
-        tracks[here] = now
+        if now is not tracks:
+            tracks[here] = now
 
     def _keep(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> None:
         """Remember this frame, and the tracks whose contacts are gone."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -52,6 +54,32 @@ TRACK = np.dtype(
 )
 
 
+@dataclass(frozen=True, eq=False)
+class TouchedBlobs:
+    """The m blobs of touched taxels of a frame.
+
+    Attributes:
+        taxels: (a,) int64, the taxels of all of them.
+        blob: (a,) int64, the blob of each.
+        value: (a,) the value of each.
+        load, peak: (m,) sum and maximum of the values of each blob.
+        frame: (m,) int64, number of its coordinate frame, -1 for none.
+        cop_m: (m, 3) m, its centre; NaN if it is not known.
+        is_sure: (m,) bool, whether any of its taxels is touched for sure.
+        frames: (m,) int64, how many frames speak for it: 2 where :class:`.Onsets` found a taxel.
+    """
+
+    taxels: Whole
+    blob: Whole
+    value: Floats
+    load: Floats
+    peak: Floats
+    frame: Whole
+    cop_m: Floats
+    is_sure: Flags
+    frames: Whole
+
+
 def is_shared(home: Whole) -> Flags:
     """(tracks,) which of them share their blob with others."""
     count = np.bincount(home + 1, minlength=1)
@@ -81,7 +109,7 @@ def without_nan(numbers: Floats) -> Floats:
 
 def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
     """Take in where tracks were found, instead of where they were expected."""
-    now = tracks[rows]
+    now = tracks if len(rows) == len(tracks) else tracks[rows]
     passed_s = np.maximum((time_ns - now["seen_ns"]) / NS_PER_S, _SHORTEST_S)
     miss = now["found"] - now["place"]
     variance, both, pace = now["spread"].T
@@ -96,4 +124,5 @@ def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
     now["pace"] += pull[:, None] * without_nan(miss)
     pace += surprise / passed_s**2 - pull * both  # what changed once changes again
     now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
-    tracks[rows] = now
+    if now is not tracks:
+        tracks[rows] = now

@@ -25,7 +25,7 @@ YES = np.ones(1, bool)
 
 def onsets_of(above: list[float], noise: float = 0.8) -> list[bool]:
     onsets = Onsets(1, 1.0)
-    return [bool(onsets.update(np.float32([one]), np.float32([noise]), YES)[0]) for one in above]
+    return [bool(onsets.update(np.full(1, one, np.float32), np.full(1, noise, np.float32), YES)[0]) for one in above]
 
 
 def test_two_of_three_frames_are_an_onset() -> None:
@@ -56,9 +56,9 @@ class TouchedSkin:
 
     def step(self, load: float) -> list[ContactEvent]:
         self._time_ns += self._period_ns
-        values: npt.NDArray[np.float64] = 15 + 0.8 * self._random.standard_normal(120)
-        values[PRESSED] += load
-        values = np.round(values).astype(np.float32)
+        pressed: npt.NDArray[np.float64] = 15 + 0.8 * self._random.standard_normal(120)
+        pressed[PRESSED] += load
+        values: npt.NDArray[np.float32] = np.round(pressed).astype(np.float32)
         calm = self._baseline.update(self._time_ns, values)
         onset = self._onsets.update(values - calm.baseline, calm.noise, calm.usable)
         found = self._contacts.update(calm.value, calm.touched, self._time_ns, onset=onset)

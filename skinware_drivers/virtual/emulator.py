@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
+from skinware_drivers.virtual.device import DATA, Actor, Device
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.stage import DATA, Actor, Device, OptionsT, Stage
+from skinware_drivers.virtual.stage import OptionsT, Stage
 
 CanFrame = tuple[int, bytes]
 """Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""

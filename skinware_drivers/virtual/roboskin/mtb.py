@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
+from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
 from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, MTB4_UNITS, Units
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET
-from skinware_drivers.virtual.stage import DATA as BURSTS
 
 _MTB3_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}
 _MTB4_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x33: 8, 0x35: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}

@@ -14,6 +14,8 @@ import numpy as np
 
 from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.virtual.device import DATA as BURSTS
+from skinware_drivers.virtual.device import Actor, Device
 from skinware_drivers.virtual.events import Event, FrameDamage, Half
 from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
@@ -22,8 +24,7 @@ from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import PressedSkin, WireSource, cycle_pattern
-from skinware_drivers.virtual.stage import DATA as BURSTS
-from skinware_drivers.virtual.stage import Actor, Device, Stage
+from skinware_drivers.virtual.stage import Stage
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))
 """Set-up by a host: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""

@@ -304,7 +304,7 @@ class Baseline:
             self._measure(time_ns, usable, passed_s)
         live = usable & self._ready
         deviation = np.where(live, intake.last - offsets.level - touches.remains, np.float32(0))
-        free = live & ~touches.touched & touches.has_settled
+        free = live & ~touches.touched & touches.has_settled & ~self._at_end()
         spread = np.sqrt(offsets.noise2)
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
@@ -325,7 +325,7 @@ class Baseline:
         if not self._all_held:
             floor = np.where(touches.used > 0, np.float32(passed_s / RESETTLE_S), np.float32(passed_s / settings.tau_s))
             learns = live & ~touches.touched & ~surroundings.sagging & touches.has_settled
-            learns &= touches.load(deviation) < on  # a touch that begins is no drift
+            learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
             calm = learns & (np.abs(touches.smooth) < np.float32(0.5) * off)
             offsets.learn(deviation, learns, calm, np.minimum(floor, np.float32(0.5)), passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
@@ -338,6 +338,15 @@ class Baseline:
         if given is not None:
             return given
         return self._resolution * (0.5 if self._intake.few_levels else STEPS_OF_A_TOUCH)
+
+    def _at_end(self) -> Flags | np.bool_:
+        """Return (n,) which taxels are at an end of their range: they show no drift and no more load."""
+        least, most = self._limits
+        if not math.isfinite(most - least):
+            return np.False_
+        last = self._intake.last
+        at_end: Flags = (last >= most) | (last <= least)
+        return at_end
 
     def _least_noise2(self, level: Floats) -> Floats:
         rounding = self._resolution * (0.05 if self._intake.few_levels else 1 / math.sqrt(12))
@@ -404,7 +413,7 @@ class Baseline:
         self._forced[taxels] = True
 
     def _calm(self, deviation: Floats, live: Flags, held: Flags, low: Flags, off: Floats) -> Calm:
-        offsets, touches, last = self._offsets, self._touches, self._intake.last
+        offsets, touches = self._offsets, self._touches
         known = np.where(live, deviation, touches.smooth)
         touched = touches.shown(known, off)
         value = np.where(touched, known if touches.signed else np.maximum(known, 0), np.float32(0))
@@ -412,9 +421,7 @@ class Baseline:
         why[~self._ready | (offsets.variance > offsets.noise2) & ~touches.touched] = Why.RELEARNING
         why[low] = Why.COVERED
         why[self._surroundings.returned > 0] = Why.DOUBTED
-        least, most = self._limits
-        if math.isfinite(least) and math.isfinite(most):
-            why[live & ((last >= most) | (last <= least)) & touches.touched] = Why.SATURATED
+        why[touches.touched & self._at_end()] = Why.SATURATED
         if self._intake.few_levels:
             why[live] = Why.NO_RESOLUTION
         forced, self._forced = self._forced, np.zeros(len(live), bool)

@@ -150,12 +150,6 @@ class Wakeups:
 _of_process = Wakeups()
 
 
-def wakeups() -> Wakeups:
-    """Return the wake-ups of this process, in use from now on until ``leave``."""
-    _of_process.enter()
-    return _of_process
-
-
 def _start_again() -> None:
     global _of_process
     _of_process = Wakeups()
@@ -170,7 +164,8 @@ class _Awaited:
     sync: ServiceReader[Any] | skinware.skin.Skin
 
     def __init__(self) -> None:
-        self._wakeups = wakeups()
+        _of_process.enter()
+        self._wakeups = _of_process
         self._closed = False
 
     def close(self) -> None:

@@ -38,9 +38,9 @@ _ROW = np.dtype(
         ("state", "u1"),
         ("mode", "u1"),
         ("reserved", "u1", (6,)),
-        ("lost", "<u8"),
+        ("gap", "<u8"),
         ("rate_hz", "<f8"),
-        ("lost_hz", "<f8"),
+        ("gap_hz", "<f8"),
         ("bytes_per_s", "<f8"),
         ("age_p50_ns", "<f8"),
         ("age_p99_ns", "<f8"),
@@ -70,9 +70,9 @@ class ServiceState:
     Attributes:
         state: one of ``STATES``.
         mode: one of ``MODES``.
-        rate_hz, lost_hz: samples of the last second that were published here, and that the robot published and that did
+        rate_hz, gap_hz: samples of the last second that were published here, and that the robot published and that did
             not come.
-        lost: samples that the robot published and that did not come, since the first one.
+        gap: samples that the robot published and that did not come, since the first one.
         bytes_per_s: of messages, in the last second.
         age_p50_ns, age_p99_ns: from the publication there to the one here, in the last second; None: there was none.
     """
@@ -80,11 +80,11 @@ class ServiceState:
     state: str
     mode: str
     rate_hz: float = 0.0
-    lost: int = 0
+    gap: int = 0
     bytes_per_s: float = 0.0
     age_p50_ns: float | None = None
     age_p99_ns: float | None = None
-    lost_hz: float = 0.0
+    gap_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -224,8 +224,8 @@ class BridgeStateWriter:
 def _row_of(name: str, service: ServiceState) -> tuple[Any, ...]:
     ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
     state, mode = STATES.index(service.state), MODES.index(service.mode)
-    rates = service.rate_hz, service.lost_hz, service.bytes_per_s
-    return name.encode(), state, mode, 0, service.lost, *rates, *ages
+    rates = service.rate_hz, service.gap_hz, service.bytes_per_s
+    return name.encode(), state, mode, 0, service.gap, *rates, *ages
 
 
 def _state_of(row: npt.NDArray[Any]) -> ServiceState:
@@ -235,11 +235,11 @@ def _state_of(row: npt.NDArray[Any]) -> ServiceState:
         STATES[state] if state < len(STATES) else STATES[0],
         MODES[mode] if mode < len(MODES) else MODES[0],
         float(row["rate_hz"]),
-        int(row["lost"]),
+        int(row["gap"]),
         float(row["bytes_per_s"]),
         p50_ns,
         p99_ns,
-        float(row["lost_hz"]),
+        float(row["gap_hz"]),
     )
 
 

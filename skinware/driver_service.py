@@ -38,6 +38,7 @@ class DriverWriter(Writer):
         driver_type: name of the driver's class (``roboskin``), for people.
         bus_counters: names of the counters that every bus has.
         patch_counters: names of the counters that every patch has.
+        sensor_columns: more columns with an entry per sensor: their dtypes by name.
         namespace, slots, rate_hz, group, operations: as for :class:`skinware.service.ServiceWriter`, which also lists
             the errors.
     """
@@ -50,6 +51,7 @@ class DriverWriter(Writer):
         driver_type: str = "",
         bus_counters: Sequence[str] = (),
         patch_counters: Sequence[str] = (),
+        sensor_columns: Mapping[str, npt.DTypeLike] | None = None,
         namespace: Namespace | str | None = None,
         slots: int | None = None,
         rate_hz: float | None = None,
@@ -58,6 +60,7 @@ class DriverWriter(Writer):
     ) -> None:
         self.structure: Structure = structure
         self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
+        self._sensor_columns = dict(sensor_columns or {})
         super().__init__(
             name,
             namespace,
@@ -86,7 +89,8 @@ class DriverWriter(Writer):
 
     def _schema_of(self, structure: Structure) -> Schema:
         _, bus_counters, patch_counters = self._names
-        return Schema.of(_frame_columns(structure, len(bus_counters), len(patch_counters)), "")
+        columns = _frame_columns(structure, len(bus_counters), len(patch_counters))
+        return Schema.of(columns | {name: (of, structure.n_sensors) for name, of in self._sensor_columns.items()}, "")
 
     def _tables_of(self, structure: Structure) -> dict[str, npt.NDArray[Any]]:
         driver_type, bus_counters, patch_counters = self._names

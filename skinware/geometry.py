@@ -98,7 +98,7 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"normal {row} has the length {length[row]:.3g}, not 1")
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _GeometryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
     group: tuple[GeometryGroup, ...] = ()
@@ -256,7 +256,7 @@ def geometry_of(text: TomlText) -> Geometry:
     Raises:
         ConfigurationError: as for :func:`read_geometry`.
     """
-    return _joined(text.of_format("geometry file", FORMAT, VERSION, _File).group, text.place)
+    return _joined(text.of_format("geometry file", FORMAT, VERSION, _GeometryFile).group, text.place)
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:

@@ -94,18 +94,17 @@ def read_json(data: bytes | memoryview, type_: Any = Any, *, limits: Limits = LI
         raise ValueError(str(error)) from None
 
 
-def unpack(data: bytes | memoryview, most: int, *, window_bits: int = zlib.MAX_WBITS) -> bytes:
+def unpack(data: bytes | memoryview, most: int) -> bytes:
     """Decompress DEFLATE data that others packed.
 
     Args:
-        data: with zlib's header; raw if ``window_bits`` is negative.
+        data: with zlib's header.
         most: bytes that it may become.
-        window_bits: as for :func:`zlib.decompress`.
 
     Raises:
         ValueError: it cannot be decompressed, is incomplete, or becomes larger.
     """
-    unpacker = zlib.decompressobj(window_bits)
+    unpacker = zlib.decompressobj()
     try:
         unpacked = unpacker.decompress(data, most + 1)
     except zlib.error as error:

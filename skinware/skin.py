@@ -29,7 +29,7 @@ DriverCallback = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
 
 
-class _Reader(Tap[DriverSnapshot], DriverReader):
+class _SkinReader(Tap[DriverSnapshot], DriverReader):
     """A reader of one driver of a skin."""
 
 
@@ -72,7 +72,7 @@ class Skin:
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._drivers = Drivers(
             self.namespace,
-            _Reader,
+            _SkinReader,
             drivers,
             wants=lambda reader: types is None or any(one.name in types for one in reader.structure.types),
             only_living=True,
@@ -300,7 +300,7 @@ class Skin:
         return f"<Skin of namespace {self.namespace.name!r}: {', '.join(self._drivers.readers) or 'no driver'}>"
 
 
-def _nearest(readers: list[_Reader]) -> tuple[DriverSnapshot, ...]:
+def _nearest(readers: list[_SkinReader]) -> tuple[DriverSnapshot, ...]:
     newest_ns = [reader.newest_acquired_ns() for reader in readers]
     time_ns = now_ns()
     reached_ns = [
@@ -312,7 +312,7 @@ def _nearest(readers: list[_Reader]) -> tuple[DriverSnapshot, ...]:
     return tuple(reader.nearest(moment_ns) for reader in readers)
 
 
-def _has_newer(readers: list[_Reader], known: Snapshot) -> bool:
+def _has_newer(readers: list[_SkinReader], known: Snapshot) -> bool:
     return any(reader.latest != frame.position for reader, frame in zip(readers, known.frames, strict=True))
 
 

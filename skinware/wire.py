@@ -44,9 +44,14 @@ IS_FD = 0x04
 IS_CUT = 0x80
 """Flag of a frame that is longer than any that its driver knows: ``length`` is that of the part that is there."""
 
-COLUMNS: dict[str, Any] = {"bus": ("<u2", ()), "used": ("<u4", ()), "lost": ("<u8", ()), "pieces": ("u1", BATCH_BYTES)}
-"""Columns of such a service. ``used``: bytes of the pieces; ``lost``: frames or bytes of the bus for which there was no
-room so far. Static columns: ``driver``, its name, ``bus_name``, the names of its buses, and ``about``, JSON: the
+COLUMNS: dict[str, Any] = {
+    "bus": ("<u2", ()),
+    "used": ("<u4", ()),
+    "missed": ("<u8", ()),
+    "pieces": ("u1", BATCH_BYTES),
+}
+"""Columns of such a service. ``used``: bytes of the pieces; ``missed``: frames or bytes of the bus for which there was
+no room so far. Static columns: ``driver``, its name, ``bus_name``, the names of its buses, and ``about``, JSON: the
 driver and its options (``driver_type``, ``listen_only``, ``versions``; ``buses`` with ``medium`` and ``options``)."""
 
 

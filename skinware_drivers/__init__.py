@@ -8,26 +8,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skinware_drivers.bus import EXTENDED_FLAG
-    from skinware_drivers.decoding.skin_state import Updates
+    from skinware_drivers.decoding.decoder import Updates
     from skinware_drivers.description import Module, Patch, Sensor, taxels
-    from skinware_drivers.layout import (
+    from skinware_drivers.fields import (
         Above,
         Bits,
         Byte,
-        Cycle,
         DeviceTime,
-        Expand,
         Flag,
-        Frame,
         Identifier,
-        Layout,
+        Match,
         Packed,
         Sentinel,
         SequenceNumber,
         StatusBytes,
-        Values,
     )
-    from skinware_drivers.link import Link, Match
+    from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
+    from skinware_drivers.link import Link
     from skinware_drivers.operations import operation
     from skinware_drivers.options import NoOptions, Options
     from skinware_drivers.polling import Notice, Poll, Watch
@@ -65,7 +62,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("layout", "bus", "description", "link", "operations", "options", "polling")
+_MODULES = ("fields", "layout", "bus", "description", "link", "operations", "options", "polling")
 
 
 def get_include() -> str:

@@ -187,7 +187,7 @@ class Bus(ABC):
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
         fullest: largest share of the receive buffer in use after a ``receive``, since it was last set to 0.
 
-    Frames of one bus arrive in order. ``counters.lost`` counts frames that were lost. A bus that goes down or away
+    Frames of one bus arrive in order. ``counters.dropped`` counts frames that were lost. A bus that goes down or away
     raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once; its owner then closes it and opens it again,
     indefinitely, with growing pauses.
 

@@ -42,7 +42,7 @@ class BusCounters:
 
     frames: int = 0
     """Frames received."""
-    lost: int = 0
+    dropped: int = 0
     """Frames that the kernel (or the interface's queue) dropped before we could read them."""
     errors: int = 0
     """CAN error frames and similar."""

@@ -24,6 +24,10 @@ Floats = npt.NDArray[np.floating[Any]]
 
 _PART_NS = NS_PER_S
 """One point is kept for each part of the window of this length: the one with the least delay."""
+_WINDOW_PARTS = 60
+"""A shorter window follows changes of temperature faster, a longer one is steadier."""
+_MOST_DRIFT = 500e-6
+"""Largest rate error of a device's clock, as a fraction."""
 _RECENT_PARTS = 10
 """The offset is the least delay of the last parts in which frames came, so that delayed frames are known as late, also
 after a pause."""
@@ -49,9 +53,6 @@ class DeviceClock:
     Args:
         unit_s: seconds per count.
         modulo: the stamps wrap to 0 here.
-        window_s: how much of the past counts: a shorter one follows changes of temperature faster, a longer one is
-            steadier.
-        maximum_drift: largest rate error of the device's clock, as a fraction.
 
     Attributes:
         restarts: how often the device's clock restarted.
@@ -59,14 +60,10 @@ class DeviceClock:
         repeated: stamps equal to the one before.
     """
 
-    def __init__(
-        self, unit_s: float, modulo: int = 1 << 32, *, window_s: float = 60.0, maximum_drift: float = 500e-6
-    ) -> None:
+    def __init__(self, unit_s: float, modulo: int = 1 << 32) -> None:
         self._unit_ns = unit_s * NS_PER_S
         self._modulo = modulo
-        self._maximum_drift = maximum_drift
-        self._window_parts = max(3, round(window_s * NS_PER_S / _PART_NS))
-        self._points: deque[tuple[int, float, float]] = deque(maxlen=self._window_parts)
+        self._points: deque[tuple[int, float, float]] = deque(maxlen=_WINDOW_PARTS)
         self._origin_ns = 0
         self._ticks = 0
         self._stamp = -1
@@ -171,7 +168,7 @@ class DeviceClock:
                 self._fit_slope()
             elif above[best] < self._points[-1][2] - self._slope * self._points[-1][1]:
                 self._points[-1] = point
-        oldest = self._points[-1][0] - self._window_parts
+        oldest = self._points[-1][0] - _WINDOW_PARTS
         recent = [point for point in list(self._points)[-_RECENT_PARTS:] if point[0] > oldest]
         self._offset_ns = min(y - self._slope * x for _, x, y in recent)
 
@@ -191,4 +188,4 @@ class DeviceClock:
         right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
-        self._slope = min(max(slope, -self._maximum_drift), self._maximum_drift)
+        self._slope = min(max(slope, -_MOST_DRIFT), _MOST_DRIFT)

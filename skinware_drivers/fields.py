@@ -1,13 +1,15 @@
-"""Fields of frames: conditions that recognize kinds, keys of patches and modules, numbers that devices count up."""
+"""Fields of frames: conditions that recognize kinds, keys of patches and modules, numbers that devices count, flags."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD
+from skinware.status import Status
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD, Filter
 
 _MOST_BITS = 32  # of a sequence number
 
@@ -152,3 +154,107 @@ class DeviceTime:
     def turn(self) -> int:
         """Counts until it is 0 again."""
         return self.modulo or 1 << 8 * np.dtype(self.dtype).itemsize
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A value of any number of bits, packed without gaps.
+
+    Attributes:
+        bits: bits of a value, 1 to 32.
+        order: ``big``: the first value begins at the highest bit of the first byte; ``little``: at its lowest.
+        signed: two's complement.
+        skip: bits of the first byte that come before the first value, 0 to 7.
+    """
+
+    bits: int
+    order: Literal["big", "little"] = "big"
+    signed: bool = False
+    skip: int = 0
+
+
+@dataclass(frozen=True)
+class Flag:
+    """Bits of a payload that set a status bit.
+
+    The word of ``dtype`` at ``offset`` is read; a frame that ends before it sets no flag.
+
+    Attributes:
+        status: the bit to set.
+        offset: first byte of the word.
+        dtype: unsigned numpy dtype with byte order (``">u2"``).
+        mask: any of these bits set the status of the whole module. 0: none does.
+        each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
+        normal: the word that sets no flag: bits count as set where they differ from it.
+    """
+
+    status: Status
+    offset: int
+    dtype: str
+    mask: int = 0
+    each: Sequence[tuple[int, int]] = ()
+    normal: int = 0
+
+
+@dataclass(frozen=True)
+class Sentinel:
+    """A value that means "no value": each value equal to it (or NaN, if it is NaN) sets a status bit of its sensor."""
+
+    status: Status
+    value: float
+
+
+@dataclass(frozen=True)
+class Above:
+    """A limit that no true value exceeds: each value greater than it sets a status bit of its sensor."""
+
+    status: Status
+    limit: float
+
+
+@dataclass(frozen=True)
+class StatusBytes:
+    """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
+
+    Attributes:
+        offset: first byte.
+        mask: bits of each that are status bits.
+    """
+
+    offset: int
+    mask: Status
+
+
+AnyFlag = Flag | Sentinel | Above | StatusBytes
+
+
+class Reply(NamedTuple):
+    """A frame that answered."""
+
+    time_ns: int
+    identifier: int
+    payload: bytes
+
+
+class Match(NamedTuple):
+    """The frames that are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
+
+    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) always counts. If questions of other
+    programs begin like the answers, ``shortest`` excludes them: the least number of bytes of an answer.
+    """
+
+    value: int
+    mask: int = IDENTIFIER_MASK
+    prefix: bytes = b""
+    shortest: int = 0
+
+    @property
+    def filter(self) -> Filter:
+        """The filter that lets all frames with fitting identifiers through."""
+        return Filter(self.value, self.mask | EXTENDED_FLAG)
+
+    def fits(self, frame: Reply) -> bool:
+        """Return whether a frame is such an answer."""
+        value, mask = self.filter
+        is_from_there = frame.identifier & mask == value
+        return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest

@@ -15,9 +15,19 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.status import LONGEST_PERIOD_S, Status
+from skinware.status import LONGEST_PERIOD_S
 from skinware_drivers.bus import check_identifier
-from skinware_drivers.fields import Bits, Byte, Condition, DeviceTime, Identifier, SequenceNumber
+from skinware_drivers.fields import (
+    AnyFlag,
+    Bits,
+    Byte,
+    Condition,
+    DeviceTime,
+    Flag,
+    Identifier,
+    Packed,
+    SequenceNumber,
+)
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can have, over all its buses."""
@@ -25,23 +35,6 @@ MOST_MEMBERS, MOST_IN_ANY_ORDER = 128, 32
 """Frames that a cycle can have: in a given order, and in any other."""
 _KEY_BITS = 29
 _FEWEST_COUNTS = 4
-
-
-@dataclass(frozen=True)
-class Packed:
-    """A value of any number of bits, packed without gaps.
-
-    Attributes:
-        bits: bits of a value, 1 to 32.
-        order: ``big``: the first value begins at the highest bit of the first byte; ``little``: at its lowest.
-        signed: two's complement.
-        skip: bits of the first byte that come before the first value, 0 to 7.
-    """
-
-    bits: int
-    order: Literal["big", "little"] = "big"
-    signed: bool = False
-    skip: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,61 +64,6 @@ class Values:
         if isinstance(self.dtype, Packed):
             return self.offset + -(-(self.dtype.skip + self.count * self.dtype.bits) // 8)
         return self.offset + self.count * np.dtype(self.dtype).itemsize
-
-
-@dataclass(frozen=True)
-class Flag:
-    """Bits of a payload that set a status bit.
-
-    The word of ``dtype`` at ``offset`` is read; a frame that ends before it sets no flag.
-
-    Attributes:
-        status: the bit to set.
-        offset: first byte of the word.
-        dtype: unsigned numpy dtype with byte order (``">u2"``).
-        mask: any of these bits set the status of the whole module. 0: none does.
-        each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
-        normal: the word that sets no flag: bits count as set where they differ from it.
-    """
-
-    status: Status
-    offset: int
-    dtype: str
-    mask: int = 0
-    each: Sequence[tuple[int, int]] = ()
-    normal: int = 0
-
-
-@dataclass(frozen=True)
-class Sentinel:
-    """A value that means "no value": each value equal to it (or NaN, if it is NaN) sets a status bit of its sensor."""
-
-    status: Status
-    value: float
-
-
-@dataclass(frozen=True)
-class Above:
-    """A limit that no true value exceeds: each value greater than it sets a status bit of its sensor."""
-
-    status: Status
-    limit: float
-
-
-@dataclass(frozen=True)
-class StatusBytes:
-    """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
-
-    Attributes:
-        offset: first byte.
-        mask: bits of each that are status bits.
-    """
-
-    offset: int
-    mask: Status
-
-
-AnyFlag = Flag | Sentinel | Above | StatusBytes
 
 
 @dataclass(frozen=True)
@@ -391,25 +329,3 @@ def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:
         raise ConfigurationError(
             f"the counter of a cycle has {cycle.turn} values: two lost cycles look like none; it needs {_FEWEST_COUNTS}"
         )
-
-
-__all__ = [
-    "MOST_FRAMES",
-    "Above",
-    "AnyFlag",
-    "Bits",
-    "Byte",
-    "Condition",
-    "Cycle",
-    "DeviceTime",
-    "Expand",
-    "Flag",
-    "Frame",
-    "Identifier",
-    "Layout",
-    "Packed",
-    "Sentinel",
-    "SequenceNumber",
-    "StatusBytes",
-    "Values",
-]

@@ -9,7 +9,8 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.layout import Cycle, Frame, Layout, Packed, Values
+from skinware_drivers.fields import Packed
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.native.compiling import check_values
 
 _DTYPES = ("u1", "i2", "u2", "i4", "f4")

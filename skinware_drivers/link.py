@@ -15,8 +15,6 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import (
-    EXTENDED_FLAG,
-    IDENTIFIER_MASK,
     REMOTE_FLAG,
     Bus,
     Filter,
@@ -25,6 +23,7 @@ from skinware_drivers.bus import (
     identifier_text,
 )
 from skinware_drivers.decoding.addresses import fewest, filters_of
+from skinware_drivers.fields import Match, Reply
 from skinware_drivers.layout import Layout
 
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05
@@ -34,38 +33,6 @@ DEFAULT_PACE_PER_MS = 4.0
 """Half of the frames that a CAN bus of 1 Mbit/s can carry; the devices' own frames need the other half."""
 AT_ONCE = 8
 """Frames that may be sent without a pause if none was sent for a while; reception waits for these at most."""
-
-
-class Reply(NamedTuple):
-    """A frame that answered."""
-
-    time_ns: int
-    identifier: int
-    payload: bytes
-
-
-class Match(NamedTuple):
-    """The frames that are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
-
-    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) always counts. If questions of other
-    programs begin like the answers, ``shortest`` excludes them: the least number of bytes of an answer.
-    """
-
-    value: int
-    mask: int = IDENTIFIER_MASK
-    prefix: bytes = b""
-    shortest: int = 0
-
-    @property
-    def filter(self) -> Filter:
-        """The filter that lets all frames with fitting identifiers through."""
-        return Filter(self.value, self.mask | EXTENDED_FLAG)
-
-    def fits(self, frame: Reply) -> bool:
-        """Return whether a frame is such an answer."""
-        value, mask = self.filter
-        is_from_there = frame.identifier & mask == value
-        return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest
 
 
 class _Overdue(NamedTuple):

@@ -24,7 +24,7 @@ _OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__f
 _PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first
 
 
-class Kind(NamedTuple):
+class ClassKind(NamedTuple):
     """A kind of class that can be loaded.
 
     Attributes:
@@ -42,7 +42,7 @@ class Kind(NamedTuple):
     instead: str = ""
 
 
-def load(kind: Kind, name: str) -> type[Any]:
+def load(kind: ClassKind, name: str) -> type[Any]:
     """Return the class of a name.
 
     A file's folder is put behind all others in which Python looks for modules: the file can import modules beside it,
@@ -87,7 +87,7 @@ def short_name(name: str) -> str:
     return os.path.basename(name).removesuffix(SOURCE_SUFFIX) if is_file(name) else name
 
 
-def _class_in(name: str, kind: Kind) -> type[Any]:
+def _class_in(name: str, kind: ClassKind) -> type[Any]:
     module = _module_of(name, kind)
     classes = dict.fromkeys(thing for thing in vars(module).values() if isinstance(thing, type))
     found = [one for one in classes if one.__module__ == module.__name__ and kind.fits(one)]
@@ -105,7 +105,7 @@ def _class_in(name: str, kind: Kind) -> type[Any]:
     return found[0]
 
 
-def _module_of(name: str, kind: Kind) -> ModuleType:
+def _module_of(name: str, kind: ClassKind) -> ModuleType:
     """Return the module in a file; it has the name by which modules beside it import it, and is imported once."""
     path = os.path.abspath(name)
     if not os.path.isfile(path):

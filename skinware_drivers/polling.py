@@ -14,9 +14,9 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers.bus import identifier_text
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.link import Match
+from skinware_drivers.fields import Match
 
 
 class Notice(enum.Enum):

@@ -9,14 +9,14 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import CHOOSE, Bus, chosen_by
 from skinware_drivers.bus_names import BusName, parse_bus_name
-from skinware_drivers.loading import Kind, load, registered
+from skinware_drivers.loading import ClassKind, load, registered
 from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
 DEFAULT_DRIVER = "roboskin"
 
-_DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
+_DRIVER = ClassKind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
 class NamedBus:

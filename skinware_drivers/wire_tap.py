@@ -36,7 +36,7 @@ class Kept(ctypes.Structure):
         ("bytes", ctypes.c_void_p),
         ("room", ctypes.c_int64),
         ("size", ctypes.c_int64),
-        ("lost", ctypes.c_int64),
+        ("missed", ctypes.c_int64),
     ]
 
 
@@ -57,9 +57,9 @@ class WireTap:
         return 0 if self._memory is None else ctypes.addressof(self._kept)
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames or bytes that had no room since it was opened."""
-        return int(self._kept.lost)
+        return int(self._kept.missed)
 
     def open(self) -> None:
         if self._memory is None:
@@ -155,7 +155,7 @@ class WireTap:
         kept, size = self._kept, size_of(form, count)
         begin = int(kept.size)
         if begin + size > kept.room:
-            kept.lost += count
+            kept.missed += count
             return None
         kept.size = begin + size
         head = self._memory[begin : begin + PIECE.itemsize].view(PIECE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +10,13 @@ import numpy.typing as npt
 from skinware.bridge.link import Priority
 from skinware.bridge.messages import MOST_FRAMES, RAW, FrameMessage, Service, split_frame, split_generation
 from skinware.bridge.mirror import Mirror
-from skinware.bridge.pacing import Pacing
+from skinware.bridge.pacing import LinkTraffic, Pacing, Pulls
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge_state import ServiceState
 from skinware.errors import BadRecording, BridgeError, SkinwareError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.transfer.codec import Decoder
+from skinware.transfer.codec import FrameDecoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
 from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
@@ -28,62 +27,6 @@ _AGAIN_NS = NS_PER_S // 4
 _LATEST_NS = 1 << 61
 """More than any clock shows."""
 _EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
-
-
-@dataclass
-class LinkTraffic:
-    """The frames of a service that came.
-
-    Attributes:
-        lost: frames of the robot that were not published here, since the first one; all others: since the last report.
-        ages_ns: from the publication there to the one here.
-    """
-
-    frames: int = 0
-    lost: int = 0
-    lost_before: int = 0
-    bytes: int = 0
-    ages_ns: list[int] = field(default_factory=list)
-
-    def report(self, state: str, mode: str) -> ServiceState:
-        """Return the state of the service, with the rates since the last report."""
-        ages_ns = sorted(self.ages_ns)
-        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
-        new = self.lost - self.lost_before
-        report = ServiceState(state, mode, self.frames, self.lost, self.bytes, median, oldest, new)
-        self.frames, self.bytes, self.lost_before = 0, 0, self.lost
-        self.ages_ns.clear()
-        return report
-
-
-@dataclass
-class Pulls:
-    """Questions for frames that wait for an answer.
-
-    Attributes:
-        open: by number, the time until which an answer may come.
-        probe_until_ns: the same for a probe of the link.
-    """
-
-    count: int = 0
-    open: dict[int, int] = field(default_factory=dict)
-    probe_until_ns: int = 0
-
-    def begin(self, timeout_s: float) -> int:
-        """Return the number of a new question."""
-        self.count += 1
-        self.open[self.count] = now_ns() + round(timeout_s * NS_PER_S)
-        return self.count
-
-    def end(self, number: int, is_answered: bool) -> bool:
-        """Close a question; return whether it was open.
-
-        Answers come in order: an answer also closes earlier questions, which the link has dropped.
-        """
-        is_open = self.open.pop(number, None) is not None
-        if is_answered:
-            self.open = {later: until_ns for later, until_ns in self.open.items() if later > number}
-        return is_open
 
 
 class FrameOutput:
@@ -125,7 +68,7 @@ class FrameOutput:
             return None
         count = generation.published_before + frame.sequence
         if self.count is not None:
-            self.traffic.lost += max(0, count - self.count - 1)
+            self.traffic.gap += max(0, count - self.count - 1)
         self.count, self.newest, self.is_dead = count, frame.position, False
         self.traffic.frames += 1
         self.traffic.ages_ns.append(age_ns)
@@ -153,7 +96,7 @@ class ServiceFollower:
         self._pacing = Pacing(0, mode)
         self._pulls = Pulls()
         self._generation: Generation | None = None
-        self._decoder: Decoder | None = None
+        self._decoder: FrameDecoder | None = None
         self._held = b""  # the newest frame, while its generation or the robot's clock is not known
         self._asked = (0, 0)  # the generation that was asked for, and until when its answer may come
         self._patience_s = _FIRST_GENERATION_S
@@ -376,7 +319,7 @@ class ServiceFollower:
                 raise BadRecording(f"a frame of {len(parts.content)} bytes, not {generation.slot_stride}")
             return np.frombuffer(parts.content, np.uint8)
         if self._decoder is None:
-            self._decoder = Decoder(generation.coded, generation.slot_stride)
+            self._decoder = FrameDecoder(generation.coded, generation.slot_stride)
         return self._decoder.decode(parts.content, keeps=parts.keeps)
 
     def _publish(self, frame: RecordedSample) -> None:

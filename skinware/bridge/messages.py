@@ -131,7 +131,7 @@ class DriverSummary(msgspec.Struct, frozen=True):
         state: ``live``, ``paused``, ``closed`` or ``dead``.
         rate_hz: frames in the last second.
         age_ms: age of the newest data in its newest frame, on the robot; None before the first.
-        lost: frames lost on its buses since it started.
+        dropped: frames dropped on its buses since it started.
         sensors, fresh: number of sensors, and of those whose value is good and new.
         silent: names of the first patches that do not send.
         n_silent: number of patches that do not send.
@@ -141,7 +141,7 @@ class DriverSummary(msgspec.Struct, frozen=True):
     state: State
     rate_hz: _Figure
     age_ms: _Figure | None
-    lost: _Count
+    dropped: _Count
     sensors: _Count
     fresh: _Count
     patches: _Count
@@ -155,13 +155,13 @@ class Summary(msgspec.Struct, frozen=True):
 
     Attributes:
         services: number of services that are no drivers.
-        lost: frames that the bridge missed in their rings.
+        missed: frames that the bridge missed in their rings.
     """
 
     namespace: _Name
     drivers: Annotated[dict[_Name, DriverSummary], msgspec.Meta(max_length=LIMITS.services)] = {}
     services: _Count = 0
-    lost: _Count = 0
+    missed: _Count = 0
     host: _Word = ""
 
 

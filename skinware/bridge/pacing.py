@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass, field
 
-from skinware.realtime import NS_PER_S
+from skinware.bridge_state import ServiceState
+from skinware.realtime import NS_PER_S, now_ns
 
 _LOOK_NS = 2 * NS_PER_S
 _EVERY_NS = NS_PER_S // 4
@@ -40,6 +42,62 @@ times; and the number of looks before more are asked for again."""
 _ONE_FLIGHT, _LONG_NS = 14_000, 30_000_000
 """Bytes that TCP sends before it waits for an acknowledgement; the shortest round trip that counts as long."""
 _FIRST_RETRY_NS, _LAST_RETRY_NS = 10 * NS_PER_S, 320 * NS_PER_S
+
+
+@dataclass
+class LinkTraffic:
+    """The frames of a service that came.
+
+    Attributes:
+        gap: frames of the robot that were not published here, since the first one; all others: since the last report.
+        ages_ns: from the publication there to the one here.
+    """
+
+    frames: int = 0
+    gap: int = 0
+    gap_before: int = 0
+    bytes: int = 0
+    ages_ns: list[int] = field(default_factory=list)
+
+    def report(self, state: str, mode: str) -> ServiceState:
+        """Return the state of the service, with the rates since the last report."""
+        ages_ns = sorted(self.ages_ns)
+        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
+        new = self.gap - self.gap_before
+        report = ServiceState(state, mode, self.frames, self.gap, self.bytes, median, oldest, new)
+        self.frames, self.bytes, self.gap_before = 0, 0, self.gap
+        self.ages_ns.clear()
+        return report
+
+
+@dataclass
+class Pulls:
+    """Questions for frames that wait for an answer.
+
+    Attributes:
+        open: by number, the time until which an answer may come.
+        probe_until_ns: the same for a probe of the link.
+    """
+
+    count: int = 0
+    open: dict[int, int] = field(default_factory=dict)
+    probe_until_ns: int = 0
+
+    def begin(self, timeout_s: float) -> int:
+        """Return the number of a new question."""
+        self.count += 1
+        self.open[self.count] = now_ns() + round(timeout_s * NS_PER_S)
+        return self.count
+
+    def end(self, number: int, is_answered: bool) -> bool:
+        """Close a question; return whether it was open.
+
+        Answers come in order: an answer also closes earlier questions, which the link has dropped.
+        """
+        is_open = self.open.pop(number, None) is not None
+        if is_answered:
+            self.open = {later: until_ns for later, until_ns in self.open.items() if later > number}
+        return is_open
 
 
 class _QueueTimes:

@@ -150,9 +150,9 @@ class Server:
         link.declare_token(self._keys.token)
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames that were missed in their rings."""
-        return self._collector.lost
+        return self._collector.missed
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
         """Run until ``stop``; call ``each_second`` once a second."""
@@ -243,7 +243,7 @@ class Server:
             driver = served.file.driver
             if driver is not None and driver.structure is not None:
                 drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
-        self._summaries.send(drivers, len(there) - len(drivers), self.lost)
+        self._summaries.send(drivers, len(there) - len(drivers), self.missed)
 
     def _answer_wish(self, question: Question) -> None:
         services: dict[str, Service] = {}

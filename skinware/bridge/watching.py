@@ -62,23 +62,23 @@ class Summaries:
         self._frames, self._counted_ns = frames, time_ns
 
     def send(
-        self, drivers: Mapping[str, tuple[State, Structure, Generation, Sample | None]], services: int, lost: int
+        self, drivers: Mapping[str, tuple[State, Structure, Generation, Sample | None]], services: int, missed: int
     ) -> None:
         """Send it.
 
         Args:
             drivers: by name: state, present generation with its structure, and newest frame.
-            lost: frames that the bridge missed in their rings.
+            missed: frames that the bridge missed in their rings.
         """
         summaries = {name: _summary(self._rates_hz.get(name, 0.0), *driver) for name, driver in drivers.items()}
-        self._send(msgspec.json.encode(Summary(self._namespace, summaries, services, lost, self._host)))
+        self._send(msgspec.json.encode(Summary(self._namespace, summaries, services, missed, self._host)))
 
 
 def _summary(
     rate_hz: float, state: State, structure: Structure, generation: Generation, newest: Sample | None
 ) -> DriverSummary:
     is_live = state == "live"
-    age_ms, lost, fresh, problems = None, 0, 0, int(not is_live)
+    age_ms, dropped, fresh, problems = None, 0, 0, int(not is_live)
     silent: list[str] = []
     if newest is not None and newest.generation == generation.generation:
         frame = RecordedDriverSnapshot(generation, newest.slot)
@@ -88,7 +88,7 @@ def _summary(
         flags = is_fresh(frame.status, frame.sensor_time_ns, at_ns=time_ns, max_age_ns=limits_ns, alive=is_live)
         fresh = int(np.count_nonzero(flags))
         names, counts = counters_of(frame, generation.static(), "bus", len(structure.buses))
-        lost = int(counts[:, names.index("lost")].sum()) if "lost" in names else 0
+        dropped = int(counts[:, names.index("dropped")].sum()) if "dropped" in names else 0
         if is_live:
             rows = np.flatnonzero(frame.patch_state != PatchState.LIVE).tolist()
             silent = [structure.patch_names[row] for row in rows]
@@ -97,7 +97,7 @@ def _summary(
         state,
         rate_hz,
         age_ms,
-        lost,
+        dropped,
         structure.n_sensors,
         fresh,
         structure.n_patches,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.views.scene import Shape, rows_of, shape_of
+from skinware.views.scene import ModuleShape, rows_of, shape_of
 
 LEVELS = 16
 FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(10)
@@ -212,7 +212,7 @@ class _Block:
     start: int
     end: int
 
-    def shape(self, compact: bool) -> Shape:
+    def shape(self, compact: bool) -> ModuleShape:
         return shape_of("" if compact else self.kind, self.end - self.start)
 
 
@@ -257,7 +257,7 @@ class _Grid:
         last_pixels = math.ceil(last / self.per_line) * self.pitch - self.gap
         return sum(self.group_lines(count) for count in above) + math.ceil(last_pixels / 2)
 
-    def shape(self, block: _Block) -> Shape:
+    def shape(self, block: _Block) -> ModuleShape:
         """Return the shape in which a block is drawn: its own, unless that is too wide."""
         own = block.shape(self.compact)
         return own if own.halves <= self.halves else rows_of(len(own.cells), self.halves // 2)

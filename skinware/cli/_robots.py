@@ -26,7 +26,7 @@ _PORT = 7447
 _PRESENCE = {0: "gone", 1: "there"}
 _PATIENCE_S = 3
 """How long to wait for the summaries of robots; a robot without one for this long is silent."""
-_TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "silent patches", "problems", "clock")
+_TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "dropped", "silent patches", "problems", "clock")
 
 
 @click.command(
@@ -252,7 +252,7 @@ def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
         rate_text(driver["rate_hz"]),
         age_text_ms(driver["age_ms"]),
         f"{count_text(driver['fresh'])} of {count_text(driver['sensors'])}",
-        count_text(driver["lost"]),
+        count_text(driver["dropped"]),
         f"{names} and {more} more" if more else names or NO_VALUE,
         count_text(driver["problems"]),
     )

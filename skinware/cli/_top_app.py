@@ -18,7 +18,7 @@ from textual.widgets import DataTable, Footer, Static
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._painting import HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
-from skinware.cli._top_rows import COLUMNS, Row, RowKey, rows_of
+from skinware.cli._top_rows import COLUMNS, ListRow, RowKey, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.state import LIVE, life_of
@@ -128,7 +128,7 @@ class SkinTop(App[None]):
         self._table = DataTable[Text](id="list", cursor_type="row")
         self._heat_map = HeatMap(palette, id="map")
         self._lines = {name: Static(id=name, markup=False) for name in _LINES}
-        self._rows: list[Row] = []
+        self._rows: list[ListRow] = []
         self._heading = ""
         self._pointed: int | None = None
         self._missed: RowKey | None = None  # the chosen row, while its driver is away
@@ -227,11 +227,11 @@ class SkinTop(App[None]):
         self._must_draw = True  # the next layout changes the space for the picture
 
     @property
-    def _chosen(self) -> Row | None:
+    def _chosen(self) -> ListRow | None:
         at = self._table.cursor_row
         return self._rows[at] if 0 <= at < len(self._rows) else None
 
-    def _driver_of(self, row: Row) -> LiveDriver | None:
+    def _driver_of(self, row: ListRow) -> LiveDriver | None:
         return self._overview.drivers.get(row.key.driver)
 
     def _say(self, where: str, text: str | Text) -> None:
@@ -244,7 +244,7 @@ class SkinTop(App[None]):
         if not self._lines["detail"].is_attached:
             return  # the screen is being taken down
         namespace = self._overview.drivers.namespace.name
-        rows: list[Row] = []
+        rows: list[ListRow] = []
         why = _NOTHING.format(name=namespace)
         heading = ["skin-top", f"namespace {namespace}"]
         try:
@@ -271,7 +271,7 @@ class SkinTop(App[None]):
         below = max(0, len(self._rows) - above - seen)
         return [f"↑ {above} more"] * bool(above) + [f"↓ {below} more"] * bool(below)
 
-    def _fill(self, rows: list[Row]) -> None:
+    def _fill(self, rows: list[ListRow]) -> None:
         table, before = self._table, self._rows
         wanted = self._missed or (self._chosen.key if self._chosen else None)
         keys = [row.key for row in rows]
@@ -331,7 +331,7 @@ def _printable(text: str | Text) -> str | Text:
     return text
 
 
-def _cells(row: Row) -> list[Text]:
+def _cells(row: ListRow) -> list[Text]:
     cells = [_cell(text, column) for column, text in enumerate(row.cells)]
     cells[1].stylize(_STATE_COLOURS.get(row.state, ""))
     if row.key.kind == "driver":

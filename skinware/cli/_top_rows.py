@@ -11,10 +11,10 @@ from skinware.state import DEAD, LIVE, SILENT, STARTING, DriverReport
 from skinware.structure import Structure
 from skinware.text import NO_VALUE, age_text, count_text, counters_text, plural, rate_text, state_shown, words
 
-COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
+COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "dropped", "orphans", "other counters")
 """Titles of the cells of a row."""
 
-_NOT_AMONG_OTHERS = ("lost", "orphans", "bytes_in", "frame_bytes", "idle_bytes")
+_NOT_AMONG_OTHERS = ("dropped", "orphans", "bytes_in", "frame_bytes", "idle_bytes")
 """Counters with a column of their own, and counters that grow while all is well: the chosen row shows them."""
 
 DRIVER, BUS, PATCH = "driver", "bus", "patch"
@@ -30,7 +30,7 @@ class RowKey(NamedTuple):
     """Index of the bus or patch in its driver; 0 for the driver itself."""
 
 
-class Row(NamedTuple):
+class ListRow(NamedTuple):
     key: RowKey
     cells: tuple[str, ...]
     """One text for each column."""
@@ -40,7 +40,7 @@ class Row(NamedTuple):
     """Every counter that the driver publishes for this row, by name."""
 
 
-def rows_of(report: DriverReport) -> list[Row]:
+def rows_of(report: DriverReport) -> list[ListRow]:
     """Return the row of a driver, then those of its buses, each followed by its patches."""
     name, counters = report.name, report.counters
     state = report.life if report.age_ns is None else state_shown(report.life, report.fresh, report.sensors)
@@ -50,17 +50,19 @@ def rows_of(report: DriverReport) -> list[Row]:
         rate_text(report.rate_hz),
         age_text(report.age_ns),
         f"{report.fresh}/{report.sensors}",
-        count_text(counters.get("lost")),
+        count_text(counters.get("dropped")),
         count_text(counters.get("orphans")),
         "",
     )
-    rows = [Row(RowKey(name, DRIVER, 0), cells, state, counters)]
+    rows = [ListRow(RowKey(name, DRIVER, 0), cells, state, counters)]
     for at, bus in enumerate(report.buses):
-        state, lost = report.last(bus.state), count_text(bus.counters.get("lost"))
+        state, dropped = report.last(bus.state), count_text(bus.counters.get("dropped"))
         reason = "" if bus.reason is None else bus.reason.replace("_", "-")
         others = f"{reason}  {counters_text(bus.counters, besides=_NOT_AMONG_OTHERS)}".strip()
         rows.append(
-            Row(RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", lost, "", others), state, bus.counters)
+            ListRow(
+                RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", dropped, "", others), state, bus.counters
+            )
         )
         for number, patch in enumerate(report.patches):
             if patch.bus != at:
@@ -76,7 +78,7 @@ def rows_of(report: DriverReport) -> list[Row]:
                 count_text(patch.counters.get("orphans")),
                 counters_text(patch.counters, besides=_NOT_AMONG_OTHERS),
             )
-            rows.append(Row(RowKey(name, PATCH, number), cells, state, patch.counters))
+            rows.append(ListRow(RowKey(name, PATCH, number), cells, state, patch.counters))
     return rows
 
 
@@ -122,7 +124,7 @@ def plain_line(report: DriverReport) -> str:
     ]
     patches = ", ".join(f"{count} {state}" for state, count in report.patch_states.items()) or NO_VALUE
     counters = report.counters
-    losses = [f"{name} {counters[name]}" for name in ("lost", "orphans") if name in counters]
+    losses = [f"{name} {counters[name]}" for name in ("dropped", "orphans") if name in counters]
     age = f"age {age_text(report.age_ns)}"
     sensors = f"sensors {report.sensors} ({', '.join(statuses)})"
     return "  ".join([report.name, life, age, sensors, f"patches {patches}", *losses])

@@ -132,7 +132,7 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
                 for name, (state, count, pullers) in frames.items()
             }
             guard = server.guard
-            counts = {"lost": server.lost, "refused": guard.count, "last_refused": guard.last or None}
+            counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
             print_json({"event": "status", **counts, "services": services})
         for name, (state, count, _) in frames.items():
             if not as_json and shown.get(name) != state:

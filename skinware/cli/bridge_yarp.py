@@ -132,6 +132,6 @@ def _status(server: YarpServer) -> Callable[[], None]:
             count = port.pop("messages")
             ports[name] = {"rate_hz": count - before.get(name, 0), **port}
             before[name] = count
-        print_json({"event": "status", "lost": server.lost, "ports": ports})
+        print_json({"event": "status", "missed": server.missed, "ports": ports})
 
     return report

@@ -72,8 +72,8 @@ def command(
             if as_json:
                 print_json(as_data(reader, frame, type_name, counts))
             else:
-                lost = f"  lost {reader.lost}" if reader.lost and rate_hz is None else ""
-                line = f"{reader.name} {as_line(frame, type_name, counts)}{lost}"
+                missed = f"  missed {reader.missed}" if reader.missed and rate_hz is None else ""
+                line = f"{reader.name} {as_line(frame, type_name, counts)}{missed}"
                 echo("\n".join(wrapped(line, terminal_width())))
             taken += 1
             if taken == count:
@@ -91,7 +91,7 @@ def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, 
         "sequence": frame.sequence,
         "acquired_ns": frame.acquired_ns,
         "age_ms": round(frame.age_ns / 1e6, 3),
-        "lost": reader.lost,
+        "missed": reader.missed,
         "values": values.tolist(),
         "status": frame.status[index].tolist(),
     }

@@ -140,7 +140,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             driver["buses"],
             ("bus", "state", *columns),
             lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in columns.values())),
-            {"frames", "lost"},
+            {"frames", "dropped"},
         ),
         *_sample_lines(driver["buses"]),
         "",
@@ -327,7 +327,7 @@ def _reader_lines(entry: dict[str, Any]) -> list[str]:
             age_text(reader["wall"]["mean_ns"] if reader["wall"]["count"] else None),
             age_text(reader["cpu"]["mean_ns"] if reader["cpu"]["count"] else None),
             count_text(reader["frames"]),
-            count_text(reader["lost"]),
+            count_text(reader["missed"]),
         ]
         for reader in entry["readers"]
     ]

@@ -221,9 +221,9 @@ class _Progress:
             if name.endswith("/frame")
         ]
         self._before = messages
-        lost = f", lost {self._recorder.lost}" if self._recorder.lost else ""
+        missed = f", missed {self._recorder.missed}" if self._recorder.missed else ""
         passed = time.strftime("%H:%M:%S", time.gmtime(time.monotonic() - self._begin_s))
-        echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{lost}")
+        echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{missed}")
         saved, self._saved = self._saved, self._target.paths if self._is_past else []
         for path in self._saved[len(saved) :]:
             echo(f"saved {path}")
@@ -250,12 +250,13 @@ class _Progress:
             return
         for name, count in messages.items():
             echo(f"{name}: {count} messages")
-        lost = f", {self._recorder.lost} frames lost" if self._recorder.lost else ", nothing lost" * is_complete
+        count = self._recorder.missed
+        missed = f", {count} samples missed" if count else ", nothing missed" * is_complete
         ended = "complete" if is_complete else "ended early"
-        echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{lost}")
+        echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{missed}")
 
     def _figures(self, messages: dict[str, int]) -> dict[str, Any]:
-        return {"messages": messages, "lost": self._recorder.lost, "bytes": self._target.size}
+        return {"messages": messages, "missed": self._recorder.missed, "bytes": self._target.size}
 
 
 def _text_of(event: dict[str, Any]) -> str:

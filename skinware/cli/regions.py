@@ -114,12 +114,12 @@ class _Painter:
     """Collect the sensors that are touched."""
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
-        from skinware.views.history import Rest
+        from skinware.views.history import DriverRest
 
         self._reader, self._as_json = reader, as_json
         self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
         self._index = reader.structure.index(self.type_name)
-        self._rest = Rest(reader.structure)
+        self._rest = DriverRest(reader.structure)
 
     def paint(self, duration_s: float | None) -> tuple[int, npt.NDArray[np.bool_]]:
         """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""

@@ -139,14 +139,14 @@ def command(
 
 
 async def _serve(follower: Follower, access: Access, host: str, port: int | None, ready: Callable[[int], None]) -> None:
-    from skinware.views.recording import Recording
+    from skinware.views.recording import RecordingProgram
     from skinware.views.server import ViewServer, show
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     program = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
-    server = ViewServer(follower, access, Recording(program, follower.namespace.name, follower.names))
+    server = ViewServer(follower, access, RecordingProgram(program, follower.namespace.name, follower.names))
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:

@@ -71,12 +71,12 @@ class _Wipe:
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 
-        from skinware.views.history import Rest, WipeTest
+        from skinware.views.history import DriverRest, WipeTest
 
         self._reader, self._as_json = reader, as_json
         self._structure = reader.structure
         self._type = self._structure.types[0] if type_name is None else self._structure.type(type_name)
-        self._rest, self._test = Rest(self._structure), WipeTest(self._structure)
+        self._rest, self._test = DriverRest(self._structure), WipeTest(self._structure)
         self._status = np.zeros(self._structure.n_sensors, np.uint8)
         self._is_redrawing = not as_json and sys.stdout.isatty()
 

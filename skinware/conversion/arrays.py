@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import h5py
-from skinware.conversion.tables import Output, Source, Table, cannot_hold, outputs, sensor_table
+from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, sensor_table
 
 FORMAT, VERSION = "skinware-arrays", 1
 
 
-def description(source: Source, units: Sequence[dict[str, str]]) -> bytes:
+def description(source: TableSource, units: Sequence[dict[str, str]]) -> bytes:
     """Return the JSON text in a file of arrays: its format, tables, units, events and clocks."""
     tables = [
         {"name": table.name, "service": table.service, "units": of}
@@ -31,7 +31,7 @@ def description(source: Source, units: Sequence[dict[str, str]]) -> bytes:
 _DESCRIPTION = "recording"
 
 
-def write_npz(source: Source, path: Path) -> None:
+def write_npz(source: TableSource, path: Path) -> None:
     """Write a source, in one pass for each array, which must be whole before the next one begins.
 
     Raises:
@@ -73,7 +73,7 @@ _CHUNK_BYTES = 256 << 10
 """Bytes of an array that HDF5 reads at once."""
 
 
-class _File:
+class _GuardedFile:
     """A file for HDF5 that keeps errors to itself, because the library does not survive a full disk.
 
     Attributes:
@@ -129,7 +129,7 @@ class _File:
         self._file.close()
 
 
-def write_hdf5(source: Source, path: Path) -> None:
+def write_hdf5(source: TableSource, path: Path) -> None:
     """Write a source.
 
     Raises:
@@ -138,14 +138,14 @@ def write_hdf5(source: Source, path: Path) -> None:
         OSError: it cannot be written.
     """
     package = h5py()
-    with contextlib.closing(_File(path)) as stream:
+    with contextlib.closing(_GuardedFile(path)) as stream:
         with package.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
             file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))
         stream.check()
 
 
-def _write_table(group: Any, table: Table, stream: _File) -> dict[str, str]:
+def _write_table(group: Any, table: Table, stream: _GuardedFile) -> dict[str, str]:
     made = outputs(table)
     _check_names(table, made)
     datasets = {output.name: _dataset(group, output) for output in made}

@@ -16,7 +16,7 @@ from skinware.conversion.arrays import write_hdf5, write_npz
 from skinware.conversion.mcap_files import ros2_without, viewers_without, write_foxglove, write_recording, write_ros2
 from skinware.conversion.rows import csv_without, write_csv, write_parquet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Source, Table
+from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording import Recording
 from skinware.recording.wire import Chosen, Exported, export_candump, export_pcapng
@@ -31,8 +31,8 @@ class Format(NamedTuple):
     """
 
     suffix: str
-    write: Callable[[Source, Path], None]
-    without: Callable[[Source], list[str]] = lambda _: []
+    write: Callable[[TableSource, Path], None]
+    without: Callable[[TableSource], list[str]] = lambda _: []
 
 
 FORMATS = {
@@ -134,7 +134,7 @@ def begun_beside(target: Path) -> Iterator[Path]:
 class Watched(DerivedSource):
     """A source that counts its samples as they are written, and ends when it is stopped."""
 
-    def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:
+    def __init__(self, source: TableSource, is_stopped: Callable[[], bool]) -> None:
         self.frames: Counter[str] = Counter()
         super().__init__(source, [_WatchedTable(table, self.frames, is_stopped) for table in source.tables])
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skinware.conversion import ros_messages
-from skinware.conversion.showing import Message, Showing, Viewers, in_topic
-from skinware.conversion.tables import COLUMNS, TIME, Source, Table
+from skinware.conversion.showing import Showing, ViewerMessage, Viewers, in_topic
+from skinware.conversion.tables import COLUMNS, TIME, Table, TableSource
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.memory.file_layout import SLOT
@@ -22,7 +22,7 @@ from skinware.recording.files import Head, PendingChunk, RecordingFile
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
 from skinware.structure import Structure
-from skinware.transfer.codec import Encoder
+from skinware.transfer.codec import FrameEncoder
 from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
 
@@ -77,7 +77,7 @@ class _TimedJson(NamedTuple):
     data: dict[str, Any]
 
 
-def write_recording(source: Source, path: Path) -> None:
+def write_recording(source: TableSource, path: Path) -> None:
     """Write a source.
 
     Raises:
@@ -110,10 +110,10 @@ def _timed_json(topic: str, entries: list[dict[str, Any]]) -> Iterator[_TimedJso
 
 
 @dataclass
-class _Stream:
+class _CodedStream:
     head: Head
     generation: Generation
-    encoder: Encoder
+    encoder: FrameEncoder
 
 
 class _RecordingWriter:
@@ -122,7 +122,7 @@ class _RecordingWriter:
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
         self._channels = Channels()
-        self._streams: dict[str, _Stream] = {}
+        self._streams: dict[str, _CodedStream] = {}
         self._pending, self._begun_ns = PendingChunk(), 0
 
     def add_frame(self, timed: TimedFrame) -> None:
@@ -145,10 +145,10 @@ class _RecordingWriter:
     def close_chunk(self) -> None:
         self._pending.move_to(self._file)
 
-    def _stream(self, service: str, generation: Generation, before: _Stream | None) -> _Stream:
+    def _stream(self, service: str, generation: Generation, before: _CodedStream | None) -> _CodedStream:
         number = 1 if before is None else before.head.sequence + 1
         channel, schema = self._channels.of_service(service, GENERATION)
-        return _Stream(Head(channel, schema, number, generation.head), generation, Encoder(generation.coded))
+        return _CodedStream(Head(channel, schema, number, generation.head), generation, FrameEncoder(generation.coded))
 
 
 _MESSAGE_CHUNK_BYTES = 4 << 20
@@ -156,7 +156,7 @@ _BAG_VERSION = 5
 """Version of metadata.yaml: that of ROS 2 Humble, which later ones read."""
 
 
-def write_foxglove(source: Source, path: Path) -> None:
+def write_foxglove(source: TableSource, path: Path) -> None:
     """Write the pictures and states of drivers, at most 30 times a second, and their events.
 
     Raises:
@@ -167,7 +167,7 @@ def write_foxglove(source: Source, path: Path) -> None:
     writer = _MessageWriter(path, "")
     try:
         for event in source.events:
-            writer.add(Message(EVENTS, "json", SCHEMAS[EVENTS], json.dumps(event).encode()), event["log_time_ns"])
+            writer.add(ViewerMessage(EVENTS, "json", SCHEMAS[EVENTS], json.dumps(event).encode()), event["log_time_ns"])
         for timed in timed_frames(_drivers(source)):
             for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
                 writer.add(message, timed.time_ns)
@@ -175,7 +175,7 @@ def write_foxglove(source: Source, path: Path) -> None:
         writer.finish()
 
 
-def viewers_without(source: Source) -> list[str]:
+def viewers_without(source: TableSource) -> list[str]:
     notes = []
     for table in source.tables:
         structure = table.structure
@@ -186,7 +186,7 @@ def viewers_without(source: Source) -> list[str]:
     return notes
 
 
-def write_ros2(source: Source, folder: Path) -> None:
+def write_ros2(source: TableSource, folder: Path) -> None:
     """Write a bag of ROS 2 (rosbag2, storage mcap) into a new folder: every sample, and pictures for viewers.
 
     Raises:
@@ -213,27 +213,27 @@ def write_ros2(source: Source, folder: Path) -> None:
     (folder / "metadata.yaml").write_text(writer.metadata(name), encoding="utf-8")
 
 
-def ros2_without(source: Source) -> list[str]:
+def ros2_without(source: TableSource) -> list[str]:
     return [*viewers_without(source), "counters, histograms and events are left out: ros2 does not hold them"]
 
 
-def _drivers(source: Source) -> list[Table]:
+def _drivers(source: TableSource) -> list[Table]:
     drivers = [table for table in source.tables if table.structure is not None]
     if not drivers:
         raise ConfigurationError(f"{source.path}: no driver is in it, and nothing else can be shown")
     return drivers
 
 
-def _skin_frame(timed: TimedFrame) -> Message:
+def _skin_frame(timed: TimedFrame) -> ViewerMessage:
     data = ros_messages.skin_frame(DriverSnapshot(timed.generation, timed.frame.slot), timed.time_ns)
-    return Message(f"/skin/{in_topic(timed.service)}/frame", "cdr", ros_messages.SKIN_FRAME, data)
+    return ViewerMessage(f"/skin/{in_topic(timed.service)}/frame", "cdr", ros_messages.SKIN_FRAME, data)
 
 
-def _sensors(timed: TimedFrame, table: Table) -> Message:
+def _sensors(timed: TimedFrame, table: Table) -> ViewerMessage:
     structure = timed.generation.context
     assert isinstance(structure, Structure)  # noqa: S101, of a driver
     data = ros_messages.sensors(structure, table.sensor_names, timed.generation.generation, timed.time_ns)
-    return Message(f"/skin/{in_topic(timed.service)}/sensors", "cdr", ros_messages.SENSORS, data)
+    return ViewerMessage(f"/skin/{in_topic(timed.service)}/sensors", "cdr", ros_messages.SENSORS, data)
 
 
 class _MessageWriter:
@@ -246,7 +246,7 @@ class _MessageWriter:
         self._types: dict[int, tuple[str, str]] = {}
         self._begin_ns, self._end_ns = 1 << 63, 0
 
-    def add(self, message: Message, time_ns: int) -> None:
+    def add(self, message: ViewerMessage, time_ns: int) -> None:
         channel, schema = self._channels.of(message.topic, message.encoding, message.schema)
         self._types[channel.id] = message.topic, schema.name
         self._begin_ns, self._end_ns = min(self._begin_ns, time_ns), max(self._end_ns, time_ns)

@@ -21,8 +21,8 @@ from skinware.conversion.tables import (
     PHYSICAL,
     ArrayFormat,
     Output,
-    Source,
     Table,
+    TableSource,
     check_distinct,
     outputs,
     sensor_table,
@@ -82,7 +82,7 @@ _OF_DRIVERS = (
 """Columns of a driver in text files; counters and histograms would fill most of the file."""
 
 
-def write_csv(source: Source, folder: Path) -> None:
+def write_csv(source: TableSource, folder: Path) -> None:
     """Write a source into a folder, which is made.
 
     Raises:
@@ -98,7 +98,7 @@ def write_csv(source: Source, folder: Path) -> None:
             _write_csv_table(table, folder, open_files, source.start_ns)
 
 
-def csv_without(_: Source) -> list[str]:
+def csv_without(_: TableSource) -> list[str]:
     return ["counters, histograms and events are left out: csv does not hold them"]
 
 
@@ -204,7 +204,7 @@ def _line(cells: Iterable[object]) -> str:
 _GROUP_BYTES = 32 << 20
 
 
-def write_parquet(source: Source, folder: Path) -> None:
+def write_parquet(source: TableSource, folder: Path) -> None:
     """Write a source into a folder, which is made.
 
     Raises:

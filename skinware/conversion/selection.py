@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import as_index
-from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
+from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Table, TableSource
 from skinware.errors import ConfigurationError
 from skinware.tactile.regions import Regions, SensorChoice, unknown
 from skinware.transfer.generation import PER_SENSOR
@@ -39,7 +39,7 @@ class Selection:
         """The choice of sensors."""
         return SensorChoice(self.types, self.patches, self.regions, self.in_regions)
 
-    def of(self, source: Source) -> SelectedSource:
+    def of(self, source: TableSource) -> SelectedSource:
         """Return a source reduced to the selection.
 
         Raises:
@@ -87,6 +87,6 @@ class SelectedSource(DerivedSource):
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.Source`."""
+        """See :class:`skinware.conversion.tables.TableSource`."""
         left_out = {table.service for table in self._source.tables} - {table.service for table in self.tables}
         return [event for event in self._source.events if event.get("service") not in left_out]

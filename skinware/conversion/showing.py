@@ -37,7 +37,7 @@ _POINT = np.dtype([(name, "<f4" if kind == _FLOAT32 else "u1") for name, kind in
 _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
 
 
-class Message(NamedTuple):
+class ViewerMessage(NamedTuple):
     topic: str
     encoding: str
     schema: Schema
@@ -64,7 +64,7 @@ class Showing:
     def topics(self) -> dict[str, Schema]:
         return {each.topic: each.schema for each in self._shown}
 
-    def messages(self, frame: DriverSnapshot, time_ns: int) -> Iterator[Message]:
+    def messages(self, frame: DriverSnapshot, time_ns: int) -> Iterator[ViewerMessage]:
         """Yield the pictures and the state of a sample.
 
         Args:
@@ -80,7 +80,7 @@ class Showing:
         *,
         status: npt.NDArray[np.uint8] | None = None,
         wanted: Callable[[str], bool] = lambda _: True,
-    ) -> Iterator[Message]:
+    ) -> Iterator[ViewerMessage]:
         """Yield the point clouds and images of a sample.
 
         Args:
@@ -96,7 +96,7 @@ class Showing:
         for each in shown:
             yield each.message(frame, values[each.type_name], status, stamp_ns)
 
-    def _state(self, frame: DriverSnapshot) -> Message:
+    def _state(self, frame: DriverSnapshot) -> ViewerMessage:
         structure = self._structure
         fresh = np.bincount(structure.sensor_patch[frame.status == 0], minlength=structure.n_patches)
         state = {
@@ -118,8 +118,8 @@ class Showing:
         }
         topic, text = f"/skin/{in_topic(self._name)}/state", json.dumps(state)
         if self._json_state:
-            return Message(topic, "json", ros_messages.STATE, text.encode())
-        return Message(topic, "cdr", ros_messages.TEXT, Cdr().text(text).done())
+            return ViewerMessage(topic, "json", ros_messages.STATE, text.encode())
+        return ViewerMessage(topic, "cdr", ros_messages.TEXT, Cdr().text(text).done())
 
 
 def in_topic(text: str) -> str:
@@ -149,7 +149,7 @@ class _Cloud:
 
     def message(
         self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
-    ) -> Message:
+    ) -> ViewerMessage:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
         self.points["age"] = _ages_s(frame)[frame.structure.sensor_group[self._index]]
         cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
@@ -157,7 +157,7 @@ class _Cloud:
             cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
         cdr.numbers("?", False).numbers("I", _POINT.itemsize, self.points.nbytes).array(self.points)
         is_dense = bool(np.isfinite(self.points["intensity"]).all())
-        return Message(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
+        return ViewerMessage(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
 
 
 def _ages_s(frame: DriverSnapshot) -> npt.NDArray[np.float32]:
@@ -200,7 +200,7 @@ class _Image:
 
     def message(
         self, _frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
-    ) -> Message:
+    ) -> ViewerMessage:
         good = (status[self._index] == 0) & np.isfinite(values)
         if self._is_bounded:
             span = max(self._type.maximum - self._type.minimum, 1e-30)
@@ -212,7 +212,7 @@ class _Image:
         height, width = image.shape
         cdr = Cdr().header(time_ns, self._frame).numbers("I", height, width)
         cdr.text("mono16" if self._is_bounded else "32FC1").numbers("B", 0).numbers("I", width * image.itemsize)
-        return Message(self.topic, "cdr", self.schema, cdr.array(image.reshape(-1).view(np.uint8)).done())
+        return ViewerMessage(self.topic, "cdr", self.schema, cdr.array(image.reshape(-1).view(np.uint8)).done())
 
 
 def _images(name: str, structure: Structure, *, only_grids: bool) -> Iterator[_Image]:
@@ -273,17 +273,13 @@ class _Driver:
 
 
 class Viewers:
-    """Messages for viewers, beside the frames that they are made of.
+    """Messages for viewers, beside the frames that they are made of."""
 
-    Args:
-        rate_hz: of each driver, at most.
-    """
-
-    def __init__(self, *, json_state: bool = True, rate_hz: float = RATE_HZ) -> None:
-        self._json_state, self._period_ns = json_state, round(NS_PER_S / rate_hz)
+    def __init__(self, *, json_state: bool = True) -> None:
+        self._json_state, self._period_ns = json_state, round(NS_PER_S / RATE_HZ)
         self._drivers: dict[str, _Driver] = {}
 
-    def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[Message]:
+    def messages(self, service: str, generation: Generation, frame: Sample, time_ns: int) -> Iterator[ViewerMessage]:
         """Yield the messages of a sample if the next ones of its driver are due.
 
         Args:

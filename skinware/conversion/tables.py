@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -127,7 +128,7 @@ def sensor_names(structure: Structure) -> list[str]:
     return [str(name) for name in names]
 
 
-class Source(Protocol):
+class TableSource(Protocol):
     """A file that is converted."""
 
     path: Path
@@ -153,7 +154,7 @@ class Source(Protocol):
 class DerivedSource:
     """A source with other tables than the one that it stands for."""
 
-    def __init__(self, source: Source, tables: Sequence[Table]) -> None:
+    def __init__(self, source: TableSource, tables: Sequence[Table]) -> None:
         self._source = source
         self.path: Path = source.path
         self.start_ns: int = source.start_ns
@@ -193,7 +194,7 @@ class Output:
 
 def outputs(table: Table) -> list[Output]:
     """Return all arrays of a table, and ``physical/TYPE``, values in its unit, for each sensor type."""
-    found = [Output(name, each, _unit(table, name), (name,), _itself(name)) for name, each in table.arrays.items()]
+    found = [Output(name, each, _unit(table, name), (name,), itemgetter(name)) for name, each in table.arrays.items()]
     structure = table.structure
     if structure is not None:
         values = COLUMNS + "values"
@@ -265,10 +266,6 @@ def _unit(table: Table, name: str) -> str:
     return table.origin.schema.columns[column].unit or ("ns" if column.endswith("_ns") else "")
 
 
-def _itself(name: str) -> Callable[[Block], npt.NDArray[Any]]:
-    return lambda block: block[name]
-
-
 def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDArray[Any]]:
     return lambda block: structure.physical(block[COLUMNS + "values"], type_name)
 
@@ -326,7 +323,7 @@ class RecordedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.Source`."""
+        """See :class:`skinware.conversion.tables.TableSource`."""
         return self._in_span(self._recording.events)
 
     @property

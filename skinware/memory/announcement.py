@@ -33,7 +33,7 @@ class ReaderRecord(msgspec.Struct):
     Attributes:
         pid: its process (as seen in its own pid namespace).
         kind: how it reads: ``asap``, ``in order``, ``periodic 30 Hz``, ``on demand``.
-        lost: samples that were published since its first one and that it did not take.
+        missed: samples that were published since its first one and that it did not take.
         overruns: how often the writer was too fast for a copy.
         missed_periods: periods that passed unused (periodic readers).
         rate_hz: samples per second lately.
@@ -49,7 +49,7 @@ class ReaderRecord(msgspec.Struct):
     program: str
     kind: str
     frames: int = 0
-    lost: int = 0
+    missed: int = 0
     overruns: int = 0
     missed_periods: int = 0
     rate_hz: float = 0.0

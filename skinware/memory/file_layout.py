@@ -138,7 +138,7 @@ SLOT = _packed(
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class ColumnPlace:
     """One named array: in every slot, or once per file."""
 
     name: str
@@ -148,7 +148,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Layout:
+class FileLayout:
     """Where everything lies in one file.
 
     Attributes:
@@ -160,8 +160,8 @@ class Layout:
         file_size: bytes.
     """
 
-    static: tuple[Column, ...]
-    slot: tuple[Column, ...]
+    static: tuple[ColumnPlace, ...]
+    slot: tuple[ColumnPlace, ...]
     slot_count: int
     slot_offset: int
     slot_stride: int
@@ -186,7 +186,7 @@ def plan(
     slot: Mapping[str, tuple[npt.DTypeLike, int]],
     slot_count: int | None = None,
     period_ns: int = 0,
-) -> Layout:
+) -> FileLayout:
     """Lay out a new file.
 
     Args:
@@ -208,12 +208,12 @@ def plan(
         if array.ndim != 1:
             raise ConfigurationError(f"table {name!r} has shape {array.shape}: give arrays of one dimension")
         offset = aligned(end)
-        static_columns.append(_checked(Column(name, array.dtype, len(array), offset)))
+        static_columns.append(_checked(ColumnPlace(name, array.dtype, len(array), offset)))
         end = offset + array.nbytes
     slot_columns = []
     slot_end = SLOT.itemsize
     for name, (dtype, count) in slot.items():
-        column = _checked(Column(name, np.dtype(dtype), count, aligned(slot_end)))
+        column = _checked(ColumnPlace(name, np.dtype(dtype), count, aligned(slot_end)))
         slot_columns.append(column)
         slot_end = column.offset + column.dtype.itemsize * count
     slot_offset, slot_stride = aligned(end, 4096), aligned(slot_end)
@@ -223,10 +223,10 @@ def plan(
     file_size = aligned(slot_offset + slot_stride * slot_count, 4096)
     if file_size > MAX_FILE_SIZE:
         raise ConfigurationError(f"the service would need {file_size} bytes of shared memory; the limit is 4 GiB")
-    return Layout(tuple(static_columns), tuple(slot_columns), slot_count, slot_offset, slot_stride, file_size)
+    return FileLayout(tuple(static_columns), tuple(slot_columns), slot_count, slot_offset, slot_stride, file_size)
 
 
-def _checked(column: Column) -> Column:
+def _checked(column: ColumnPlace) -> ColumnPlace:
     name, code = column.name, column.dtype.str
     named = 0 < len(name) <= 24 and name.isascii() and name.isprintable()
     if not named or len(code) > 8 or column.dtype.kind not in "uifSV" or code[0] == ">":
@@ -237,8 +237,8 @@ def _checked(column: Column) -> Column:
     return column
 
 
-def column_table(layout: Layout) -> npt.NDArray[np.void]:
-    rows: Sequence[tuple[Column, int]] = [(c, 0) for c in layout.static] + [(c, 1) for c in layout.slot]
+def column_table(layout: FileLayout) -> npt.NDArray[np.void]:
+    rows: Sequence[tuple[ColumnPlace, int]] = [(c, 0) for c in layout.static] + [(c, 1) for c in layout.slot]
     table = np.zeros(len(rows), COLUMN)
     for row, (column, in_slot) in zip(table, rows, strict=True):
         row["name"], row["dtype"] = column.name.encode(), column.dtype.str.encode()
@@ -246,7 +246,7 @@ def column_table(layout: Layout) -> npt.NDArray[np.void]:
     return table
 
 
-def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
+def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, FileLayout]:
     """Check and read the header and the column table of a file that somebody else wrote.
 
     Args:
@@ -286,15 +286,15 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
         raise refuse(f"{slot_count} slots of {stride} bytes at {slot_offset} make no ring")
     if slot_offset < table_end or slot_offset + slot_count * stride > file_size:
         raise refuse("the ring lies outside the file")
-    static: list[Column] = []
-    slot: list[Column] = []
+    static: list[ColumnPlace] = []
+    slot: list[ColumnPlace] = []
     for row in np.frombuffer(head, COLUMN, n_columns, COLUMN_OFFSET):
         try:
             name, code = bytes(row["name"]).decode("ascii"), bytes(row["dtype"]).decode("ascii")
             dtype = np.dtype(code)
             if dtype.str != code:  # numpy reads more than we write: structures, arrays, objects, aliases
                 raise ValueError(f"dtype {code!r}")
-            column = _checked(Column(name, dtype, int(row["count"]), int(row["offset"])))
+            column = _checked(ColumnPlace(name, dtype, int(row["count"]), int(row["offset"])))
         except (UnicodeDecodeError, TypeError, ValueError, SyntaxError) as error:
             raise refuse(f"a column that cannot be read ({error})") from None
         in_slot = bool(row["in_slot"])
@@ -304,4 +304,4 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
         if column.offset + column.count * dtype.itemsize > last:
             raise refuse(f"column {name!r} lies outside its {'slot' if in_slot else 'table'}")
         (slot if in_slot else static).append(column)
-    return header, Layout(tuple(static), tuple(slot), slot_count, slot_offset, stride, file_size)
+    return header, FileLayout(tuple(static), tuple(slot), slot_count, slot_offset, stride, file_size)

@@ -45,7 +45,7 @@ for _function in (_syscall, _sleep, _poke):
     _function.restype = ctypes.c_long
 
 
-class _Timespec(ctypes.Structure):
+class Timespec(ctypes.Structure):
     _fields_ = [("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long)]
 
 
@@ -81,7 +81,7 @@ class Word:
         self.address: int = memory.ctypes.data + offset
         self._address = ctypes.c_void_p(self.address)
         self._expected = ctypes.c_uint32()
-        self._timeout = _Timespec()
+        self._timeout = Timespec()
         self._timeout_at = ctypes.byref(self._timeout)
         self._timeout_ns = 0
         if _syscall(_sys_futex, self._address, _wait, self._expected, self._timeout_at) < 0:
@@ -124,7 +124,7 @@ def wait_any(words: Sequence[tuple[Word, int]], deadline_ns: int) -> bool:
     table = ctypes.create_string_buffer(
         b"".join(entry.pack(value, word.address, _FUTEX_32, 0) for word, value in words)
     )
-    deadline = _Timespec(deadline_ns // NS_PER_S, deadline_ns % NS_PER_S)
+    deadline = Timespec(deadline_ns // NS_PER_S, deadline_ns % NS_PER_S)
     result = _syscall(
         ctypes.c_long(_SYS_FUTEX_WAITV),
         table,

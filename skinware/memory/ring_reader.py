@@ -38,7 +38,7 @@ class Turns(NamedTuple):
     """
 
     frames: int
-    lost: int
+    missed: int
     last: int
     over: list[Turn]
 
@@ -142,8 +142,8 @@ class RingReader(Generic[SampleT]):
         state = self.state_in_c
         if not (state.frames or state.noted):
             return None
-        settled = Turns(state.frames, state.lost, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
-        state.frames = state.lost = state.noted = 0
+        settled = Turns(state.frames, state.missed, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
+        state.frames = state.missed = state.noted = 0
         return settled
 
     def end_turn(self) -> tuple[int, int] | None:

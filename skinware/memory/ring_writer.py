@@ -78,8 +78,8 @@ class RingWriter:
 
         Args:
             from_last: copy the newest sample into it first, for writers that change parts only.
-            skip: sequences before its own that are left out; readers count them as lost. It is one more where the slot
-                would be that of the newest sample, which stays readable meanwhile.
+            skip: sequences before its own that are left out; readers count them as missed. It is one more where the
+                slot would be that of the newest sample, which stays readable meanwhile.
             contents: a whole slot of the same layout, to be copied into it first.
         """
         if self.segment.descriptor.fd < 0:

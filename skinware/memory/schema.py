@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.memory.file_layout import Layout
+from skinware.memory.file_layout import FileLayout
 
 STATIC_NAME = "schema"
 _MAX_BYTES = 1 << 16
@@ -116,7 +116,7 @@ class _SchemaText(msgspec.Struct):
     tables: dict[str, Any] = {}
 
 
-def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
+def from_file(layout: FileLayout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
     """Return the schema of an attached file.
 
     Raises:

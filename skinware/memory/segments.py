@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory import file_layout, futex
-from skinware.memory.file_layout import Layout
+from skinware.memory.file_layout import FileLayout
 from skinware.memory.futex import fence
 from skinware.memory.locks import Descriptor, Process, ProcessWatch, has_ended, is_locked, this_process, try_lock
 from skinware.memory.namespace import Namespace
@@ -45,7 +45,7 @@ class Segment:
 
     path: str
     header: np.void
-    layout: Layout
+    layout: FileLayout
     data: npt.NDArray[np.uint8]
     descriptor: Descriptor
     inode: tuple[int, int]
@@ -159,7 +159,7 @@ def create(
 def _write_head(
     data: npt.NDArray[np.uint8],
     header: npt.NDArray[np.void],
-    layout: Layout,
+    layout: FileLayout,
     static: Mapping[str, npt.NDArray[Any]],
 ) -> None:
     """Write what is before the slots, but for what changes while a writer runs."""
@@ -334,7 +334,7 @@ def _not_found(namespace: Namespace, name: str) -> str:
 
 
 def _header(
-    name: str, layout: Layout, digest: bytes, kind: str, period_ns: int, published_before: int
+    name: str, layout: FileLayout, digest: bytes, kind: str, period_ns: int, published_before: int
 ) -> npt.NDArray[np.void]:
     header = np.zeros(1, file_layout.HEADER)
     header["magic"] = file_layout.MAGIC

@@ -68,7 +68,7 @@ class ReaderState(RingWords):
         ("descriptor", ctypes.c_int64),
         ("writer", ctypes.c_int64),
         ("frames", ctypes.c_uint64),
-        ("lost", ctypes.c_uint64),
+        ("missed", ctypes.c_uint64),
         ("acquired_ns", ctypes.c_int64),
         ("taken_ns", ctypes.c_int64),
         ("noted", ctypes.c_uint64),

@@ -32,7 +32,7 @@ typedef struct skinware_native_reader {
     int64_t descriptor;  /* of the file: asks whether the writer lives */
     int64_t writer;      /* pidfd of the writer, SKINWARE__UNKNOWN or SKINWARE__ENDED */
     uint64_t frames;     /* samples taken */
-    uint64_t lost;       /* samples missed */
+    uint64_t missed;     /* samples missed */
     int64_t acquired_ns; /* of the sample whose turn is not over */
     int64_t taken_ns;    /* when it was taken; 0: there is none */
     uint64_t noted;      /* turns that are over */
@@ -156,7 +156,7 @@ static int copy_all(const skinware_native_take *take, unsigned char *to) {
     for (i = 0; i < take->count; i++) {
         skinware_native_reader *reader = take->places[i].reader;
         const skinware__slot *slot = (const skinware__slot *)(const void *)(to + take->places[i].start);
-        reader->lost += slot->sequence > reader->last + 1 ? slot->sequence - reader->last - 1 : 0;
+        reader->missed += slot->sequence > reader->last + 1 ? slot->sequence - reader->last - 1 : 0;
         reader->frames++;
         reader->last = slot->sequence;
         if (take->is_loop) {

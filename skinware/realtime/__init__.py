@@ -10,8 +10,7 @@
 """
 
 from skinware.realtime._clock import NS_PER_S, TURN_S, WAIT_SLICE_NS, Periodic, boot, now_ns, period_ns, short_turns
-from skinware.realtime._kernel import Refusal, cpus_from_text
-from skinware.realtime._profile import Profile
+from skinware.realtime._profile import Profile, Refusal, cpus_from_text
 
 __all__ = [
     "NS_PER_S",

@@ -19,7 +19,7 @@ from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import ClosedChunk, McapFile, OpenChunk
-from skinware.transfer.codec import Encoder
+from skinware.transfer.codec import FrameEncoder
 
 _REPEATED_AFTER_NS = 60 * NS_PER_S
 _REPEATED_AFTER_BYTES = 64 << 20
@@ -156,7 +156,7 @@ class PendingChunk:
         schema: Schema,
         sample: Sample,
         time_ns: int,
-        encoder: Encoder,
+        encoder: FrameEncoder,
         head: Head,
         wall_ns: int | None = None,
     ) -> None:

@@ -41,7 +41,7 @@ class Damaged(Exception):
     """A chunk or the summary is not as it was written."""
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """One message.
 
     Attributes:
@@ -86,7 +86,7 @@ class ChunkContents:
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
-    messages: list[Message] = field(default_factory=list)
+    messages: list[McapMessage] = field(default_factory=list)
 
 
 class McapSource:
@@ -268,7 +268,7 @@ def _parsed(data: bytes, limits: Limits) -> ChunkContents:
             channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
             if time_ns > limits.time_ns:
                 raise Damaged("a message has a time that no clock has")
-            contents.messages.append(Message(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
+            contents.messages.append(McapMessage(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
         elif opcode == Opcode.CHANNEL:
             channel = _read(Channel, record)
             contents.channels[channel.id] = channel

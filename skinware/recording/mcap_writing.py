@@ -225,7 +225,8 @@ class McapFile:
         """
         self.check()
         free = os.fstatvfs(self._fd)
-        if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * self._summary_size + _LEAST_FREE:
+        summary_size = 2048 + self._index.size
+        if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * summary_size + _LEAST_FREE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
         index = chunk.index
         moved = ChunkIndex(
@@ -270,10 +271,6 @@ class McapFile:
                 os.close(fd)
             except OSError as error:  # network file systems report a full disk late
                 raise OSError(error.errno, error.strerror, str(self.path)) from None
-
-    @property
-    def _summary_size(self) -> int:
-        return 2048 + self._index.size
 
     def _summary(self, start: int) -> Iterator[bytes]:
         statistics = Statistics(

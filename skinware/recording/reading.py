@@ -14,7 +14,7 @@ from skinware.errors import BadRecording, ConfigurationError
 from skinware.limits import LIMITS, read_json
 from skinware.memory.namespace import is_name
 from skinware.realtime import NS_PER_S
-from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource, Message
+from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapMessage, McapSource
 from skinware.recording.timeline import GONE, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
@@ -146,9 +146,9 @@ class Recording:
         return list(self._json(CLOCK))
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Samples that were published meanwhile and could not be recorded."""
-        return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "lost")
+        return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "missed")
 
     @property
     def problems(self) -> list[str]:
@@ -357,7 +357,7 @@ class Recording:
                 if data is not None:
                     yield {**data, "time_s": self.time_s(message.time_ns)}
 
-    def _checked(self, topic: str, message: Message) -> dict[str, Any] | None:
+    def _checked(self, topic: str, message: McapMessage) -> dict[str, Any] | None:
         """Return the fields of a JSON message; None, with a note, if they are not what they should be."""
         try:
             data = read_json(message.data, dict[str, Any])

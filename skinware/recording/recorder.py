@@ -1,7 +1,8 @@
 """Record all samples of all services.
 
 One thread takes samples from the rings and never waits for the disk; another codes, compresses and writes them. If the
-second one cannot keep up (a slow disk), samples wait in memory; if that is full, they are not taken, and count as lost.
+second one cannot keep up (a slow disk), samples wait in memory; if that is full, they are not taken, and count as
+missed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Head, PendingChunk, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
-from skinware.transfer.codec import CodedColumn, Encoder
+from skinware.transfer.codec import CodedColumn, FrameEncoder
 from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
@@ -110,9 +111,9 @@ class Recorder:
         self._stopping = False
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Samples that were published meanwhile and could not be taken."""
-        return self._collector.lost
+        return self._collector.missed
 
     @property
     def services(self) -> list[str]:
@@ -150,7 +151,8 @@ class Recorder:
                     if now_ns() >= report_ns:
                         report_ns = max(report_ns + _REPORT_NS, now_ns())
                         report()
-                    taken = self._bytes_waiting < _MOST_WAITING and self._collector.take()
+                    waiting = self._bytes_given - self._coder.bytes_done
+                    taken = waiting < _MOST_WAITING and self._collector.take()
                     if taken:  # take together the samples that come soon
                         time.sleep(min(_LONGEST_REST_NS, self._collector.slack_ns // 4) / NS_PER_S)
                     self._collector.wait(WAIT_SLICE_NS // 5)
@@ -184,15 +186,11 @@ class Recorder:
     def happened(self, event: dict[str, Any]) -> None:
         self._jobs.put(_Happened(event))
 
-    @property
-    def _bytes_waiting(self) -> int:
-        return self._bytes_given - self._coder.bytes_done
-
 
 @dataclass
 class _Stream:
     head: Head
-    encoder: Encoder
+    encoder: FrameEncoder
     generation: Generation | None
 
 
@@ -293,7 +291,7 @@ class _Coder(threading.Thread):
         number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
         channel, schema = self.channels.of_service(service, GENERATION)
         columns = segment.layout.slot
-        encoder = Encoder([CodedColumn.of(column) for column in columns])
+        encoder = FrameEncoder([CodedColumn.of(column) for column in columns])
         generation = None
         if self._renderer is not None:
             with contextlib.suppress(BadRecording):  # viewers cannot show an unreadable driver

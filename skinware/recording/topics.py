@@ -22,8 +22,8 @@ _EVENT = {
         "event": {"type": "string", "description": "found, live, ... see Recordings in the documentation"},
         "service": {"type": "string"},
         "time_ns": {"type": "integer", "description": "CLOCK_MONOTONIC"},
-        "count": {"type": "integer", "description": "lost: how many samples"},
-        "before": {"type": "integer", "description": "lost: sequence of the sample after them"},
+        "count": {"type": "integer", "description": "missed: how many samples"},
+        "before": {"type": "integer", "description": "missed: sequence of the sample after them"},
         "why": {"type": "string", "description": "unreadable: the reason"},
         "for_ns": {"type": "integer", "description": "suspended: for how long"},
         "by_ns": {"type": "integer", "description": "clock_stepped: by how much"},
@@ -54,7 +54,7 @@ _FRAME_TEXT = b"""\
 One frame: u8 generation, u8 sequence, i8 acquired_ns, i8 published_ns, u8 flags, u8 after, little-endian; a byte for
 each column, how it is coded; u4 of each, its size; what changed in each since frame `after`."""
 _WIRE_TEXT = b"""\
-What went over a wire: u8 generation, u8 sequence, i8 published_ns, u8 lost, little-endian; then pieces: u4 size,
+What went over a wire: u8 generation, u8 sequence, i8 published_ns, u8 missed, little-endian; then pieces: u4 size,
 u4 count, u1 form (1: struct can_frame, 2: struct canfd_frame, 3: bytes), u1 is_sent, 6 bytes; i8 time_ns of each frame,
 or one of all bytes; the frames, or bytes up to a multiple of 8."""
 _GENERATION_TEXT = b"""\

@@ -130,8 +130,8 @@ def _export(
             wires.append((wire, name))
         else:
             exported.notes.append(f"{wire.bus} of {wire.driver} left out: the format has no serial lines")
-        if wire.lost:
-            exported.notes.append(f"{wire.bus} of {wire.driver}: {wire.lost} lost while it was recorded")
+        if wire.missed:
+            exported.notes.append(f"{wire.bus} of {wire.driver}: {wire.missed} missed while it was recorded")
     if not wires:
         what = "no frame of a CAN bus" if exported.notes else "no wire"
         raise BadRecording(f"{recording.path}: {what} was recorded: skin-record --wire records them")

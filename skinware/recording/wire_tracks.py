@@ -2,7 +2,7 @@
 
 A message holds a sample of the driver's wire service (:mod:`skinware.wire`)::
 
-    header      32 bytes: u8 generation, u8 sequence, i8 published_ns, u8 lost
+    header      32 bytes: u8 generation, u8 sequence, i8 published_ns, u8 missed
     pieces      of one bus
 """
 
@@ -23,7 +23,7 @@ from skinware.recording.tracks import ChunkSource
 from skinware.wire import read_pieces
 
 _HEADER = struct.Struct("<QQqQ")
-"""Generation and sequence of the sample, its time of publication, frames or bytes lost on the bus so far."""
+"""Generation and sequence of the sample, its time of publication, frames or bytes missed on the bus so far."""
 _LATEST_S = 1.0
 """A frame is published at most so long after it crossed the wire."""
 _WINDOW_NS = 2 * NS_PER_S
@@ -46,7 +46,7 @@ FRAME = np.dtype(
 def message_of(frame: Sample) -> bytes:
     """Return the message of a sample of a driver's wire service."""
     used = int(frame.column("used")[()])
-    header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("lost")[()]))
+    header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("missed")[()]))
     return header + frame.column("pieces")[:used].tobytes()
 
 
@@ -108,15 +108,15 @@ class WireTrack:
         self.channel: int = channel
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames or bytes that the driver received and had no room to publish.
 
         Losses before the driver are in its ``bus_counters``.
         """
-        lost: dict[int, int] = {}
+        missed: dict[int, int] = {}
         for generation, count, _, _ in self._batches(0.0, None):
-            lost[generation] = max(lost.get(generation, 0), count)
-        return sum(lost.values())
+            missed[generation] = max(missed.get(generation, 0), count)
+        return sum(missed.values())
 
     def pieces(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WirePiece]:
         """Yield all pieces as they came; damaged ones are left out and named in the recording's ``problems``.
@@ -181,7 +181,7 @@ class WireTrack:
         return frames[np.argsort(frames["time_ns"], kind="stable")]
 
     def _batches(self, start_s: float, end_s: float | None) -> Iterator[tuple[int, int, int, memoryview]]:
-        """Yield (generation, lost so far, ns since 1970 minus CLOCK_MONOTONIC, pieces) of every message."""
+        """Yield (generation, missed so far, ns since 1970 minus CLOCK_MONOTONIC, pieces) of every message."""
         until_s = None if end_s is None else end_s + _LATEST_S
         for contents in self._recording.chunks({self.channel}, start_s, until_s):
             for message in contents.messages:
@@ -190,11 +190,11 @@ class WireTrack:
                 if len(message.data) < _HEADER.size:
                     self._recording.note(f"wire of {self.bus}: a message is shorter than its header")
                     continue
-                generation, _, published_ns, lost = _HEADER.unpack_from(message.data)
+                generation, _, published_ns, missed = _HEADER.unpack_from(message.data)
                 if not (LIMITS.is_time(message.time_ns) and LIMITS.is_time(published_ns)):
                     self._recording.note(f"wire of {self.bus}: a message has a time that no clock has")
                     continue
-                yield generation, lost, message.time_ns - published_ns, message.data[_HEADER.size :]
+                yield generation, missed, message.time_ns - published_ns, message.data[_HEADER.size :]
 
     def __repr__(self) -> str:
         return f"<WireTrack of {self.bus!r} of {self.driver!r}>"

@@ -16,7 +16,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from skinware.errors import BridgeError, ConfigurationError, MissingExtra
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.messages import DISCOVERY_TOPIC, PARTICIPANT_DATA, endpoint_data, entities
 from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
@@ -106,7 +106,7 @@ class DdsNode:
         self._writers: list[_DdsWriter] = []
         self._services: list[_DdsService] = []
         self._worker: _RequestThread | None = None
-        self._info = self._writer(DISCOVERY_TOPIC, types.PARTICIPANT, Qos(depth=1, latched=True), is_listed=False)
+        self._info = self._writer(DISCOVERY_TOPIC, messages.PARTICIPANT, Qos(depth=1, latched=True), is_listed=False)
         self._publish_endpoints()
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
@@ -305,7 +305,7 @@ class _RequestThread:
 def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
     """Return a type for Cyclone DDS, which checks incoming messages by it."""
     fields: dict[str, Any] = dict(_REQUEST_ID) if with_id else {}
-    for field in _FIELD.finditer(types.definition(message_type)):
+    for field in _FIELD.finditer(messages.definition(message_type)):
         kind: Any = _PLAIN.get(field["type"]) or _type(MessageType(field["type"].replace("/", "/msg/"), ""))
         if field["bound"]:
             kind = idl.bounded_str[int(field["bound"])]

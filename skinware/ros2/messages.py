@@ -1,4 +1,4 @@
-"""Build messages of ROS 2 in CDR that need no frame: diagnostics, transforms, answers, and the endpoints of a node."""
+"""Messages and services of ROS 2: their types, with definitions and hashes, and those in CDR that need no frame."""
 
 from __future__ import annotations
 
@@ -6,8 +6,89 @@ from collections.abc import Collection, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+from skinware.conversion import ros_messages
 from skinware.conversion.ros_messages import Cdr
-from skinware.ros2.transport import Distro, NodeIdentity
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity, ServiceType
+
+_KEY_VALUE = "string key\nstring value\n"
+_DIAGNOSTIC_STATUS = """\
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values
+"""
+_PARTICIPANT_ENTITIES = """\
+rmw_dds_common/Gid gid
+rmw_dds_common/NodeEntitiesInfo[] node_entities_info_seq
+"""
+_NODE_ENTITIES = """\
+string<=256 node_namespace
+string<=256 node_name
+rmw_dds_common/Gid[] reader_gid_seq
+rmw_dds_common/Gid[] writer_gid_seq
+"""
+TEXTS = {
+    **ros_messages.TEXTS,
+    "diagnostic_msgs/KeyValue": _KEY_VALUE,
+    "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
+    ),
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "rmw_dds_common/Gid": "uint8[16] data\n",
+    "rmw_dds_common/NodeEntitiesInfo": _NODE_ENTITIES,
+    "rmw_dds_common/ParticipantEntitiesInfo": _PARTICIPANT_ENTITIES,
+    "std_srvs/srv/Trigger_Request": "uint8 structure_needs_at_least_one_member\n",
+    "std_srvs/srv/Trigger_Response": "bool success\nstring message\n",
+}
+"""Definitions, by type; names of messages are without ``msg``."""
+
+POINTS = MessageType(
+    "sensor_msgs/msg/PointCloud2", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+)
+IMAGE = MessageType("sensor_msgs/msg/Image", "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47")
+SKIN_FRAME = MessageType(
+    "skinware_msgs/msg/SkinFrame", "RIHS01_4c6c7978ff329a043a35d3762fc01b81ab8bfbf3d39510eaae7762e0c88d6654"
+)
+SENSORS = MessageType(
+    "skinware_msgs/msg/Sensors", "RIHS01_223f66244e68a28a02cb2d2591b01679d9264cfe19da5262d3f45178f7c40799"
+)
+DIAGNOSTICS = MessageType(
+    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+)
+TRANSFORMS = MessageType(
+    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+)
+TRIGGER = ServiceType(
+    "std_srvs/srv/Trigger",
+    "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    MessageType(
+        "std_srvs/srv/Trigger_Request", "RIHS01_d010825374ce8918e72bfd826c82603e60f45419e932ea976f807b74a863a199"
+    ),
+    MessageType(
+        "std_srvs/srv/Trigger_Response", "RIHS01_2d946c21e2fc3f1e9ca6986a8191d85fcc70097a8bb7771a053564bc47009cdf"
+    ),
+)
+PARTICIPANT = MessageType(
+    "rmw_dds_common/msg/ParticipantEntitiesInfo",
+    "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",
+)
+OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
+"""Types of point clouds and images, by the names of their definitions."""
+
+
+def definition(message_type: MessageType) -> str:
+    return TEXTS[message_type.name.replace("/msg/", "/")]
+
 
 DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""

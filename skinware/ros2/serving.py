@@ -12,7 +12,7 @@ from skinware.errors import NamespaceError, RequestTimeout
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus, diagnostics, trigger_response
 from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
@@ -44,14 +44,14 @@ class ServedReport:
         state: as :func:`skinware.state.life_of`; ``gone``: it was withdrawn.
         rate_hz: frames that it publishes; None: not known yet.
         age_ms: of its newest data; None: no frame so far.
-        lost: frames so far that a subscriber wanted and that could not be taken.
+        missed: frames so far that a subscriber wanted and that could not be taken.
         left_out: messages that were not sent, because the carrier took no more.
     """
 
     state: str
     rate_hz: float | None
     age_ms: float | None
-    lost: int
+    missed: int
     messages: int
     left_out: int
 
@@ -74,12 +74,12 @@ class _ServedDriver:
     look_ns: int = 0
     is_over: bool = False
     wants_frames: bool = False
-    lost: int = 0
+    missed: int = 0
 
     def take(self, frame: DriverSnapshot, *, wants_frames: bool) -> None:
         before = self.frame
         if before is not None and wants_frames and self.wants_frames and frame.generation == before.generation:
-            self.lost += frame.sequence - before.sequence - 1
+            self.missed += frame.sequence - before.sequence - 1
         self.frame, self.wants_frames, self.is_over = frame, wants_frames, False
 
     def publish_last(self) -> None:
@@ -119,7 +119,7 @@ class Ros2Server:
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _ServedDriver] = {}
         self._troubles: set[str] = set()
-        self._diagnostics = node.publisher("/diagnostics", types.DIAGNOSTICS, Qos())
+        self._diagnostics = node.publisher("/diagnostics", messages.DIAGNOSTICS, Qos())
         self._stopping = False
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
@@ -154,7 +154,7 @@ class Ros2Server:
         """Return the state of all drivers that were found at any time, by name."""
         reports = {}
         for name, served in self._served.items():
-            live, traffic = self._live.get(name), (served.lost, served.topics.messages, served.topics.left_out)
+            live, traffic = self._live.get(name), (served.missed, served.topics.messages, served.topics.left_out)
             if live is None:
                 reports[name] = ServedReport(GONE, 0.0, None, *traffic)
                 continue
@@ -209,7 +209,7 @@ class Ros2Server:
         topics = DriverTopics(self._node, self._prefix, name)
         self._served[name] = served = _ServedDriver(topics)
         if self._with_tare:
-            served.end_tare = self._node.service(f"{topics.base}/tare", types.TRIGGER, lambda _: self._tare(name))
+            served.end_tare = self._node.service(f"{topics.base}/tare", messages.TRIGGER, lambda _: self._tare(name))
         return served
 
     def _report_once(self, text: str) -> None:

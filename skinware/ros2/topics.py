@@ -11,7 +11,7 @@ from skinware.conversion.showing import Showing, in_topic
 from skinware.conversion.tables import sensor_names
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import now_ns
-from skinware.ros2 import messages, types
+from skinware.ros2 import messages
 from skinware.ros2.transport import Node, Qos, TopicPublisher
 from skinware.status import Status
 from skinware.structure import Structure
@@ -35,8 +35,8 @@ class DriverTopics:
         self._generation = 0
         self._showing: Showing | None = None
         self._pictures: dict[str, TopicPublisher] = {}
-        self._frames = node.publisher(f"{self.base}/frame", types.SKIN_FRAME, Qos())
-        self._sensors = node.publisher(f"{self.base}/sensors", types.SENSORS, _LATCHED)
+        self._frames = node.publisher(f"{self.base}/frame", messages.SKIN_FRAME, Qos())
+        self._sensors = node.publisher(f"{self.base}/sensors", messages.SENSORS, _LATCHED)
 
     @property
     def wants_frames(self) -> bool:
@@ -74,7 +74,7 @@ class DriverTopics:
                 self._pictures.pop(topic).close()
             for topic, schema in topics.items():
                 if topic not in self._pictures:
-                    message_type = types.OF_SCHEMAS[schema.name]
+                    message_type = messages.OF_SCHEMAS[schema.name]
                     self._pictures[topic] = self._node.publisher(self._prefix + topic, message_type, Qos())
         sensors = ros_messages.sensors(structure, sensor_names(structure), frame.generation, time_ns)
         self._send(self._sensors, sensors)
@@ -95,7 +95,7 @@ class Transforms:
     def __init__(self, node: Node, root: str) -> None:
         self._root = root
         self._frames: set[str] = set()
-        self._publisher = node.publisher("/tf_static", types.TRANSFORMS, _LATCHED)
+        self._publisher = node.publisher("/tf_static", messages.TRANSFORMS, _LATCHED)
 
     def add(self, structure: Structure) -> None:
         """Publish the frames of a driver's sensors together with those of other drivers, if any is new."""

@@ -25,7 +25,7 @@ class ServiceReader(Taking[SampleT]):
     """Reads one service, and attaches again by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Samples of one generation come in order; a reader that is
-    slow loses samples (``lost`` counts them exactly, over restarts too) and never disturbs the writer or other readers.
+    slow misses samples (``missed`` counts them exactly, over restarts too) and never disturbs the writer or others.
 
     Args:
         name: the service.
@@ -50,14 +50,14 @@ class ServiceReader(Taking[SampleT]):
         super().__init__(name, namespace, timeout_s, announce)
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Samples that were published since the first one that was taken, and that were not taken.
 
         Those of generations that came and went meanwhile are counted too: each file has the number of samples that
         were published under the name before it. It is unknown only if the namespace's files were removed in between.
         """
         self._settle()
-        return self._accounts.record.lost
+        return self._accounts.record.missed
 
     @property
     def statistics(self) -> ReaderRecord:
@@ -182,7 +182,7 @@ class ServiceReader(Taking[SampleT]):
         """Every sample, one after the other, as long as this program keeps up within the ring's slots.
 
         For recorders and tests; a control loop wants the newest (``frames``). Samples that were overwritten before
-        their turn are counted in ``lost``. As long as the loop lives, other threads of this process keep the
+        their turn are counted in ``missed``. As long as the loop lives, other threads of this process keep the
         interpreter for 0.1 ms at the most.
 
         Raises:
@@ -293,7 +293,7 @@ class Tap(ServiceReader[SampleT]):
 
         Args:
             with_first: begin with the first sample of the generation at hand, otherwise with the one that is its newest
-                now. Samples that are overwritten before they are taken are lost.
+                now. Samples that are overwritten before they are taken are missed.
         """
         self._accounts.begin_loop("in order")
         self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
@@ -338,7 +338,7 @@ class Tap(ServiceReader[SampleT]):
             raise Overrun(f"service {self.name!r}: sample {sequence} was overwritten before it was copied")
         before = self._last
         taken = self._newest_now(lambda: frame, True)
-        if before is not None and before > taken.position:  # it came before, and is not lost again
+        if before is not None and before > taken.position:  # it came before, and is not missed again
             self._last = before
         return taken
 

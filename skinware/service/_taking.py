@@ -1,4 +1,4 @@
-"""Take the samples of a service: wait for them, and count them and those that were lost."""
+"""Take the samples of a service: wait for them, and count them and those that were missed."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class Accounts:
         self._record.kind = kind
         self._in_loop = True
 
-    def taken(self, lost: int) -> None:
+    def taken(self, missed: int) -> None:
         self._record.frames += 1
-        if lost:
-            self._record.lost += lost
+        if missed:
+            self._record.missed += missed
 
     @property
     def due_ns(self) -> int:
@@ -62,7 +62,7 @@ class Accounts:
 
     def settle(self, turns: Turns) -> None:
         self._record.frames += turns.frames
-        self._record.lost += turns.lost
+        self._record.missed += turns.missed
         self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
 
     def end_turn(self, turn: tuple[int, int] | None) -> None:
@@ -126,7 +126,7 @@ class Taking(Attachment[SampleT]):
             published = ring.segment.published_before
             if published < taken:  # the count began again: the lock's file was removed
                 published = before.published
-            self._accounts.record.lost += published - taken
+            self._accounts.record.missed += published - taken
             self._last = (ring.generation, 0)
         super()._adopt(ring)
 
@@ -211,7 +211,7 @@ class Taking(Attachment[SampleT]):
         frame = self._ring.copy(last + 1)
         if frame is not None:
             return frame
-        for _ in range(COPY_ATTEMPTS):  # it lost some
+        for _ in range(COPY_ATTEMPTS):  # it missed some
             latest = self._ring.latest
             oldest = max(last + 1, latest - self._ring.slot_count + 2)
             for sequence in range(oldest, latest + 1):
@@ -308,11 +308,11 @@ class Taking(Attachment[SampleT]):
 
     def _count(self, frame: SampleT) -> None:
         last = self._last
-        lost = 0
+        missed = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
-            lost = frame.sequence - last[1] - 1
+            missed = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
-        self._accounts.taken(lost)
+        self._accounts.taken(missed)
         self._open_turn = frame.acquired_ns, now_ns()
 
 

@@ -34,7 +34,7 @@ class Writer(Ownership):
             from_last: begin with the contents of the newest sample, to change parts of it only; otherwise the arrays
                 hold something old.
             skip: sequences before this sample that are left out, where a program passes samples on and some did not
-                arrive: readers count them as lost. It may become one more: the newest sample stays readable meanwhile.
+                arrive: readers count them as missed. It may become one more: the newest sample stays readable.
             contents: a slot of a service with the same columns (``Sample.slot``), to begin with.
 
         Raises:
@@ -287,7 +287,7 @@ class ServiceWriter(Writer):
             columns: as for a new writer.
             static: as for a new writer.
             rate_hz: the nominal rate from now on; None: as before.
-            skip: samples before its first one that are left out; readers count them as lost.
+            skip: samples before its first one that are left out; readers count them as missed.
 
         Raises:
             ConfigurationError: columns that the format cannot hold; the old generation then goes on.

@@ -7,10 +7,10 @@
         calm = baseline.take(frame)
         print(calm.value[calm.touched])     # 0 = no touch, in the type's unit
 
-The rule works per taxel, with times from the frames and never from a nominal rate. A level above a taxel's own baseline
-and noise is a touch, with hysteresis. A slow change that a patch has in common is drift, also of taxels in contact:
-each has learned how strongly it follows. Taxels near a contact keep their own baselines, and for some seconds after it.
-When most of a contact's load goes at once, it is over, and the rest counts as drift if drift can have made it.
+One question decides everything: how much of this could be drift? Each taxel has an offset and knows how uncertain it
+is. A value that is above the offset by more than noise and uncertainty explain is a touch. Under a touch the offset is
+predicted from what the patch has in common, and its uncertainty grows by the drift that was measured at rest. A touch
+lasts until its load is gone, or has fallen to what drift could be. All times are those of the frames.
 :mod:`.rule` has all numbers.
 """
 
@@ -29,13 +29,28 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.drift import Drift, Sag
+from skinware.tactile.offsets import Offsets
 from skinware.tactile.rest import Rest
-from skinware.tactile.rule import FORGET_AFTER_S, SIGNED_TYPES, UNUSABLE, BaselineSettings, resolution_of
-from skinware.tactile.touches import Thresholds, Touches
+from skinware.tactile.rule import (
+    EPSILON,
+    FEW_LEVELS,
+    FORGET_AFTER_S,
+    OFF_TO_ON,
+    RESETTLE_S,
+    SIGNED_TYPES,
+    STEPS_OF_A_TOUCH,
+    TINY,
+    UNUSABLE,
+    BaselineSettings,
+    Why,
+    resolution_of,
+)
+from skinware.tactile.surroundings import Surroundings
+from skinware.tactile.touches import Touches
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +63,10 @@ class Calm:
         touched: (n,) bool.
         held: (n,) bool, near a contact, or near where one was some seconds ago.
         baseline: (n,) float32, what each taxel would read if nothing touched it; NaN before that is known.
+        uncertainty: (n,) float32, standard deviation of the baseline, and so of ``value``, beside the noise; NaN before
+            it is known.
         noise: (n,) float32, standard deviation from frame to frame; NaN before it is known.
+        why: (n,) uint8, why each is in its state: a :class:`.Why`.
         forced: (n,) bool, the baseline was put where the value is, at once.
         usable: (n,) bool, value and baseline are of this frame; others show what was last known, or nothing yet.
     """
@@ -57,7 +75,9 @@ class Calm:
     touched: Flags
     held: Flags
     baseline: Floats
+    uncertainty: Floats
     noise: Floats
+    why: npt.NDArray[np.uint8]
     forced: Flags
     usable: Flags
 
@@ -68,13 +88,14 @@ class _Intake:
     Attributes:
         seen: (n,) bool, which taxels have ever had a value.
         last: (n,) float32, the newest value of each.
-        smooth: (n,) float32, the same, smoothed over time.
+        few_levels: whether no value has ever been beyond two steps from 0.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, resolution: float) -> None:
         self.seen: Flags = np.zeros(n, bool)
         self.last: Floats = np.full(n, np.nan, np.float32)
-        self.smooth: Floats = np.full(n, np.nan, np.float32)
+        self.few_levels = resolution > 0
+        self._most = FEW_LEVELS * resolution
         self._away_s: Floats = np.zeros(n, np.float32)
         self._time_ns: int | None = None
 
@@ -93,30 +114,13 @@ class _Intake:
             self.seen &= ~lost
         return lost
 
-    def take(self, values: Floats, usable: Flags, jumped: Flags | None, share: float, most: Floats | None) -> Floats:
-        """Take a frame in, and return (n,) how far the hardware moved its own baseline just before it.
-
-        Args:
-            values: (n,) values of the frame.
-            usable: (n,) which of them are of this frame.
-            jumped: (n,) where the hardware moved its baseline.
-            share: of the way to the newest value that the smoothed value goes.
-            most: (n,) by which the smoothed value may be above the newest one at most, or None.
-        """
-        now = np.where(usable, values, self.last)
+    def take(self, values: Floats, usable: Flags) -> None:
+        """Take a frame in."""
+        np.copyto(self.last, values, where=usable)
         if not self.seen.all():
-            new = usable & ~self.seen
-            self.smooth[new] = now[new]
-            self.seen |= new
-        step = np.zeros_like(now)
-        if jumped is not None and jumped.any():
-            step[jumped] = now[jumped] - self.last[jumped]
-            self.smooth += step
-        self.smooth += np.where(usable, now - self.smooth, np.float32(0)) * np.float32(share)
-        if most is not None:
-            np.minimum(self.smooth, now + most, out=self.smooth, where=usable)
-        self.last = now
-        return step
+            self.seen |= usable
+        if self.few_levels:
+            self.few_levels = not (usable & (np.abs(values) > self._most)).any()
 
 
 class Baseline:
@@ -132,6 +136,7 @@ class Baseline:
         settings: default: those of the class.
         resolution: the step of the values; 0 if they have none.
         signed: a touch may move a value to both sides.
+        limits: least and largest value of the type; a taxel there is saturated.
         neighbours: (n, k) int, the taxels near each, filled with -1: they are held with it, instead of its module.
 
     Attributes:
@@ -146,24 +151,23 @@ class Baseline:
         *,
         resolution: float = 1.0,
         signed: bool = False,
+        limits: tuple[float, float] = (-math.inf, math.inf),
         neighbours: npt.NDArray[np.integer] | None = None,
     ) -> None:
-        module, self._patch = np.asarray(module, np.intp), np.asarray(patch, np.intp)
-        n = len(self._patch)
+        module, patch = np.asarray(module, np.intp), np.asarray(patch, np.intp)
+        n = len(patch)
         self.type_name: str = ""
-        self._signed = signed
         self._settings = settings or BaselineSettings()
-        self._intake = _Intake(n)
-        self._rest = Rest(n)
-        self._thresholds = Thresholds(n, resolution)
-        self._touches = Touches(module, neighbours)
-        self._drift = Drift(self._patch)
-        self._sag = Sag(module, self._patch)
+        self._resolution, self._limits = resolution, limits
+        self._intake = _Intake(n, resolution)
+        self._ready: Flags = np.zeros(n, bool)
+        self._offsets = Offsets(patch)
+        self._rest = Rest(self._offsets.patches)
+        self._touches = Touches(module, patch, signed=signed)
+        self._surroundings = Surroundings(module, patch, neighbours)
         self._all_held = False
-        self._below_s: Floats = np.zeros(n, np.float32)
         self._forced: Flags = np.zeros(n, bool)
         self._suspect: Flags | None = None
-        self._thresholds.set(self._rest, self._settings)
 
     @classmethod
     def of(
@@ -185,12 +189,14 @@ class Baseline:
         Raises:
             StructureError: no such type here.
         """
+        sensor_type = structure.type(type_name)
         baseline = cls(
             structure.module_of(type_name),
             structure.patch_of(type_name),
             settings,
             resolution=resolution_of(structure, type_name),
             signed=type_name.startswith(SIGNED_TYPES),
+            limits=(sensor_type.minimum, sensor_type.maximum),
             neighbours=neighbours,
         )
         baseline.type_name = type_name
@@ -199,7 +205,7 @@ class Baseline:
     @property
     def ready(self) -> Flags:
         """(n,) bool, which taxels have a baseline; a copy."""
-        return self._rest.ready.copy()
+        return self._ready.copy()
 
     @property
     def refused_share(self) -> float:
@@ -214,7 +220,6 @@ class Baseline:
     @settings.setter
     def settings(self, settings: BaselineSettings) -> None:
         self._settings = settings
-        self._thresholds.set(self._rest, settings)
 
     def hold(self, on: bool) -> None:
         """Leave all baselines as they are, except for common drift, until ``hold(False)``."""
@@ -234,16 +239,23 @@ class Baseline:
         """
         taxels = self._intake.seen.copy()
         if patch is not None:
-            taxels &= self._patch == patch
+            taxels &= self._offsets.patches.group == patch
         if not taxels.any():
             raise ConfigurationError("nothing to tare: no value has come yet")
-        if self._thresholds.minimum_on == 0 and not self._rest.ready[taxels].all():
+        if self._minimum_on == 0 and not self._ready[taxels].all():
             raise ConfigurationError("the noise is not known yet: wait until it is measured, or set minimum_on")
-        self._touches.forget(taxels)
-        self._rest.begin_at(np.flatnonzero(taxels), self._intake.smooth[taxels], self._rest.noise[taxels])
-        self._thresholds.set(self._rest, self._settings)
+        rows = np.flatnonzero(taxels)
+        fresh = rows[~self._ready[rows]]
+        self._offsets.noise2[fresh] = self._least_noise2(self._intake.last[fresh])
+        self._ready |= taxels
+        now = self._intake.last[rows]
+        known = np.isfinite(self._offsets.level[rows]) & ~np.isin(rows, fresh)
+        now = np.where(known, self._offsets.level[rows] + self._touches.smooth[rows], now)
+        self._offsets.put(rows, now)
+        self._touches.forget(rows)
+        self._surroundings.forget(taxels)
         self._forced |= taxels
-        return int(taxels.sum())
+        return len(rows)
 
     def take(self, frame: DriverSnapshot) -> Calm:
         """Calm the next frame of the driver.
@@ -276,38 +288,149 @@ class Baseline:
         """
         given = np.asarray(values, np.float32)
         usable = np.isfinite(given) if usable is None else np.isfinite(given) & usable
-        settings, intake, rest = self._settings, self._intake, self._rest
+        settings, intake, offsets, touches = self._settings, self._intake, self._offsets, self._touches
         passed_s = intake.pass_time(time_ns)
         lost = intake.lost(usable, passed_s)
         if lost.any():
-            self._touches.forget(lost)
-            rest.forget(lost)
-        self._take(given, usable, passed_s, None if jumped is None else usable & rest.ready & np.asarray(jumped, bool))
-        if not rest.ready.all():
-            waiting = usable & ~rest.ready
-            minimum_on = self._thresholds.minimum_on
-            if waiting.any() and rest.measure(time_ns, intake.last, waiting, intake.seen, minimum_on, settings):
-                self._thresholds.set(rest, settings)
-        live = usable & rest.ready
-        deviation = np.where(live, intake.smooth - rest.level, np.float32(0))
-        held = self._follow_touches(deviation, live, passed_s)
-        free = live & ~held
-        self._recover(deviation, free, passed_s)
-        rest.level += self._drift.step(
-            deviation,
-            live,
-            free,
-            passed_s=passed_s,
-            tau_s=settings.tau_s,
-            common_tau_s=settings.common_tau_s,
-            limit=self._thresholds.on,
-        )
-        self._sag.sink(-self._drift.alone)
-        above = intake.last - rest.level
-        touched = self._touches.shown(self._load(above), self._load(intake.smooth - rest.level), self._thresholds.off)
-        value = np.where(touched, above if self._signed else np.maximum(above, 0), np.float32(0))
+            self._ready &= ~lost
+            offsets.level[lost] = np.nan
+            touches.forget(np.flatnonzero(lost))
+        if jumped is not None:
+            moved = usable & self._ready & np.asarray(jumped, bool)
+            offsets.level[moved] += given[moved] - intake.last[moved]
+            self._forced |= moved
+        intake.take(given, usable)
+        if not self._ready.all():
+            self._measure(time_ns, usable, passed_s)
+        live = usable & self._ready
+        deviation = np.where(live, intake.last - offsets.level - touches.remains, np.float32(0))
+        free = live & ~touches.touched & touches.has_settled
+        spread = np.sqrt(offsets.noise2)
+        if not touches.signed:
+            low = touches.smooth < -settings.off_sigma * spread
+            free &= ~self._surroundings.sagging & ~(self._surroundings.below & low)
+        offsets.follow_common(deviation, free, passed_s)
+        on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
+        off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
+        touches.follow(deviation, live, on, passed_s, settings.smooth_s)
+        most_s = settings.maximum_hold_s or math.inf
+        over = touches.judge(deviation, live, on, off, offsets, passed_s, most_s)
+        if not self._all_held:
+            self._let_go(over, live, on, off, deviation, passed_s)
+        surroundings = self._surroundings
+        held = surroundings.hold(touches, live, passed_s, settings.settle_s)
+        if not touches.signed:
+            surroundings.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
+        low = self._recover(deviation, live, on, passed_s)
+        if not self._all_held:
+            floor = np.where(touches.used > 0, np.float32(passed_s / RESETTLE_S), np.float32(passed_s / settings.tau_s))
+            learns = live & ~touches.touched & ~surroundings.sagging & touches.has_settled
+            learns &= touches.load(deviation) < on  # a touch that begins is no drift
+            calm = learns & (np.abs(touches.smooth) < np.float32(0.5) * off)
+            offsets.learn(deviation, learns, calm, np.minimum(floor, np.float32(0.5)), passed_s)
+            np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
+        touches.remember(deviation, on, passed_s)
+        return self._calm(deviation, live, held, low, off)
+
+    @property
+    def _minimum_on(self) -> float:
+        given = self._settings.minimum_on
+        if given is not None:
+            return given
+        return self._resolution * (0.5 if self._intake.few_levels else STEPS_OF_A_TOUCH)
+
+    def _least_noise2(self, level: Floats) -> Floats:
+        rounding = self._resolution * (0.05 if self._intake.few_levels else 1 / math.sqrt(12))
+        least: Floats = np.fmax(np.float32(rounding), EPSILON * np.abs(level) + TINY) ** 2
+        return least
+
+    def _measure(self, time_ns: int, usable: Flags, passed_s: float) -> None:
+        """Measure the taxels that wait for a baseline."""
+        waiting, intake = usable & ~self._ready, self._intake
+        if not waiting.any():
+            return
+        found = self._rest.measure(time_ns, intake.last, waiting, intake.seen, self._minimum_on, self._settings)
+        if found is None or not len(found.taxels):
+            return
+        rows, first = found.taxels, not self._ready.any()
+        noise2 = np.maximum(found.noise2, self._least_noise2(found.level))
+        self._offsets.begin(rows, found.level, noise2, found.gain, found.gain_variance)
+        self._ready[rows] = True
+        if first:
+            patches = self._offsets.patches
+            number = np.maximum(patches.sum(self._ready), 1)
+            rounding = 3 * patches.sum(np.where(self._ready, self._offsets.noise2, 0)) / number**2
+            self._offsets.common.agility[:] = np.maximum(self._rest.moves2 - rounding, 0.01 * rounding) / max(
+                passed_s, 1e-3
+            )
+
+    def _let_go(self, over: Rows, live: Flags, on: Floats, off: Floats, deviation: Floats, passed_s: float) -> None:
+        """End touches: what is left of them is what the prediction was wrong by."""
+        offsets, touches = self._offsets, self._touches
+        if len(over):
+            left = touches.smooth[over]
+            firm = touches.peak[over] > 2 * on[over]  # a light one that flickers says nothing of its offset
+            offsets.variance[over] += left * left * firm
+            too_long = touches.contact_s[over] > (self._settings.maximum_hold_s or math.inf)
+            touches.end(over)
+            if too_long.any():
+                self._put(over[too_long], left[too_long], deviation)
+        back = self._surroundings.back(touches, on, passed_s)
+        if len(back):
+            self._put(back, touches.smooth[back], deviation)
+            touches.end(back)
+        stepped, by = touches.module_steps(live, on, offsets, passed_s)
+        if len(stepped):
+            self._put(stepped, by, deviation)
+            touches.end(stepped[touches.smooth[stepped] < off[stepped]])
+
+    def _recover(self, deviation: Floats, live: Flags, on: Floats, passed_s: float) -> Flags:
+        """Give new offsets to taxels whose old ones were learned under a load that is gone now."""
+        touches = self._touches
+        if touches.signed:
+            return np.zeros_like(live)
+        low = live & (touches.smooth < -on)
+        due = self._surroundings.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
+        if len(due) and not self._all_held:
+            self._put(due, touches.smooth[due], deviation)
+        return low
+
+    def _put(self, taxels: Rows, by: Floats, deviation: Floats) -> None:
+        """Move the offsets of k taxels at once."""
+        offsets, touches = self._offsets, self._touches
+        offsets.put(taxels, offsets.level[taxels] + by)
+        deviation[taxels] -= by
+        touches.smooth[taxels] -= by
+        self._forced[taxels] = True
+
+    def _calm(self, deviation: Floats, live: Flags, held: Flags, low: Flags, off: Floats) -> Calm:
+        offsets, touches, last = self._offsets, self._touches, self._intake.last
+        known = np.where(live, deviation, touches.smooth)
+        touched = touches.shown(known, off)
+        value = np.where(touched, known if touches.signed else np.maximum(known, 0), np.float32(0))
+        why = np.where(touched, np.uint8(Why.HELD), np.uint8(Why.REST))
+        why[~self._ready | (offsets.variance > offsets.noise2) & ~touches.touched] = Why.RELEARNING
+        why[low] = Why.COVERED
+        why[self._surroundings.returned > 0] = Why.DOUBTED
+        least, most = self._limits
+        if math.isfinite(least) and math.isfinite(most):
+            why[live & ((last >= most) | (last <= least)) & touches.touched] = Why.SATURATED
+        if self._intake.few_levels:
+            why[live] = Why.NO_RESOLUTION
         forced, self._forced = self._forced, np.zeros(len(live), bool)
-        return Calm(value, touched, held, rest.level.copy(), rest.noise.copy(), forced, live)
+        baseline = offsets.level + touches.remains
+        held = np.ones_like(held) if self._all_held else held
+        return Calm(
+            value,
+            touched,
+            held,
+            baseline,
+            offsets.uncertainty(),
+            np.sqrt(offsets.noise2),
+            why,
+            forced,
+            live,
+        )
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return all that was learned, by name: arrays (n,), copies."""
@@ -334,64 +457,16 @@ class Baseline:
             if given is None or given.dtype != array.dtype or given.ndim != 1 or len(given) < m:
                 raise ConfigurationError(f"no state of a baseline: {name} is missing or has a wrong shape or dtype")
         here[here] = state["ready"][rows[here]]
-        for name in learned.keys() - {"noise"}:
+        for name in learned:
             here[here] = np.isfinite(state[name][rows[here]])
         for name, array in learned.items():
             array[here] = state[name][rows[here]]
-        self._thresholds.set(self._rest, self._settings)
+        self._offsets.lose_common()
         return int(here.sum())
 
     def _learned(self) -> dict[str, npt.NDArray[Any]]:
-        rest, touches, drift = self._rest, self._touches, self._drift
-        own = {"ready": rest.ready, "base": rest.level, "noise": rest.noise}
-        of_touches = {name: getattr(touches, name) for name in ("touched", "level", "contact_s", "sunk", "settling_s")}
-        of_drift = {name: getattr(drift, name) for name in ("factor", "own", "common", "product", "square", "lag")}
-        return own | of_touches | of_drift
-
-    # -- steps of one frame -------------------------------------------------------------------------------------
-
-    def _load(self, deviation: Floats) -> Floats:
-        return np.abs(deviation) if self._signed else deviation
-
-    def _take(self, given: Floats, usable: Flags, passed_s: float, jumped: Flags | None) -> None:
-        """Take the values in; where the hardware moved its own baseline, this one moves with it."""
-        smooth_s = self._settings.smooth_s
-        share = -math.expm1(-passed_s / smooth_s) if smooth_s else 1.0
-        most = None if self._signed else self._thresholds.on  # the end of a touch shows soon, however firm it was
-        moved = self._intake.take(given, usable, jumped, share, most)
-        if jumped is not None:
-            self._forced |= moved != 0
-            self._rest.level += moved
-
-    def _follow_touches(self, deviation: Floats, live: Flags, passed_s: float) -> Flags:
-        """Judge touches and their ends; return (n,) the taxels that keep their own baselines."""
-        thresholds, settings = self._thresholds, self._settings
-        if not self._signed:
-            up = self._sag.come_back(deviation, self._touches.touched & live, thresholds.off, passed_s)
-            self._rest.level += up
-            deviation -= up
-        load = self._load(deviation)
-        self._touches.judge(load, live, thresholds)
-        if not self._all_held:
-            self._put(self._touches.over(load, live, thresholds.on, passed_s, settings), deviation)
-        held = self._touches.hold(live, passed_s, settings.settle_s)
-        return np.ones_like(held) if self._all_held else held
-
-    def _recover(self, deviation: Floats, free: Flags, passed_s: float) -> None:
-        """Give new baselines to taxels whose old ones were learned under a load that is gone now."""
-        if self._signed:
-            return
-        below = free & (deviation < -self._thresholds.on)
-        self._below_s = np.where(below, self._below_s + np.float32(passed_s), np.float32(0))
-        recovers = self._below_s >= max(self._settings.recover_s, 1e-9)
-        if recovers.any():
-            self._sag.sink(np.where(recovers, -deviation, np.float32(0)))
-            self._put(np.flatnonzero(recovers), deviation)
-
-    def _put(self, taxels: npt.NDArray[np.intp], deviation: Floats) -> None:
-        """Put the baselines of some taxels where their values are."""
-        if len(taxels):
-            self._rest.level[taxels] = self._intake.smooth[taxels]
-            self._forced[taxels] = True
-            self._below_s[taxels] = 0
-            deviation[taxels] = 0
+        offsets, touches = self._offsets, self._touches
+        of_offsets = {name: getattr(offsets, name) for name in ("level", "gain", "variance", "cross", "noise2")}
+        of_offsets["gain_variance"] = offsets.gain_variance
+        of_touches = {name: getattr(touches, name) for name in ("touched", "smooth", "peak", "used", "contact_s")}
+        return {"ready": self._ready} | of_offsets | of_touches

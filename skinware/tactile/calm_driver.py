@@ -78,8 +78,14 @@ class DriverSource:
             self.reader.close()
 
 
+SENSOR_COLUMNS = {"uncertainty": "<f4", "why": "u1"}
+"""What a calmed driver publishes of each sensor beside values and status: dtypes by name, see :class:`.Calm`."""
+
+
 class CalmedDriver:
-    """Publishes a driver again, with the output of a chain.
+    """Publishes a driver again, with the output of a chain, and how far that can be trusted.
+
+    ``uncertainty`` is in the unit in which values come to the baseline, NaN without one; ``why`` is a :class:`.Why`.
 
     Args:
         name: name of the driver.
@@ -115,6 +121,7 @@ class CalmedDriver:
                 driver_type="calm",
                 bus_counters=counters[0],
                 patch_counters=counters[1],
+                sensor_columns=SENSOR_COLUMNS,
                 namespace=self._into,
                 rate_hz=rate_hz,
                 group=self._group,
@@ -136,7 +143,7 @@ class CalmedDriver:
         for name in self._copied:
             columns[name][:] = frame.column(name)
         for name in self._unknown:
-            columns[name][:] = 0
+            columns[name][:] = np.nan if name == "uncertainty" else 0
         return columns
 
     def publish_stale(self) -> None:

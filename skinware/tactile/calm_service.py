@@ -224,7 +224,7 @@ class CalmService:
             "sequence": 0 if writer is None else writer.sequence,
             "driver_alive": self._source.alive,
             "frames": self.frames,
-            "lost": 0 if reader is None else reader.lost,
+            "missed": 0 if reader is None else reader.missed,
             "restored": self.restored,
             "ready": {name: int(stage.baseline.ready.sum()) for name, stage in stages.items()},
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},
@@ -259,6 +259,7 @@ class CalmService:
         if columns is None:
             return False
         chain.step(frame, columns["values"], columns["status"])
+        chain.tell_why(columns["uncertainty"], columns["why"])
         if self.health is not None:
             self.health.step(columns["status"], frame.acquired_ns)
         self._warn_of_waiting(chain)

@@ -107,7 +107,14 @@ class BaselineStage(Stage):
         self.taxels = replace(
             taxels, type=replace(before, minimum=-span if signed else 0.0, maximum=span), resolution=0.0
         )
-        self.baseline = Baseline(taxels.module, taxels.patch, settings, resolution=taxels.resolution, signed=signed)
+        self.baseline = Baseline(
+            taxels.module,
+            taxels.patch,
+            settings,
+            resolution=taxels.resolution,
+            signed=signed,
+            limits=(before.minimum, before.maximum),
+        )
         self.given: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
         self.calm: Calm | None = None
 
@@ -357,3 +364,10 @@ class Chain:
             values[index] = signal.values
             of_type = of_type | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
+
+    def tell_why(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:
+        """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
+        for name, stage in self.baseline_stages.items():
+            if stage.calm is not None:
+                index = self._before.index(name)
+                uncertainty[index], why[index] = stage.calm.uncertainty, stage.calm.why

@@ -20,7 +20,7 @@ from skinware.tactile.rule import FORGET_AFTER_S
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
-_VERSION = 1
+_VERSION = 2
 _HEALTH = "health/"
 _SAVE_EVERY_NS = 20 * NS_PER_S
 

@@ -239,8 +239,9 @@ class Health:
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
-        low = given < calm.baseline - np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
-        if self._noise.add(self._now_s, given - self._use.value, self._is_at_end(given), low, calm):
+        far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
+        low, free = given < calm.baseline - far, calm.usable & ~calm.touched & (given <= calm.baseline + far)
+        if self._noise.add(self._now_s, given - self._use.value, self._is_at_end(given), low, free, calm):
             self._clear = _CLEAR * self._typical_noise()
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))

@@ -66,7 +66,7 @@ class Noise:
         self._before_low: Floats = np.zeros((3, n), np.float32)
         """The sums when each taxel fell."""
 
-    def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, calm: Calm) -> bool:
+    def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, free: Flags, calm: Calm) -> bool:
         """Take the next frame in.
 
         Args:
@@ -74,13 +74,13 @@ class Noise:
             difference: (n,) of the values from those of the frame before.
             at_end: (n,) which are at an end of the range.
             low: (n,) which are far below their baselines.
+            free: (n,) which are neither touched nor far above their baselines, as at the beginning of a touch.
             calm: what the baseline made of the frame.
 
         Returns:
             Whether a measurement ends with it.
         """
         self._note_low(low, calm)
-        free = calm.usable & ~calm.touched
         both = free & self._was_free
         self._was_free = free
         difference = np.where(both, difference, np.float32(0))

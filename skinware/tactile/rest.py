@@ -1,4 +1,4 @@
-"""Measure what taxels read at rest: their levels and their noise."""
+"""Measure what taxels read at rest: their levels, their noise, and their gains to what their patch has in common."""
 
 from __future__ import annotations
 
@@ -9,35 +9,68 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.rule import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, MOVED_SHARE, BaselineSettings
+from skinware.tactile.offsets import Groups
+from skinware.tactile.rule import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD, MOVED_SHARE, BaselineSettings
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
 
 _MEDIAN_OF_VARIANCE = {4: 0.789, 5: 0.839, 6: 0.870, 7: 0.891, 8: 0.907, 9: 0.918, 10: 0.927}
 """Median of chi-square with m - 1 degrees of freedom, divided by m - 1."""
 
 
-class Rest:
-    """The baselines of n taxels, and how each begins: with a measurement while nothing moves it.
+class Measured(NamedTuple):
+    """The result for k taxels that begin.
 
     Attributes:
-        ready: (n,) bool, which taxels have a baseline.
-        level: (n,) float32, the baseline; NaN before it is known.
-        noise: (n,) float32, standard deviation from frame to frame; NaN before it is known.
-        refused_share: share of the taxels that have to wait for their baselines because they move.
+        taxels: (k,) which.
+        level: (k,) float32, offsets at the last frame.
+        noise2: (k,) float32, variances from frame to frame.
+        gain: (k,) float32, to the common mode.
+        gain_variance: (k,) float32.
     """
 
-    def __init__(self, n: int) -> None:
-        self.ready: Flags = np.zeros(n, bool)
-        self.level: Floats = np.full(n, np.nan, np.float32)
-        self.noise: Floats = np.full(n, np.nan, np.float32)
+    taxels: Rows
+    level: Floats
+    noise2: Floats
+    gain: Floats
+    gain_variance: Floats
+
+
+class Rest:
+    """Measures n taxels over the last seconds, in a tenth of them at a time, beside what their patch has in common.
+
+    Level and noise are medians over the tenths: a touch of a third of the time moves neither, and medians of means are
+    finer than the steps of the values, which medians of integers are not.
+
+    Args:
+        patches: the patches of the taxels.
+
+    Attributes:
+        refused_share: share of the taxels that have to wait because they move.
+        moves2: (n_patches,) by how much the common modes move from frame to frame, squared.
+    """
+
+    def __init__(self, patches: Groups) -> None:
         self.refused_share = 0.0
-        self._measurement: RestMeasurement | None = None
+        self.moves2 = np.zeros(patches.n)
+        self._patches = patches
+        self._clear()
+
+    def _clear(self) -> None:
+        n = len(self._patches.group)
+        self._first: Floats = np.full(n, np.nan, np.float32)
+        self._begun_ns: int | None = None
+        self._frames = 0
+        self._sums = np.zeros((6, n), np.float32)
+        """Of frames, deviations d from the first value, common modes c, d * d, d * c and c * c."""
+        self._blocks: deque[Floats] = deque(maxlen=BLOCKS)
+        self._common: Floats = np.zeros(self._patches.n, np.float32)
 
     def measure(
         self, time_ns: int, values: Floats, waiting: Flags, seen: Flags, minimum_on: float, settings: BaselineSettings
-    ) -> bool:
+    ) -> Measured | None:
         """Measure the taxels that wait for a baseline.
 
         Where many of them move, those that move go on waiting until they rest.
@@ -51,116 +84,77 @@ class Rest:
             settings: for its length and for thresholds.
 
         Returns:
-            Whether a measurement ended, so that taxels may have a baseline now.
+            Those that begin, if a measurement ended.
         """
-        if self._measurement is None:
-            self._measurement = RestMeasurement(len(values), settings.calibrate_s)
-        if not self._measurement.add(time_ns, values, waiting):
-            return False
-        taxels = np.flatnonzero(~self.ready)
-        found = self._measurement.result(taxels)
-        measured = np.isfinite(found.level)
-        moving = measured & (found.range > np.maximum(minimum_on, settings.on_sigma * found.noise))
+        if not self._add(time_ns, values, waiting, round(settings.calibrate_s * NS_PER_S / BLOCKS)):
+            return None
+        taxels = np.flatnonzero(np.isfinite(self._first))
+        level, found, moves = self._result(taxels)
+        measured = np.isfinite(level)
+        moving = measured & (moves > np.maximum(minimum_on, settings.on_sigma * np.sqrt(found.noise2)))
         refused = int(moving.sum()) > max(1, MOVED_SHARE * measured.sum())
         self.refused_share = int(moving.sum()) / int(seen.sum()) if refused else 0.0
         begins = measured & ~moving if refused else measured
         if not refused:
-            self._measurement = None  # a taxel that sends later starts a new one
-        self.begin_at(taxels[begins], found.level[begins], found.noise[begins])
-        return True
+            self._clear()  # a taxel that sends later starts a new one
+        return Measured(found.taxels[begins], *(array[begins] for array in found[1:]))
 
-    def begin_at(self, taxels: npt.NDArray[np.intp], level: Floats, noise: Floats) -> None:
-        """Give k taxels their (k,) levels and noise."""
-        self.level[taxels] = level
-        self.noise[taxels] = noise
-        self.ready[taxels] = True
-        if self.ready.all():
-            self._measurement = None
-
-    def forget(self, taxels: Flags) -> None:
-        """Take the baselines of some taxels away."""
-        self.ready &= ~taxels
-        self.level[taxels] = np.nan
-
-
-class Measured(NamedTuple):
-    """The result for k taxels.
-
-    Attributes:
-        level: (k,) float32, NaN without enough data.
-        noise: (k,) float32, standard deviation from frame to frame.
-        range: (k,) float32, between the highest and the lowest level of a tenth of the time.
-    """
-
-    level: Floats
-    noise: Floats
-    range: Floats
-
-
-class RestMeasurement:
-    """Measures levels and noise of n taxels over the last seconds, in a tenth of them at a time.
-
-    Level and noise are medians over the tenths: a touch of a third of the time moves neither, and medians of means are
-    finer than the steps of the values, which medians of integers are not.
-
-    Args:
-        n: number of taxels.
-        seconds: how long; longer if fewer than 4 frames come in a tenth of it.
-    """
-
-    def __init__(self, n: int, seconds: float) -> None:
-        self._block_ns = round(seconds * NS_PER_S / BLOCKS)
-        self._first: Floats = np.full(n, np.nan, np.float32)
-        self._begun_ns: int | None = None
-        self._frames = 0
-        self._count, self._sum, self._squares = (np.zeros(n, np.float32) for _ in range(3))
-        self._levels: deque[Floats] = deque(maxlen=BLOCKS)
-        self._variances: deque[Floats] = deque(maxlen=BLOCKS)
-
-    def add(self, time_ns: int, values: Floats, usable: Flags) -> bool:
-        """Take a frame in.
-
-        Args:
-            time_ns: time of the frame.
-            values: (n,) finite where usable.
-            usable: (n,) which of them count.
-
-        Returns:
-            Whether there is a new result: after all the time, and again after each further tenth of it.
-        """
+    def _add(self, time_ns: int, values: Floats, usable: Flags, block_ns: int) -> bool:
+        """Take a frame in; return whether a tenth ended, and there are ten of them."""
         if self._begun_ns is None:
             self._begun_ns = time_ns
         np.copyto(self._first, values, where=usable & np.isnan(self._first))
         difference = np.where(usable, values - self._first, np.float32(0))  # small, so that its squares are exact
-        self._count += usable
-        self._sum += difference
-        self._squares += difference * difference
+        before, self._common = self._common, self._patches.median(difference, usable)
+        if self._frames:
+            self.moves2 += ((self._common - before) ** 2 - self.moves2) / 20
+        common = self._patches.spread(self._common) * usable
+        pairs = (usable, difference, common, difference * difference, difference * common, common * common)
+        for total, of_frame in zip(self._sums, pairs, strict=True):
+            total += of_frame
         self._frames += 1
-        if time_ns - self._begun_ns < self._block_ns or self._frames < BLOCK_FRAMES:
+        if time_ns - self._begun_ns < block_ns or self._frames < BLOCK_FRAMES:
             return False
-        self._end_block()
+        self._blocks.append(self._sums)
+        self._sums = np.zeros_like(self._sums)
         self._begun_ns, self._frames = time_ns, 0
-        return len(self._levels) == BLOCKS
+        return len(self._blocks) == BLOCKS
 
-    def result(self, taxels: npt.NDArray[np.intp]) -> Measured:
-        """Return what (k,) taxels read in the last tenths."""
-        blocks = (np.array([block[taxels] for block in of_taxels]) for of_taxels in (self._levels, self._variances))
-        levels, variances = (np.sort(of_taxels, axis=0) for of_taxels in blocks)  # NaN comes last
-        found = np.isfinite(levels).sum(axis=0)
-        enough = found >= ENOUGH_BLOCKS * len(levels)
-        taxel = np.arange(len(found))
-        at = (np.maximum(found - 1, 0) // 2, taxel), (np.minimum(found // 2, len(levels) - 1), taxel)
-        level = self._first[taxels] + (levels[at[0]] + levels[at[1]]) / 2
-        noise = np.sqrt((variances[at[0]] + variances[at[1]]) / 2)
-        spread = levels[np.maximum(found - 1, 0), taxel] - levels[0]
-        return Measured(*(np.where(enough, array, np.nan).astype(np.float32) for array in (level, noise, spread)))
+    def _result(self, taxels: Rows) -> tuple[Floats, Measured, Floats]:
+        """Levels, NaN without enough data; what was measured; and how far each moved from tenth to tenth."""
+        blocks = np.array([block[:, taxels] for block in self._blocks])
+        blocks = np.where(blocks[:, :1] >= BLOCK_FRAMES, blocks, np.float32(np.nan))
+        count, d, c, dd, dc, cc = (blocks[:, row] for row in range(6))
+        found = np.isfinite(count).sum(axis=0)
+        enough = found >= ENOUGH_BLOCKS * BLOCKS
+        typical = _MEDIAN_OF_VARIANCE.get(int(np.nanmedian(count)) if found.any() else 0, 1.0)
+        own, mode = dd - d * d / count, cc - c * c / count
+        both = dc - d * c / count
+        noise2 = _median((own - 2 * both + mode) / (count - 1)) / np.float32(typical)
+        total, mean_c = np.nansum(count, axis=0), np.nansum(c, axis=0) / np.maximum(np.nansum(count, axis=0), 1)
+        del total
+        power = np.nansum(cc, axis=0) - mean_c * np.nansum(c, axis=0)
+        beside = np.nansum(dc, axis=0) - mean_c * np.nansum(d, axis=0) - power
+        prior = noise2 / np.float32(GAIN_SPREAD**2) + np.float32(1e-12)
+        gain = (1 + beside / (power + prior)).astype(np.float32)
+        noise2 = _median((own - 2 * gain * both + gain * gain * mode) / (count - 1)) / np.float32(typical)
+        levels = (d - gain * c) / count
+        level = _median(levels) + self._first[taxels] + gain * self._common[self._patches.group[taxels]]
+        moves = np.nanmax(np.where(enough, levels, 0), axis=0) - np.nanmin(np.where(enough, levels, 0), axis=0)
+        level = np.where(enough, level, np.float32(np.nan))
+        variance = np.maximum(noise2, 1e-12) / (power + prior)
+        return (
+            level,
+            Measured(taxels, *(a.astype(np.float32) for a in (level, np.maximum(noise2, 0), gain, variance))),
+            moves,
+        )
 
-    def _end_block(self) -> None:
-        count = np.where(self._count >= BLOCK_FRAMES, self._count, np.nan).astype(np.float32)
-        mean = self._sum / count
-        variance = np.maximum(self._squares / count - mean * mean, 0) * (count / (count - 1))
-        typical = _MEDIAN_OF_VARIANCE.get(self._frames, 1 - 0.67 / (self._frames - 1))
-        self._levels.append(mean)
-        self._variances.append(variance / np.float32(typical))
-        for total in (self._count, self._sum, self._squares):
-            total[:] = 0
+
+def _median(blocks: Floats) -> Floats:
+    """(k,) medians over (BLOCKS, k), NaN left out."""
+    ordered = np.sort(blocks, axis=0)  # NaN comes last
+    found = np.isfinite(blocks).sum(axis=0)
+    each = np.arange(blocks.shape[1])
+    low, high = np.maximum(found - 1, 0) // 2, np.minimum(found // 2, len(blocks) - 1)
+    middle: Floats = (ordered[low, each] + ordered[high, each]) / 2
+    return middle

@@ -1,13 +1,15 @@
 """Define the rule of the baseline in numbers: the settings that a user may change, and the constants behind them.
 
-A level above a taxel's own baseline and noise is a touch, with hysteresis. :mod:`.touches` judges touches and their
-ends, :mod:`.drift` follows baselines, :mod:`.rest` measures them first; docs/tactile/baselines.md has the formulas.
+The rule asks one question: how much of a deviation could be drift? :mod:`.offsets` predicts what each taxel reads at
+rest, and how uncertain that is; :mod:`.touches` compares deviations with it; :mod:`.rest` measures the beginning.
+docs/tactile/baselines.md has the formulas.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from enum import IntEnum
 from typing import Any, Self
 
 import msgspec
@@ -21,18 +23,20 @@ UNUSABLE = Status.NEVER_SEEN | Status.STALE | Status.MASKED | Status.NOT_CONNECT
 SIGNED_TYPES = ("shear_", "force_x", "force_y", "magnetic_field_", "acceleration_", "angular_rate_")
 """Beginnings of the names of types that a touch may move to both sides."""
 
-# Thresholds of touch
+# Levels of evidence
 
-STEPS_OF_A_TOUCH = 3
-"""Steps of the raw values that a touch rises by. Rounding alone moves an untouched value by one, drift by another."""
+DRIFT_SIGMA = 3.0
+"""Standard deviations: an innovation counts for at most this, and what is left of a load within it may be drift."""
+STEPS_OF_A_TOUCH = 2
+"""Steps of the raw values that a touch rises by at least: rounding alone moves an untouched value by one."""
 OFF_TO_ON = 0.6
 """Share of ``minimum_on``: the least threshold at which a touch ends. A value between both does not flicker."""
-QUIET_TO_TYPICAL = 0.25
-"""Share of the median noise: no taxel counts as quieter. Seconds of rounded values may show no noise at all."""
 EPSILON = 1e-6
-"""Share of the baseline: the least noise, ten times what float32 resolves, of values without steps and noise."""
+"""Share of the level: the least noise, ten times what float32 resolves, of values without steps and noise."""
 TINY = 1e-12
-"""In the unit of the type: keeps a threshold above 0 where the baseline itself is 0."""
+"""In the unit of the type: keeps a noise above 0 where the level itself is 0."""
+FEW_LEVELS = 2
+"""Steps from 0 to the largest value: with no more, each step is a touch, and there is no drift to see."""
 
 # The first measurement
 
@@ -47,37 +51,79 @@ MOVED_SHARE = 0.05
 FORGET_AFTER_S = 600.0
 """Seconds without data after which a baseline is measured again: a skin that warms up drifts farther than a touch."""
 
-# Contacts and their ends
+# What is learned of drift
 
-LEVEL_RISES_S = 2.0
-"""Seconds: time constant of a contact's load while it grows. A bump of a moment must not raise the level."""
-LEVEL_FALLS_S = 20.0
-"""Seconds: the same while it shrinks. A weaker grip becomes the level, and the next release is judged by it."""
-ENDING_SHARE = 0.5
-"""Share of the smoothed load: a value that falls below it ends its touch at once, without the delay of smoothing."""
-DRIFT_PER_MIN = 0.25
-"""Thresholds a minute: the default of ``drift_max_per_min``. With more of it, an eased grip vanishes."""
-JUST_TOUCHED = 1.25
-"""Thresholds: the most that a taxel shows which drifted past its threshold a moment ago."""
-SAG_RETURNS_S = 0.3
-"""Seconds after a touch in which the module still gives back how far it sagged: that belongs to the contact."""
+GAIN_SPREAD = 0.3
+"""Standard deviation of the gains of taxels to the common mode, around 1, before anything is known."""
+GAIN_LASTS_S = 36000.0
+"""Seconds in which a known gain becomes as uncertain as that: gains change as skins age and warm up."""
+LEAST_GAIN, MOST_GAIN = 0.1, 3.0
+"""Outside of them something else moves the taxel."""
+FEW_TAXELS = 3.0
+"""Free taxels of a patch of which nothing is common; the weight of the common mode grows with their number beyond."""
+MATCH_S = 2.0
+"""Seconds in which the agility of the common mode changes e-fold, until it explains how the mode moves."""
+RATE_S = 30.0
+"""Seconds: the speed of the common drift is averaged over this, so that what comes and goes does not count."""
+"""Fluctuations slower than this are drift of the taxel, not its noise."""
+SLOW_S = 5.0
+"""Seconds: deviations that last longer are drift of the taxel, quicker ones are its noise."""
+NOISE_S = 60.0
+"""Seconds: time constant of the noise, which also changes with temperature and with motors nearby."""
+TICK_S = 1.0
+"""Seconds between adjustments of what changes slowly."""
 
-# Drift
+# Contacts
 
-LEAST_FACTOR, MOST_FACTOR = 0.2, 3.0
-"""Ratios: the drift of a taxel by that of its patch. Outside of them something else moves the taxel."""
-FREE_SHARE = 0.5
-"""Share of a patch that must be away from contacts, or its common drift counts as unknown."""
-DOUBT = 0.3
-"""Thresholds: a common drift this long weighs as much as the first guess that a taxel's factor is 1."""
-STRETCH = 2.0
-"""Thresholds of common drift after which a factor is learned again, with half the weight on what was known."""
-LEVEL_EVERY_S = 1.0
-"""Seconds between corrections of the typical factor of a patch to 1, without which factors and drift float apart."""
-COVER_RETURNS_S = 0.5
-"""Seconds after the last touch of a module in which free taxels of its patch give back how far they sagged."""
-COVER_RETURNS_BY = 1.5
+FALLEN = 0.5
+"""Share of the peak of a load: below it the load has fallen, and what is left may be drift."""
+PEAK_S = 2.0
+"""Seconds: time constant of the peak. A bump of a moment must not make the load after it look fallen."""
+USED_S = 40.0
+"""Seconds in which the material gets used to a load, and forgets it."""
+RESETTLE_S = 3.0
+"""Seconds in which a taxel finds back after a load, instead of ``tau_s``."""
+FADED = 0.75
+"""Share: what is left after a sudden fall, and fades below this by itself, was a remainder."""
+MOST_REMAINDER = 0.35
+"""Share of a load: no cover keeps more of it."""
+STEP_OVER_ON = 3.0
+"""Thresholds: a module whose taxels all rise alike by less moved its own baseline."""
+ALIKE = 0.3
+"""Share of the median: taxels that are nearer to it moved alike."""
+MOST_ALIKE = 0.6
+"""Share of the taxels of a module that have to."""
+SAG_RETURNS_S = 0.6
+"""Seconds from the end of a contact in which the cover around it comes back, until that is looked at."""
+SAG_RETURNS_BY = 1.5
 """Times the sag: a value that rises farther than this (and a threshold) is a touch, not the cover that comes back."""
+SAG_SHARE = 0.3
+"""Share of the largest load in the patch: a cover that is pressed sinks around by no more."""
+
+
+LOOK_AT_S = 0.3
+"""Seconds after the beginning of a touch at which it is looked at again: did a module step, or a taxel return?"""
+DIP_S = 60.0
+"""Seconds in which a taxel that fell, and returns to within a threshold, shows that touches may lower it."""
+
+
+class Why(IntEnum):
+    """Why a taxel is in its state."""
+
+    REST = 0
+    """It is at rest."""
+    HELD = 1
+    """It is touched; its offset is predicted, not measured."""
+    RELEARNING = 2
+    """Its offset is not known yet, or less well than its noise."""
+    COVERED = 3
+    """It is below its offset, which was learned under a load or before a cover sank nearby."""
+    DOUBTED = 4
+    """It falls and returns again and again where nothing touches: its polarity may be wrong."""
+    SATURATED = 5
+    """It is at the end of its range: it may bear more than it shows."""
+    NO_RESOLUTION = 6
+    """It has too few levels to show how strong a touch is."""
 
 
 def resolution_of(structure: Structure, type_name: str) -> float:
@@ -89,24 +135,20 @@ def resolution_of(structure: Structure, type_name: str) -> float:
     return 0.0 if structure.dtype.kind == "f" else abs(structure.type(type_name).scale)
 
 
-_MAY_BE_NONE = ("minimum_on", "drift_max_per_min", "maximum_hold_s")
+_MAY_BE_NONE = ("minimum_on", "maximum_hold_s")
 
 
 class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of a baseline. Times are in seconds, whatever the rate; levels are in the unit of the type.
 
     Attributes:
-        tau_s: time constant of a taxel's own drift, away from contacts.
-        common_tau_s: time constant of the drift that a patch has in common.
-        settle_s: how long after a contact the taxels near it keep their own baselines.
-        smooth_s: time constant of the level that is compared with the thresholds. Published values are not smoothed,
-            and the end of a touch shows at once.
-        on_sigma: a touch begins above this many standard deviations of the noise.
+        tau_s: the slowest time constant of a taxel's own drift, away from contacts; it is faster where drift is.
+        settle_s: how long after a contact the taxels near it count as held.
+        smooth_s: time constant of the deviation that is compared with the thresholds. Published values are not
+            smoothed, and the end of a touch shows at once.
+        on_sigma: a touch begins above this many standard deviations of noise and offset.
         off_sigma: and ends below this many.
-        minimum_on: a touch is at least this high. None: three steps of the raw values; 0 for values without steps.
-        drift_max_per_min: the most that a baseline drifts under a contact in a minute. None: a quarter of a threshold.
-        release: a contact is over when less than this share of its load is left
-        release_s: for this long.
+        minimum_on: a touch is at least this high. None: two steps of the raw values; 0 for values without steps.
         recover_s: a taxel that is as far below its baseline as a touch is above it, for this long, gets a new one.
         maximum_hold_s: a touch becomes the baseline after this time; None: never.
         calibrate_s: how long the rest is measured at the start.
@@ -116,32 +158,26 @@ class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """
 
     tau_s: float = 30.0
-    common_tau_s: float = 5.0
     settle_s: float = 3.0
     smooth_s: float = 0.1
     on_sigma: float = 5.0
     off_sigma: float = 3.0
     minimum_on: float | None = None
-    drift_max_per_min: float | None = None
-    release: float = 0.35
-    release_s: float = 1.0
     recover_s: float = 1.0
     maximum_hold_s: float | None = None
     calibrate_s: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("tau_s", "common_tau_s", "calibrate_s", "maximum_hold_s"):
+        for name in ("tau_s", "calibrate_s", "maximum_hold_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ConfigurationError(f"{name} = {value}: give a number of seconds above 0")
-        for name in ("settle_s", "smooth_s", "release_s", "recover_s", "minimum_on", "drift_max_per_min", "off_sigma"):
+        for name in ("settle_s", "smooth_s", "recover_s", "minimum_on", "off_sigma"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
                 raise ConfigurationError(f"{name} = {value}: give 0 or more")
         if not self.off_sigma <= self.on_sigma < math.inf:
             raise ConfigurationError(f"on_sigma = {self.on_sigma}: give at least off_sigma, {self.off_sigma}")
-        if not 0 <= self.release < 1:
-            raise ConfigurationError(f"release = {self.release}: give a share, 0 to below 1")
 
     def changed(self, changes: Mapping[str, Any]) -> Self:
         """Return these settings with some changed.

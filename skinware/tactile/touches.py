@@ -1,4 +1,4 @@
-"""Judge which taxels are touched, which are held because they are near a contact, and when a contact is over."""
+"""Compare deviations with what drift could be: which taxels are touched, and when a touch is over."""
 
 from __future__ import annotations
 
@@ -7,172 +7,218 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.rest import Rest
+from skinware.tactile.offsets import Groups, Offsets
 from skinware.tactile.rule import (
-    DRIFT_PER_MIN,
-    ENDING_SHARE,
-    EPSILON,
-    JUST_TOUCHED,
-    LEVEL_FALLS_S,
-    LEVEL_RISES_S,
+    ALIKE,
+    DRIFT_SIGMA,
+    FADED,
+    FALLEN,
+    LOOK_AT_S,
+    MOST_ALIKE,
+    MOST_REMAINDER,
     OFF_TO_ON,
-    QUIET_TO_TYPICAL,
-    SAG_RETURNS_S,
-    STEPS_OF_A_TOUCH,
-    TINY,
-    BaselineSettings,
+    PEAK_S,
+    STEP_OVER_ON,
+    USED_S,
 )
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
 
-
-class Thresholds:
-    """The levels at which touches of n taxels begin and end, in the unit of the values.
-
-    Args:
-        n: number of taxels.
-        resolution: step of the values; 0 if they have none.
-
-    Attributes:
-        minimum_on: the least of ``on``.
-        on: (n,) float32, a touch begins above it.
-        off: (n,) float32, and ends below it.
-    """
-
-    def __init__(self, n: int, resolution: float) -> None:
-        self._resolution = resolution
-        self.minimum_on = 0.0
-        self.on: Floats = np.zeros(n, np.float32)
-        self.off: Floats = np.zeros(n, np.float32)
-
-    def set(self, rest: Rest, settings: BaselineSettings) -> None:
-        """Compute them from the noise of the taxels."""
-        given = settings.minimum_on
-        self.minimum_on = STEPS_OF_A_TOUCH * self._resolution if given is None else given
-        known = rest.noise[rest.ready]
-        typical = float(np.nanmedian(known)) if np.isfinite(known).any() else 0.0
-        rounding = self._resolution / math.sqrt(12)
-        least = np.maximum(rounding, QUIET_TO_TYPICAL * typical)
-        noise = np.fmax(rest.noise, np.fmax(least, EPSILON * np.abs(rest.level)))
-        self.on = np.fmax(self.minimum_on, settings.on_sigma * noise + TINY).astype(np.float32)
-        self.off = np.fmax(OFF_TO_ON * self.minimum_on, settings.off_sigma * noise).astype(np.float32)
+_LEFT_AT_S = 3.0
+"""Seconds after a sudden fall at which it is noted what is left."""
+_QUICK_S = 0.12
+"""Seconds: with frames more apart, one high value is a touch; with more frames it takes two."""
 
 
 class Touches:
     """Follows touches of n taxels.
 
     Args:
-        module: (n,) int, the module of each taxel: its taxels sag and settle together.
-        neighbours: (n, k) int, the taxels near each, filled with -1: they are held with it, instead of its module.
+        module: (n,) int, the module of each taxel.
+        patch: (n,) int, the patch of each.
+        signed: a touch may move a value to both sides.
 
     Attributes:
         touched: (n,) bool.
-        level: (n,) float32, the load of each taxel during the contact of its module, slowly followed.
+        smooth: (n,) float32, deviation from the offset, smoothed.
+        peak: (n,) float32, the highest load of the touch, slowly followed.
+        used: (n,) float32, the load that the material is used to.
         contact_s: (n,) float32, how long each has been touched.
-        sunk: (n,) float32, how far below its baseline each has been during the contact of its module: it comes back.
-        settling_s: (n,) float32, for how long each is still held.
+        remainder: (n_patches,) share of the load that a cover keeps for a while after it.
     """
 
-    def __init__(self, module: npt.NDArray[np.intp], neighbours: npt.NDArray[np.integer] | None = None) -> None:
+    def __init__(self, module: Rows, patch: Rows, *, signed: bool) -> None:
         n = len(module)
-        self._module = module
-        self._neighbours = neighbours
-        self._n_modules = int(module.max(initial=-1)) + 1
+        self.signed = signed
         self.touched: Flags = np.zeros(n, bool)
-        self.level: Floats = np.zeros(n, np.float32)
-        self.contact_s: Floats = np.zeros(n, np.float32)
-        self.sunk: Floats = np.zeros(n, np.float32)
-        self.settling_s: Floats = np.zeros(n, np.float32)
-        self._ending: Flags = np.zeros(n, bool)
-        self._fading_s = np.zeros(self._n_modules)
-        """For how long most of the load of each module has been gone."""
-        self._ended_s = np.full(self._n_modules, np.inf)
-        """For how long no taxel of each module has been touched."""
+        self._high: Flags = np.zeros(n, bool)
+        self.smooth, self.peak, self.used, self.contact_s = (np.zeros(n, np.float32) for _ in range(4))
+        self._steady: Floats = np.zeros(n, np.float32)
+        self._since_fall_s: Floats = np.full(n, np.inf, np.float32)
+        self._left: Floats = np.full(n, np.nan, np.float32)
+        self._used_then: Floats = np.zeros(n, np.float32)
+        self._modules, self._patch = Groups(module), patch
+        self.remainder: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
+        self._since_end_s: Floats = np.full(n, np.inf, np.float32)
+        self._remains: Floats = np.zeros(n, np.float32)
 
-    def judge(self, load: Floats, usable: Flags, thresholds: Thresholds) -> None:
-        """Find the touched taxels: above ``on``, or still above ``off``; unusable ones stay as they are."""
-        above = load > np.where(self.touched, thresholds.off, thresholds.on)
-        ended = self.touched & ~above & usable
-        if ended.any():
-            self.touched[ended] = False
-            self.contact_s[ended] = 0
-        self.touched |= above & usable
+    @property
+    def remains(self) -> Floats:
+        """(n,) what is left of loads that are over, by what the material is used to."""
+        return self._remains
 
-    def hold(self, usable: Flags, passed_s: float, settle_s: float) -> Flags:
-        """Return (n,) the taxels that keep their own baselines: near a contact, and for ``settle_s`` after it."""
-        np.maximum(self.settling_s - np.float32(passed_s), 0, out=self.settling_s)
-        active = np.flatnonzero(self.touched & usable)
-        if not len(active):
-            held: Flags = self.settling_s > 0
-            return held
-        if self._neighbours is None:
-            touched_modules = np.zeros(self._n_modules, bool)
-            touched_modules[self._module[active]] = True
-            near = touched_modules[self._module]
-        else:
-            around = self._neighbours[active].ravel()
-            near = np.zeros(len(self.touched), bool)
-            near[around[around >= 0]] = True
-            near[active] = True
-        self.settling_s[near] = settle_s
-        return near | (self.settling_s > 0)
+    def load(self, deviation: Floats) -> Floats:
+        return np.abs(deviation) if self.signed else deviation
 
-    def over(
-        self, load: Floats, usable: Flags, on: Floats, passed_s: float, settings: BaselineSettings
-    ) -> npt.NDArray[np.intp]:
-        """Follow the load of contacts, and end those of which most is gone.
+    def follow(self, deviation: Floats, live: Flags, on: Floats, passed_s: float, smooth_s: float) -> None:
+        """Smooth the deviations (n,)."""
+        share = np.float32(-math.expm1(-passed_s / smooth_s)) if smooth_s else np.float32(1)
+        self.smooth += (deviation - self.smooth) * (share * live)
+        if not self.signed:
+            np.minimum(self.smooth, deviation + on, out=self.smooth, where=live)
+
+    def judge(
+        self, deviation: Floats, live: Flags, on: Floats, off: Floats, offsets: Offsets, passed_s: float, most_s: float
+    ) -> Rows:
+        """Find touches and their ends.
 
         Args:
-            load: (n,) above the baselines.
-            usable: (n,) which taxels have values.
-            on: (n,) threshold of touch.
+            deviation: (n,) of the values.
+            live: (n,) which taxels have values and offsets.
+            on: (n,) a touch begins above it.
+            off: (n,) and ends below it, drift or not.
+            offsets: what drift could be.
             passed_s: since the last frame.
-            settings: for release and drift.
+            most_s: a touch ends after this time.
 
         Returns:
-            The taxels whose remaining load counts as drift, in modules whose contact is over.
+            The taxels whose touch is over.
         """
-        active = np.flatnonzero(usable & (self.touched | (self.level > 0)))
+        smooth, now = self.load(self.smooth), self.load(deviation)
+        high = (now > off) & live
+        begins = high & (smooth > on) & ~self.touched
+        if passed_s < _QUICK_S:
+            begins &= self._high
+        np.copyto(self._high, high, where=live)
+        begun = np.flatnonzero(begins)
+        if len(begun):
+            self.touched[begun] = True
+            self.peak[begun] = smooth[begun]
+            self._steady[begun] = smooth[begun]
+            self.contact_s[begun] = 0
+            self._since_fall_s[begun] = np.inf
+            self._left[begun] = np.nan
+        active = np.flatnonzero(self.touched & live)
         if not len(active):
             return active
-        touched, module = self.touched[active], self._module[active]
-        self._ended_s += passed_s
-        self._ended_s[module[touched]] = 0
-        in_contact = self._ended_s < SAG_RETURNS_S
-        self.contact_s[active] += np.float32(passed_s) * touched
-        now, level = np.where(touched, load[active], np.float32(0)), self.level[active]
-        rise, fall = (np.float32(-math.expm1(-passed_s / tau)) for tau in (LEVEL_RISES_S, LEVEL_FALLS_S))
-        level = (level + (now - level) * np.where(now > level, rise, fall)) * in_contact[module]
-        self.level[active] = level
-        self.sunk = np.maximum(self.sunk, -load) * in_contact[self._module]
-        left, whole = (np.bincount(module, level * of, self._n_modules) for of in (now, level))
-        fading = left < settings.release * whole
-        self._fading_s = np.where(fading, self._fading_s + passed_s, 0)
-        released = self._fading_s >= settings.release_s
-        too_long = self.touched & (self.contact_s > (settings.maximum_hold_s or math.inf))
-        if not released.any() and not too_long.any():
-            return active[:0]
-        self._fading_s[released] = 0
-        own = settings.drift_max_per_min
-        per_min = DRIFT_PER_MIN * on if own is None else np.float32(own)
-        is_drift = load < JUST_TOUCHED * on + per_min * (self.contact_s / 60) + self.sunk
-        let_go = (released[self._module] & usable & is_drift) | (too_long & usable)
-        self._end(let_go)
-        return np.flatnonzero(let_go)
+        load = smooth[active]
+        self.contact_s[active] += np.float32(passed_s)
+        peak = self.peak[active]
+        self.peak[active] = peak + np.maximum(load - peak, 0) * np.float32(-math.expm1(-passed_s / PEAK_S))
+        variance = offsets.variance[active] + offsets.noise2[active] + (0.3 * self._remains[active]) ** 2
+        variance += offsets.gain[active] ** 2 * offsets.common.variance[self._patch[active]].astype(np.float32)
+        is_over = load < off[active]
+        is_over |= (load < FALLEN * self.peak[active]) & (load * load < DRIFT_SIGMA**2 * variance)
+        fades = self._fades(active, load, off[active], passed_s)
+        is_over |= fades
+        is_over |= self.contact_s[active] > most_s
+        return active[is_over]
 
-    def shown(self, load: Floats, smooth_load: Floats, off: Floats) -> Flags:
+    def shown(self, deviation: Floats, off: Floats) -> Flags:
         """Return (n,) the touched taxels, without those whose present load is gone while the smoothed one is not."""
-        ending = load < np.where(self._ending, off, np.minimum(off, ENDING_SHARE * smooth_load))
-        self._ending = ending & self.touched
-        return self.touched & ~self._ending
+        shown: Flags = self.touched & (self.load(deviation) >= np.minimum(off, FALLEN * self.load(self.smooth)))
+        return shown
 
-    def forget(self, taxels: Flags) -> None:
-        """Drop the contacts of some taxels."""
-        self._end(taxels)
-        self.settling_s[taxels] = 0
+    def _fades(self, active: Rows, load: Floats, off: Floats, passed_s: float) -> Flags:
+        """Return (k,) where what was left after a sudden fall faded by itself, and learn how much remains."""
+        steady = self._steady[active]
+        fell = (load < FALLEN * steady) & (steady > 2 * off)
+        moved = fell | (np.abs(load - steady) > off)
+        steady = np.where(fell, load, steady + (load - steady) * np.float32(-math.expm1(-passed_s)))
+        left = np.where(moved, np.nan, self._left[active])
+        since = np.where(fell, 0, np.where(moved & np.isfinite(self._left[active]), np.inf, self._since_fall_s[active]))
+        since = since + np.float32(passed_s)
+        notes = np.isnan(left) & (since >= _LEFT_AT_S) & (since < 2 * _LEFT_AT_S)
+        left = np.where(notes, steady, left)
+        then = np.where(notes, self.used[active], self._used_then[active])
+        self._steady[active], self._left[active] = steady, left
+        self._since_fall_s[active], self._used_then[active] = since, then
+        faded: Flags = (steady < np.minimum(FADED * left, left - 0.5 * off)) & (left < MOST_REMAINDER * then)
+        faded &= since < 2 * USED_S
+        if faded.any():
+            self._learn_remainder(active[faded], left[faded], then[faded], 1.0)
+        return faded
 
-    def _end(self, taxels: Flags) -> None:
+    def _learn_remainder(self, taxels: Rows, left: Floats, used: Floats, weight: float) -> None:
+        patch = self._patch[taxels]
+        power = np.bincount(patch, used * used, len(self.remainder))
+        found = np.bincount(patch, left * used, len(self.remainder)) / np.maximum(power, 1e-12)
+        change = np.float32(weight) * (found.astype(np.float32) - self.remainder)
+        self.remainder += np.where(power > 0, change, 0)
+        np.clip(self.remainder, 0, MOST_REMAINDER, out=self.remainder)
+
+    def remember(self, deviation: Floats, on: Floats, passed_s: float) -> None:
+        """Follow what the material is used to, and predict what remains of it."""
+        rows = np.flatnonzero(self.touched | (self.used > 0) | (self._since_end_s < 1))
+        if not len(rows):
+            return
+        load = np.where(self.touched[rows], np.maximum(self.load(deviation[rows]), 0), np.float32(0))
+        used = self.used[rows]
+        used += (load - used) * np.float32(-math.expm1(-passed_s / USED_S))
+        used[(used < 0.5 * on[rows]) & ~self.touched[rows]] = 0
+        self.used[rows] = used
+        after = self._since_end_s[rows]
+        self._since_end_s += np.float32(passed_s)
+        due = (after < 1) & (after + passed_s >= 1) & ~self.touched[rows] & (used > 5 * on[rows])
+        if due.any():
+            due &= self._modules.sum(self.touched)[self._modules.group[rows]] == 0  # else a weaker grip may be left
+            taxels = rows[due]
+            self._learn_remainder(taxels, self.load(self.smooth[taxels]) + self._remains[taxels], used[due], 0.5)
+        self._remains[rows] = self.remainder[self._patch[rows]] * np.maximum(used - load, 0)
+
+    def looked(self, passed_s: float) -> tuple[Flags, Flags]:
+        """Return (n,) the touches that are looked at again in this frame, and (n,) those that were."""
+        old = self.touched & (self.contact_s - np.float32(passed_s) >= LOOK_AT_S)
+        return self.touched & (self.contact_s >= LOOK_AT_S) & ~old, old
+
+    def module_steps(self, live: Flags, on: Floats, offsets: Offsets, passed_s: float) -> tuple[Rows, Floats]:
+        """Return the k taxels of modules that rose alike, suddenly and by little, and (k,) by how much."""
+        new, _ = self.looked(passed_s)
+        if self.signed or not new.any():
+            return np.zeros(0, np.intp), self.smooth[:0]
+        modules = self._modules
+        looked = np.zeros(modules.n, bool)
+        looked[modules.group[new]] = True
+        here = live & looked[modules.group]
+        median = modules.median(self.smooth, here)
+        sudden = modules.median(offsets.slow, here) < 0.3 * median
+        threshold = modules.median(on, here)
+        around = np.maximum(ALIKE * modules.spread(median), 0.5 * on)
+        near = here & (np.abs(self.smooth - modules.spread(median)) < around)
+        number = modules.sum(here)
+        alike = (number >= 4) & (modules.sum(near) >= MOST_ALIKE * number) & sudden & looked
+        alike &= (median > OFF_TO_ON * threshold) & (median < STEP_OVER_ON * threshold)
+        stepped = np.flatnonzero(here & alike[modules.group])
+        return stepped, median[modules.group[stepped]]
+
+    @property
+    def has_settled(self) -> Flags:
+        """(n,) which taxels' last touch has been over for a second: what is left of it is known now."""
+        settled: Flags = self._since_end_s >= 1
+        return settled
+
+    def forget(self, taxels: Rows) -> None:
+        """Drop what is known of some taxels."""
+        self.end(taxels)
+        for array in (self.smooth, self.used, self._remains):
+            array[taxels] = 0
+        self._since_end_s[taxels] = np.inf
+
+    def end(self, taxels: Rows) -> None:
+        """Drop the touches of some taxels."""
         self.touched[taxels] = False
-        for of_contact in (self.level, self.contact_s, self.sunk):
+        self._since_end_s[taxels] = 0
+        for of_contact in (self.peak, self.contact_s):
             of_contact[taxels] = 0

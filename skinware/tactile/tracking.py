@@ -2,86 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware.tactile.assignment import Gains, assign
+from skinware.tactile.meetings import Meetings, fit_bells, resume
+from skinware.tactile.tracks import (
+    TRACK,
+    Flags,
+    Floats,
+    TouchedBlobs,
+    Tracks,
+    Whole,
+    correct,
+    expected_at,
+    is_shared,
+    without_nan,
+)
 
-Gains = npt.NDArray[np.float64]
-
-
-def assign(gain: Gains) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Assign rows to columns, each at most once, so that the sum of gains is the largest.
-
-    Args:
-        gain: (r, c) gain of each pair; 0 or less: the pair is impossible.
-
-    Returns:
-        (p,) int64 rows, in ascending order, and (p,) int64, the column of each.
-    """
-    possible = gain > 0
-    column_of = np.full(len(gain), -1, np.int64)
-    is_clear = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)
-    row, column = np.nonzero(is_clear)
-    column_of[row] = column
-    rows = np.flatnonzero(possible.any(axis=1) & (column_of < 0))
-    columns = np.flatnonzero((possible & ~is_clear).any(axis=0))
-    if len(rows):
-        cost = -np.maximum(gain[np.ix_(rows, columns)], 0.0)
-        if len(rows) <= len(columns):
-            column_of[rows] = columns[_cheapest(cost)]
-        else:
-            column_of[rows[_cheapest(cost.T)]] = columns
-    row = np.flatnonzero(column_of >= 0)
-    row = row[possible[row, column_of[row]]]
-    return row, column_of[row]
-
-
-def _cheapest(cost: Gains) -> npt.NDArray[np.int64]:
-    """(r,) int64: a column for each of r rows (at most as many as columns), for the smallest sum.
-
-    By shortest augmenting paths: each row joins along the path of exchanges that costs least. ``of_row`` and
-    ``of_column`` are the dual prices, ``row_at`` is the row of each column; column 0 stands for the row that joins.
-    """
-    rows, columns = cost.shape
-    of_row, of_column = np.zeros(rows + 1), np.zeros(columns + 1)
-    row_at = np.zeros(columns + 1, np.int64)
-    for new in range(1, rows + 1):
-        row_at[0] = new
-        column = 0
-        distance = np.full(columns + 1, np.inf)
-        before = np.zeros(columns + 1, np.int64)
-        is_open = np.ones(columns + 1, bool)
-        while column == 0 or row_at[column]:
-            is_open[column] = False
-            row = row_at[column]
-            reached = cost[row - 1] - of_row[row] - of_column[1:]
-            shorter = is_open[1:] & (reached < distance[1:])
-            distance[1:][shorter] = reached[shorter]
-            before[1:][shorter] = column
-            column = int(np.where(is_open, distance, np.inf)[1:].argmin()) + 1
-            step = distance[column]
-            of_row[row_at[~is_open]] += step
-            of_column[~is_open] -= step
-            distance[is_open] -= step
-        while column:
-            row_at[column], column = row_at[before[column]], int(before[column])
-    found = np.zeros(rows, np.int64)
-    taken = np.flatnonzero(row_at[1:])
-    found[row_at[1:][taken] - 1] = taken
-    return found
-
-
-Floats = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
-
-_STRONG, _WEAK, _NEAR = 5.0, 1.5, 0.1
-"""Gains of a pair that shares half of the smaller one's taxels, any, or is near: one outweighs two of the next."""
+_STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
+"""Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
+first two outweighs two of the next."""
+_REST = 0.2
+"""Share of its load below which a contact may be what a faster one left behind."""
 _PREFERENCE = 0.2
 """Gain of the oldest track, and of the largest contact. All pairs of a track have it, so it only decides which is left
 out: the younger identity where contacts merge, the smaller part where one splits."""
@@ -92,10 +39,23 @@ _NEARNESS, _PRESENCE = 0.4, 0.2
 taxels are shared, or the contact is so fast that shared taxels mean nothing."""
 _DOUBT = 0.5
 """Share of its expected way by which a contact may miss the expected place."""
-_LONGEST_GUESS_S = 0.1
-"""Seconds for which a velocity is extrapolated."""
 _CALM = 3.0
 """Time constant of the motion that is judged as sliding, in multiples of ``velocity_s``."""
+_NOISE_PITCHES = 0.3
+"""Pitches: standard deviation of the centre of a contact of one taxel."""
+_NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
+"""m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is fast."""
+_MOST_WITHIN, _MOST_TAXELS = 4, 400
+"""Tracks that a blob carries at most, and taxels of the largest blob that carries more than one."""
+_FAINT = 0.25
+"""A track in a blob has gone if less than this share of its peak is left."""
+_PITCH_M = 0.0065
+"""m: pitch of taxels whose places are not known."""
+_REACH_PITCHES, _GATE = 2.3, 2.5
+"""Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
+a bit more than the second ring of neighbours."""
+_NARROWEST_PITCHES = 0.35
+"""Pitches: width of a contact that only one taxel feels."""
 _LAST_ID = (1 << 32) - 1
 
 
@@ -115,140 +75,96 @@ class TrackingSettings:
     """Settings of the tracking of contacts.
 
     Attributes:
+        frames: in how many frames it must be seen before it is a contact.
         patience_s: how long an identity is kept while its contact is gone, s.
-        reach_m: how far a contact may be from its expected place without sharing a taxel, m.
-        fast_m: a contact expected to move farther in a frame is judged by its place first, m.
+        pitch_m: pitch of the taxels, m; None: that of their places. A contact may be 2.3 pitches from its expected
+            place; one expected to move farther than a pitch in a frame is judged by its place first.
         velocity_s: time constant of the velocity, and of the steady load, s.
         touch_s: how long a contact is a touch, s.
         sliding_m_s: speed from which it is sliding, until it falls below half of it, m/s.
         steady: share by which the load of a sliding contact may differ from its steady load.
     """
 
+    frames: int = 2
     patience_s: float = 0.06
-    reach_m: float = 0.015
-    fast_m: float = 0.0065
+    pitch_m: float | None = None
     velocity_s: float = 0.1
     touch_s: float = 0.3
     sliding_m_s: float = 0.005
     steady: float = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
-    """The places of the m contacts of a frame.
-
-    Attributes:
-        taxels: (a,) int64, the taxels of all of them.
-        contact: (a,) int64, the contact of each.
-        load: (m,) load of each contact.
-        frame: (m,) int64, number of its coordinate frame, -1 for none.
-        cop_m: (m, 3) m, its centre; NaN if it is not known.
-    """
-
-    taxels: Whole
-    contact: Whole
-    load: Floats
-    frame: Whole
-    cop_m: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class _Tracks:
-    """All identities: those of the newest frame in its order, then those whose contacts are gone."""
-
-    id: Whole
-    born_ns: Whole
-    gone_ns: Whole
-    """When the contact went; 0 while it is there."""
-    seen_ns: Whole
-    size: Whole
-    frame: Whole
-    cop_m: Floats
-    velocity_m_s: Floats
-    steps: Whole
-    """Number of moves in the velocity."""
-    load: Floats
-    """Smoothed."""
-    motion_m_s: Floats
-    """The velocity, smoothed once more, so that noise does not look like sliding."""
-    kind: Whole
-
-    def __getitem__(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> _Tracks:
-        return _Tracks(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
-
-    def and_then(self, others: _Tracks) -> _Tracks:
-        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in dataclasses.fields(self))
-        return _Tracks(*(np.concatenate(pair) for pair in pairs))
-
-
 class Tracked(NamedTuple):
-    """The history of the m contacts of a frame.
+    """The history of the m blobs of a frame.
 
     Attributes:
-        id: (m,) int64, from 1 on; numbers repeat only after 2**32.
+        id: (m,) int64, from 1 on; numbers repeat only after 2**32; 0: not a contact yet.
         age_s: (m,) s.
         velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
         kind: (m,) int64, :class:`ContactKind`.
+        provisional: (m,) bool, whether it was never touched for sure.
     """
 
     id: Whole
     age_s: Floats
     velocity_m_s: Floats
     kind: Whole
+    provisional: Flags
+
+
+_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, bool))
 
 
 class Tracker:
     """Gives contacts their identities, frame by frame.
 
+    A blob in which contacts have merged carries the tracks of all of them.
+
     Args:
-        n: number of taxels.
+        position_m: (n, 3) m, places of the taxels.
+        pitch_m: of the taxels, m; NaN if it is not known.
         settings: default: those of the class.
     """
 
-    def __init__(self, n: int, settings: TrackingSettings | None = None) -> None:
-        self._settings = settings or TrackingSettings()
-        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
-        self._tracks = _Tracks(none, none, none, none, none, none, nowhere, nowhere, none, np.zeros(0), nowhere, none)
-        self._track_of = np.full(n, -1, np.int64)
-        self._last_id = 0
+    def __init__(self, position_m: Floats, pitch_m: float, settings: TrackingSettings | None = None) -> None:
+        self._settings = settings = settings or TrackingSettings()
+        self._position_m = position_m
+        self._pitch_m = settings.pitch_m or (pitch_m if pitch_m > 0 else _PITCH_M)
+        self._tracks: Tracks = np.zeros(0, TRACK)
+        self._track_of = np.full(len(position_m), -1, np.int64)
+        self._taxels = np.zeros(0, np.int64)  # that have a track
+        self._meetings = Meetings(self._pitch_m)
+        self._last_id = self._last_key = 0
         self._time_ns: int | None = None
 
-    def follow(self, places: Places, time_ns: int) -> Tracked:
-        """Return the identities of the contacts of the next frame, and how they move."""
+    @property
+    def track_of(self) -> Whole:
+        """(n,) the track that each taxel was last in; -1: none."""
+        return self._track_of
+
+    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Tracked:
+        """Return the identities of the blobs of the next frame, and how they move."""
         self._forget(time_ns)
-        tracks, size = self._tracks, np.bincount(places.contact, minlength=len(places.load))
-        track = self._track_of[places.taxels]
-        is_known = track >= 0
-        pair = track[is_known] * len(size) + places.contact[is_known]
-        shared = np.bincount(pair, minlength=len(tracks.id) * len(size)).reshape(len(tracks.id), len(size))
-        overlap = shared / np.maximum(np.minimum(tracks.size[:, None], size), 1)
-        passed_s = np.minimum((time_ns - tracks.seen_ns) / NS_PER_S, _LONGEST_GUESS_S)
-        expected_m = tracks.velocity_m_s * passed_s[:, None]
-        known, found = assign(self._gains(overlap, expected_m, places))
-        now = _Tracks(
-            id=np.zeros(len(size), np.int64),
-            born_ns=np.full(len(size), time_ns),
-            gone_ns=np.zeros(len(size), np.int64),
-            seen_ns=np.full(len(size), time_ns),
-            size=size,
-            frame=places.frame,
-            cop_m=places.cop_m,
-            velocity_m_s=np.where(np.isnan(places.cop_m), np.nan, 0.0),
-            steps=np.zeros(len(size), np.int64),
-            load=places.load.copy(),
-            motion_m_s=np.zeros((len(size), 3)),
-            kind=np.full(len(size), int(ContactKind.TOUCH)),
-        )
-        now.id[found], now.born_ns[found] = tracks.id[known], tracks.born_ns[known]
-        for row in np.flatnonzero(now.id == 0).tolist():
-            self._last_id = self._last_id % _LAST_ID + 1
-            now.id[row] = self._last_id
+        before, size = self._tracks, np.bincount(blobs.blob, minlength=len(blobs.load))
+        if not len(before) and not len(size):
+            return _NOTHING
+        expected = expected_at(before, time_ns)
+        overlap = self._overlap(blobs, size)
+        home = self._homes(overlap, expected, blobs, size)
+        self._meetings.begin(before, expected["place"], time_ns)
         is_joined = overlap >= 0.5
-        is_whole = (is_joined.sum(axis=1)[known] <= 1) & (is_joined.sum(axis=0)[found] <= 1)
-        self._move(now, found, known, is_whole)
-        self._judge(now, found, known, places.load, time_ns)
-        self._keep(now, places, known, time_ns)
-        return Tracked(now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s, now.kind)
+        expected["jumps"] = is_joined.sum(axis=1) > 1
+        expected["jumps"][home >= 0] |= is_joined.sum(axis=0)[home[home >= 0]] > 1
+        expected["home"] = home
+        tracks = self._with_new(expected, blobs, time_ns)
+        tracks["shared"] = is_shared(tracks["home"])
+        self._find(tracks, blobs, size, time_ns)
+        self._move(tracks, before)
+        self._judge(tracks, before, time_ns)
+        self._meetings.end(tracks, time_ns)
+        resume(tracks, self._settings.frames, self._pitch_m)
+        self._keep(tracks, blobs, time_ns)
+        return self._tracked(tracks, time_ns)
 
     def _forget(self, time_ns: int) -> None:
         """Drop the identities whose contacts have been gone for too long."""
@@ -257,68 +173,213 @@ class Tracker:
         self._time_ns = time_ns
         # half a period more: at 50 Hz, 60 ms are three frames, also with jitter
         patience_ns = self._settings.patience_s * NS_PER_S + period_ns / 2
-        keep = (tracks.gone_ns == 0) | (time_ns - tracks.gone_ns <= patience_ns)
+        keep = (tracks["gone_ns"] == 0) | (time_ns - tracks["gone_ns"] <= patience_ns)
         if not keep.all():
             number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
-            self._tracks, self._track_of = tracks[keep], number[self._track_of]
+            self._tracks = tracks[keep]
+            self._track_of[self._taxels] = number[self._track_of[self._taxels]]
 
-    def _gains(self, overlap: Floats, expected_m: Floats, places: Places) -> Gains:
+    def _overlap(self, blobs: TouchedBlobs, size: Whole) -> Floats:
+        """(tracks, m): shared taxels of each pair, as a share of the smaller one."""
+        tracks, track = self._tracks, self._track_of[blobs.taxels]
+        is_known = track >= 0
+        pair = track[is_known] * len(size) + blobs.blob[is_known]
+        shared = np.bincount(pair, minlength=len(tracks) * len(size)).reshape(len(tracks), len(size))
+        overlap: Floats = shared / np.maximum(np.minimum(tracks["size"][:, None], size), 1)
+        return overlap
+
+    def _homes(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
+        """(tracks,) the blob of each; -1: it has gone."""
+        tracks, touching = self._tracks, overlap > 0
+        way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
+        by_place = (way_m > self._pitch_m) | tracks["shared"]
+        if not by_place.any() and (touching.sum(axis=1) == 1).all() and (touching.sum(axis=0) == 1).all():
+            only: Whole = touching.argmax(axis=1)
+            return only  # nothing begins, ends or merges
+        home = np.full(len(tracks), -1)
+        known, found = assign(self._gains(overlap, expected, blobs, way_m, by_place))
+        home[known] = found
+        self._join(home, overlap, expected, blobs, size)
+        return home
+
+    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Gains:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
-        tracks, settings = self._tracks, self._settings
-        away_m = np.linalg.norm((tracks.cop_m + expected_m)[:, None] - places.cop_m, axis=2)
-        way_m = np.nan_to_num(np.linalg.norm(expected_m, axis=1))[:, None]
-        reach_m = settings.reach_m + _DOUBT * way_m
-        is_near = (away_m <= reach_m) & (tracks.frame[:, None] == places.frame)
-        is_fast = way_m > settings.fast_m
-        nearness = np.where(is_near, 1 - (away_m / reach_m) ** 2, 0.0)
-        is_sharing = (overlap > 0) & ~(is_fast & is_near)
-        sharing = np.where(overlap >= 0.5, _STRONG, _WEAK) + _CLOSENESS * overlap
-        sharing += _PREFERENCE * (1 - _rank(tracks.born_ns)[:, None] + _rank(places.load))
-        near = _NEAR + _NEARNESS * nearness + _PRESENCE * (tracks.gone_ns == 0)[:, None]
+        tracks = self._tracks
+        away = expected["place"][:, None] - blobs.cop_m
+        squares = np.einsum("ijk,ijk->ij", away, away)
+        reach_m = _DOUBT * without_nan(way_m) + _REACH_PITCHES * self._pitch_m
+        if len(tracks) <= _MOST_FAST:
+            reach_m = np.fmax(reach_m, _DOUBT * way_m + _GATE * np.sqrt(expected["spread"][:, 0]))
+        misses = squares / (reach_m**2)[:, None]
+        is_near = (misses <= 1) & (tracks["frame"][:, None] == blobs.frame)
+        is_sharing = (overlap > 0) & ~(by_place & is_near.any(axis=1))[:, None]
+        is_rest = blobs.load < _REST * tracks["load"][:, None]
+        sharing = np.where(is_rest, _LEFT, np.where(overlap >= 0.5, _STRONG, _WEAK)) + _CLOSENESS * overlap
+        sharing += _PREFERENCE * (1 - _rank(tracks["born_ns"])[:, None] + _rank(blobs.load))
+        near = _NEAR + _NEARNESS * (1 - misses) + _PRESENCE * (tracks["gone_ns"] == 0)[:, None]
         return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
 
-    def _move(self, now: _Tracks, found: Whole, known: Whole, is_whole: npt.NDArray[np.bool_]) -> None:
-        """Update velocities; they stay where contacts merge or split, as their centres jump."""
-        tracks = self._tracks
-        now.velocity_m_s[found], now.steps[found] = tracks.velocity_m_s[known], tracks.steps[known]
-        passed_s = (now.seen_ns[found] - tracks.seen_ns[known]) / NS_PER_S
-        moved = is_whole & (passed_s > 0) & (tracks.frame[known] == now.frame[found])
-        found, known, passed_s = found[moved], known[moved], passed_s[moved]
-        velocity = (now.cop_m[found] - tracks.cop_m[known]) / passed_s[:, None]
-        now.steps[found] += 1
-        weight = np.maximum(1 - np.exp(-passed_s / self._settings.velocity_s), 1 / now.steps[found])[:, None]
-        before = np.nan_to_num(now.velocity_m_s[found])
-        now.velocity_m_s[found] = before + weight * (velocity - before)
+    def _join(self, home: Whole, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> None:
+        """Put tracks that found no blob of their own into that of another."""
+        lost = np.flatnonzero((home < 0) & (expected["frames"] > 1) & np.isfinite(expected["place"][:, 0]))
+        if not len(lost) or not len(size) or len(lost) > _MOST_NEW:
+            return
+        within = np.bincount(home[home >= 0], minlength=len(size))
+        position = self._position_m[blobs.taxels]
+        for track in lost.tolist():
+            squares = ((position - expected["place"][track]) ** 2).sum(axis=1)
+            nearest = int(squares.argmin())
+            blob = int(blobs.blob[nearest])
+            if squares[nearest] > self._pitch_m**2:
+                blob = int(overlap[track].argmax())
+                if overlap[track, blob] < 0.5:
+                    continue
+            if (
+                blobs.frame[blob] == expected["frame"][track]
+                and within[blob] < _MOST_WITHIN
+                and size[blob] <= _MOST_TAXELS
+            ):
+                home[track] = blob
+                within[blob] += 1
 
-    def _judge(self, now: _Tracks, found: Whole, known: Whole, load: Floats, time_ns: int) -> None:
-        tracks, settings = self._tracks, self._settings
-        passed_s = np.maximum(now.seen_ns[found] - tracks.seen_ns[known], 0) / NS_PER_S
-        was, motion = tracks.load[known], tracks.motion_m_s[known]
-        now.load[found] = was + (load[found] - was) * -np.expm1(-passed_s / settings.velocity_s)
-        weight = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
-        now.motion_m_s[found] = motion + weight * (np.nan_to_num(now.velocity_m_s[found]) - motion)
-        is_steady = abs(load - now.load) <= settings.steady * now.load
-        slowest = np.full(len(load), settings.sliding_m_s)
-        slowest[found[tracks.kind[known] == ContactKind.SLIDING]] /= 2
-        is_sliding = is_steady & (np.linalg.norm(now.motion_m_s, axis=1) >= slowest)
-        is_old = time_ns - now.born_ns >= settings.touch_s * NS_PER_S
-        now.kind[is_old] = np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD)[is_old]
+    def _with_new(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> Tracks:
+        """The tracks, and new ones of the blobs that have none."""
+        has_track = np.zeros(len(blobs.load), bool)
+        has_track[tracks["home"][tracks["home"] >= 0]] = True
+        if has_track.all():
+            return tracks
+        new = np.flatnonzero(~has_track)
+        begun = np.zeros(len(new), TRACK)
+        begun["key"] = self._last_key + 1 + np.arange(len(new))
+        self._last_key += len(new)
+        begun["home"], begun["born_ns"], begun["frame"] = new, time_ns, blobs.frame[new]
+        begun["place"], begun["kind"] = blobs.cop_m[new], int(ContactKind.TOUCH)
+        begun["velocity"] = np.where(np.isnan(blobs.cop_m[new]), np.nan, 0.0)
+        begun["spread"] = np.inf, 0.0, (_NEW_M_S if len(new) <= _MOST_NEW else 0.0) ** 2
+        return np.concatenate([tracks, begun])
 
-    def _keep(self, now: _Tracks, places: Places, known: Whole, time_ns: int) -> None:
-        """Remember this frame, and the identities whose contacts are gone."""
-        tracks = self._tracks
-        is_gone = np.ones(len(tracks.id), bool)
-        is_gone[known] = False
-        gone = tracks[is_gone]
-        gone.gone_ns[gone.gone_ns == 0] = time_ns
-        number = np.append(np.where(is_gone, len(now.id) + np.cumsum(is_gone) - 1, -1), -1)
-        self._track_of = number[self._track_of]
-        self._track_of[places.taxels] = places.contact
-        self._tracks = now.and_then(gone)
+    def _find(self, tracks: Tracks, blobs: TouchedBlobs, size: Whole, time_ns: int) -> None:
+        """Measure where each track is in this frame, and correct what was expected of it."""
+        pitch_m, home = self._pitch_m, tracks["home"]
+        alone = np.flatnonzero((home >= 0) & ~tracks["shared"])
+        blob = home[alone]
+        tracks["found"][alone], tracks["noise"][alone] = blobs.cop_m[blob], (_NOISE_PITCHES * pitch_m) ** 2 / size[blob]
+        tracks["now"][alone], tracks["height"][alone] = blobs.load[blob], blobs.peak[blob]
+        elsewhere = alone[tracks["frame"][alone] != blobs.frame[blob]]
+        tracks["place"][elsewhere], tracks["pace"][elsewhere] = tracks["found"][elsewhere], 0.0
+        tracks["frame"][alone], tracks["size"][alone] = blobs.frame[blob], size[blob]
+        jumping = alone[tracks["jumps"][alone]]
+        tracks["place"][jumping] = tracks["found"][jumping]
+        correct(tracks, alone, time_ns)
+        for one in set(home[tracks["shared"]].tolist()):
+            self._tell_apart(tracks, np.flatnonzero(home == one), blobs, time_ns)
+        here = np.flatnonzero(tracks["home"] >= 0)
+        tracks["seen_ns"][here], tracks["gone_ns"][here] = time_ns, 0
+        tracks["frames"][here] += blobs.frames[tracks["home"][here]]
+        tracks["sure"][here] |= blobs.is_sure[tracks["home"][here]]
+
+    def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
+        """Find the tracks that share a blob, each with its own bell."""
+        within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
+        fitted = fit_bells(
+            blobs.value[within],
+            self._position_m[blobs.taxels[within]],
+            tracks["place"][rows],
+            tracks["spread"][rows, 0],
+            tracks["height"][rows],
+            tracks["width"][rows],
+        )
+        tracks["found"][rows], tracks["noise"][rows] = fitted.place, fitted.variance_m2
+        tracks["height"][rows] = fitted.peak
+        share = fitted.peak * tracks["width"][rows] ** 2
+        tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
+        tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
+        tracks["jumps"][rows] = False
+        correct(tracks, rows, time_ns)
+        is_faint = fitted.peak < _FAINT * tracks["peak"][rows]
+        is_faint[fitted.peak.argmax()] = False
+        tracks["home"][rows[is_faint]] = -1
+
+    def _move(self, tracks: Tracks, before: Tracks) -> None:
+        """Update the velocities that are published; they stay where contacts merge or split, as their centres jump."""
+        known = np.arange(len(before))
+        passed_s = (tracks["seen_ns"][known] - before["seen_ns"]) / NS_PER_S
+        moved = (tracks["home"][known] >= 0) & (passed_s > 0) & (tracks["frame"][known] == before["frame"])
+        moved &= (tracks["shared"][known] == before["shared"]) & ~tracks["jumps"][known]
+        known, passed_s = known[moved], passed_s[moved]
+        velocity = (tracks["found"][known] - before["found"][known]) / passed_s[:, None]
+        tracks["steps"][known] += 1
+        weight = np.maximum(-np.expm1(-passed_s / self._settings.velocity_s), 1 / tracks["steps"][known])[:, None]
+        was = without_nan(tracks["velocity"][known])
+        tracks["velocity"][known] = was + weight * (velocity - was)
+
+    def _judge(self, tracks: Tracks, before: Tracks, time_ns: int) -> None:
+        """Update what is smoothed, and the kinds."""
+        settings, pitch_m = self._settings, self._pitch_m
+        here = np.flatnonzero(tracks["home"] >= 0)
+        now = tracks if len(here) == len(tracks) else tracks[here]
+        passed_s = np.zeros(len(here))
+        known = here < len(before)
+        passed_s[known] = np.maximum(time_ns - before["seen_ns"][here[known]], 0) / NS_PER_S
+        is_new = ~known
+        weight = np.where(is_new, 1.0, -np.expm1(-passed_s / settings.velocity_s))
+        now["load"] += weight * (now["now"] - now["load"])
+        alone = np.maximum(weight, 1 / now["frames"]) * ~now["shared"]
+        now["peak"] += alone * (now["height"] - now["peak"])
+        width = pitch_m * np.sqrt(now["now"] / (2 * np.pi * np.maximum(now["height"], 1e-9)))
+        now["width"] += alone * (np.maximum(width, _NARROWEST_PITCHES * pitch_m) - now["width"])
+        calm = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
+        now["motion"] += calm * (without_nan(now["velocity"]) - now["motion"])
+        is_steady = abs(now["now"] - now["load"]) <= settings.steady * now["load"]
+        slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
+        is_sliding = is_steady & (np.linalg.norm(now["motion"], axis=1) >= slowest)
+        is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
+        now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
+        if now is not tracks:
+            tracks[here] = now
+
+    def _keep(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> None:
+        """Remember this frame, and the tracks whose contacts are gone."""
+        is_gone = tracks["home"] < 0
+        tracks["gone_ns"][is_gone & (tracks["gone_ns"] == 0)] = time_ns
+        owner = np.full(len(blobs.load), -1)
+        owner[tracks["home"][~is_gone]] = np.flatnonzero(~is_gone)
+        of_taxel = owner[blobs.blob]
+        shared = np.flatnonzero(tracks["shared"] & ~is_gone)
+        if len(shared):
+            within = np.flatnonzero(np.isin(blobs.blob, tracks["home"][shared]))
+            away = self._position_m[blobs.taxels[within], None] - tracks["place"][shared]
+            bell = np.log(tracks["height"][shared]) - (away**2).sum(axis=2) / (2 * tracks["width"][shared] ** 2)
+            bell[blobs.blob[within, None] != tracks["home"][shared]] = -np.inf
+            of_taxel[within] = shared[bell.argmax(axis=1)]
+        track = self._track_of[self._taxels]
+        left = self._taxels[(track >= 0) & is_gone[track]] if len(is_gone) else self._taxels[:0]
+        left_by = self._track_of[left]
+        self._track_of[self._taxels] = -1
+        self._track_of[left] = left_by
+        self._track_of[blobs.taxels] = of_taxel
+        self._taxels = np.concatenate([left, blobs.taxels])
+        self._tracks = tracks
+
+    def _tracked(self, tracks: Tracks, time_ns: int) -> Tracked:
+        """Return the identity of the oldest track of each blob, and the mean of their velocities."""
+        here = np.flatnonzero(tracks["home"] >= 0)
+        here = here[np.lexsort([tracks["key"][here], tracks["born_ns"][here], tracks["home"][here]])]
+        home = tracks["home"][here]
+        first = here[np.diff(home, prepend=-1) > 0]
+        new = first[(tracks["id"][first] == 0) & (tracks["frames"][first] >= self._settings.frames)]
+        tracks["id"][new] = (self._last_id + np.arange(len(new))) % _LAST_ID + 1
+        self._last_id = (self._last_id + len(new) - 1) % _LAST_ID + 1 if len(new) else self._last_id
+        velocity = tracks["velocity"][first]
+        for blob in set(home[1:][np.diff(home) == 0].tolist()):
+            rows = here[home == blob]
+            velocity[blob] = np.average(tracks["velocity"][rows], axis=0, weights=np.maximum(tracks["now"][rows], 1e-9))
+        age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
+        return Tracked(tracks["id"][first], age_s, velocity, tracks["kind"][first], ~tracks["sure"][first])
 
 
 def _rank(numbers: Floats | Whole) -> Floats:
     """0 for the smallest to 1 for the largest."""
-    rank = np.zeros(len(numbers))
-    rank[np.argsort(numbers, kind="stable")] = np.linspace(0, 1, len(numbers)) if len(numbers) else 0.0
+    rank = np.empty(len(numbers))
+    rank[np.argsort(numbers, kind="stable")] = np.arange(len(numbers)) / max(len(numbers) - 1, 1)
     return rank

@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadRecording
 from skinware.limits import LIMITS
-from skinware.memory.file_layout import SLOT, Column
+from skinware.memory.file_layout import SLOT, ColumnPlace
 from skinware.memory.ring import Sample
 
 HEADER = np.dtype(
@@ -72,7 +72,7 @@ class CodedColumn:
     is_integer: bool
 
     @staticmethod
-    def of(column: Column) -> CodedColumn:
+    def of(column: ColumnPlace) -> CodedColumn:
         """Return how a column of a service's column table is coded."""
         dtype = column.dtype
         if dtype.kind in "uif" and dtype.itemsize in (1, 2, 4, 8):
@@ -85,7 +85,7 @@ class CodedColumn:
         return np.frombuffer(slot, self.words, self.count, self.offset)
 
 
-class Encoder:
+class FrameEncoder:
     """Codes the frames of one generation, in order."""
 
     def __init__(self, columns: Sequence[CodedColumn]) -> None:
@@ -211,7 +211,7 @@ class Run:
         return slots
 
 
-class Decoder:
+class FrameDecoder:
     """Decodes frames of one generation, each coded after one of the last two that were kept."""
 
     def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:

@@ -45,7 +45,7 @@ class FrameListener(Protocol):
 class _Source:
     reader: Tap[Sample]
     generation: int = 0
-    lost: int = 0
+    missed: int = 0
     state: str = LIVE
 
     @property
@@ -62,7 +62,7 @@ class _Taken(NamedTuple):
     frame: Sample
     head: bytes | None
     is_restarted: bool
-    lost: int
+    missed: int
 
 
 class Collector:
@@ -95,9 +95,9 @@ class Collector:
         self._stopping = False
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames that were published meanwhile and could not be taken."""
-        return sum(source.reader.lost for source in self._sources.values())
+        return sum(source.reader.missed for source in self._sources.values())
 
     @property
     def services(self) -> list[str]:
@@ -119,8 +119,8 @@ class Collector:
                 self._listener.began(one.service, one.head)
             if one.is_restarted:
                 self._report("restarted", one.service)
-            if one.lost:
-                self._report("lost", one.service, count=one.lost, before=one.frame.sequence)
+            if one.missed:
+                self._report("missed", one.service, count=one.missed, before=one.frame.sequence)
             self._listener.took(one.service, one.frame)
         if time_ns >= self._next_life_ns:
             self._next_life_ns = time_ns + _LIFE_NS
@@ -163,18 +163,18 @@ class Collector:
             try:
                 frame = reader.next_in_order()
             except Overrun:
-                return  # it counts as lost before the next frame
+                return  # it counts as missed before the next frame
             except StructureChanged:
                 if not self._reattach(name, source):
                     return
                 continue
             if frame is None:
                 return
-            before, lost_before = source.generation, source.lost
-            source.generation, source.lost = frame.generation, reader.lost
+            before, missed_before = source.generation, source.missed
+            source.generation, source.missed = frame.generation, reader.missed
             is_first = frame.generation != before
             head = reader.head if is_first else None
-            yield _Taken(name, frame, head, is_first and before != 0, reader.lost - lost_before)
+            yield _Taken(name, frame, head, is_first and before != 0, reader.missed - missed_before)
 
     def _reattach(self, name: str, source: _Source) -> bool:
         try:

@@ -65,7 +65,7 @@ def as_lines(robot: str, state: dict[str, Any]) -> list[str]:
             service["mode"],
             rate_text(service["rate_hz"]),
             *(age_text_ms(service["age_ms"][share]) for share in ("p50", "p99")),
-            count_text(service["lost"]),
+            count_text(service["gap"]),
         )
         for name, service in state["services"].items()
     ]
@@ -78,8 +78,8 @@ def _service_data(service: ServiceState) -> dict[str, Any]:
         "state": service.state,
         "mode": service.mode,
         "rate_hz": service.rate_hz,
-        "lost": service.lost,
-        "lost_hz": service.lost_hz,
+        "gap": service.gap,
+        "gap_hz": service.gap_hz,
         "bytes_per_s": round(service.bytes_per_s),
         "age_ms": {
             "p50": None if p50_ns is None else p50_ns / 1e6,

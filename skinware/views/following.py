@@ -18,7 +18,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
-from skinware.views.history import Past, Rest
+from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
 from skinware.views.quantities import Quantity, physical_values, quantities_of
 from skinware.views.robot import Robot
@@ -109,7 +109,7 @@ class ShownDriver:
         self.newest: Newest | None = None
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
-        self.past, self.rest = Past(self.structure.n_sensors, self.structure.dtype), Rest(self.structure)
+        self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
 
     @property
     def name(self) -> str:
@@ -136,7 +136,8 @@ class ShownDriver:
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)
-            self.past, self.rest = Past(self.structure.n_sensors, self.structure.dtype), Rest(self.structure)
+            self.past = RecentValues(self.structure.n_sensors, self.structure.dtype)
+            self.rest = DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         self.newest = self._judged(frame, services)

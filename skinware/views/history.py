@@ -79,7 +79,7 @@ def rounded_up(value: float) -> float:
     return next(step * unit for step in _STEPS if step * unit >= value * (1 - 1e-9))
 
 
-class Rest:
+class DriverRest:
     """The baseline of every sensor of a driver, and its noise.
 
     A baseline is the mean of the first second. Then it follows slowly, over a minute: a touch stays visible, drift does
@@ -136,7 +136,7 @@ class Rest:
         return max(float(np.median(unrest)), count)
 
 
-class Past:
+class RecentValues:
     """Values of n sensors in the last seconds."""
 
     def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
@@ -240,9 +240,9 @@ def threshold(noise: float) -> float:
 class Memory:
     """Everything that a picture of one driver remembers from snapshot to snapshot."""
 
-    def __init__(self, structure: Structure, rest: Rest | None = None) -> None:
+    def __init__(self, structure: Structure, rest: DriverRest | None = None) -> None:
         self.structure = structure
-        self.rest = rest or Rest(structure)
+        self.rest = rest or DriverRest(structure)
         self.wipe: WipeTest | None = None
         self.peak: tuple[str, Floats] | None = None
         self._spans: dict[tuple[str, str], ChangeSpan] = {}

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.views.following import Newest, ShownDriver
-from skinware.views.history import Memory, Rest, WipeTest, threshold
+from skinware.views.history import DriverRest, Memory, WipeTest, threshold
 from skinware.views.quantities import HIGHEST, Levels, Quantity, levels_of, shear_of
 
 Mode = Literal["raw", "change", "peak", "wipe"]
@@ -67,7 +67,7 @@ class Look:
     def tare(self) -> None:
         """Take the next values for rest, and begin peaks again."""
         for memory in self._memories.values():
-            memory.rest = Rest(memory.structure)
+            memory.rest = DriverRest(memory.structure)
             memory.peak = None
 
     def wipe(self, on: bool) -> None:

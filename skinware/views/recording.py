@@ -21,7 +21,7 @@ _END_S = 10.0
 """Time for a recording to complete its file."""
 
 
-class Recording:
+class RecordingProgram:
     """Run ``skin-record``, one at a time.
 
     Args:
@@ -51,7 +51,7 @@ class Recording:
         """The file, its size, losses and duration; None while nothing is recorded."""
         if self._running is None:
             return None
-        figures = {name: self._report.get(name, 0) for name in ("bytes", "lost")}
+        figures = {name: self._report.get(name, 0) for name in ("bytes", "missed")}
         return {"file": str(self._file), **figures, "s": round(time.monotonic() - self._begin_s, 1)}
 
     def start(self) -> None:

@@ -71,7 +71,7 @@ class _Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rpy: Triple = _NOWHERE
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
     link: tuple[_Link, ...] = ()
@@ -103,7 +103,7 @@ def _from_toml(path: Path) -> Robot:
     text = TomlText(path)
     poses: dict[str, Pose] = {}
     meshes = []
-    for number, link in enumerate(text.of_format("file of links", FORMAT, VERSION, _File).link):
+    for number, link in enumerate(text.of_format("file of links", FORMAT, VERSION, _RobotFile).link):
         pose = pose_of(link.xyz, link.rpy)
         place = text.place(("link", number))
         if not np.isfinite(pose).all():

@@ -30,7 +30,7 @@ _BY_KIND = {("triangle", 10): _TRIANGLE, ("fingertip", 12): _FINGERTIP}
 
 
 @dataclass(frozen=True)
-class Shape:
+class ModuleShape:
     """The places of the sensors of a module.
 
     Attributes:
@@ -44,7 +44,7 @@ class Shape:
 
 
 @cache
-def shape_of(kind: str, count: int) -> Shape:
+def shape_of(kind: str, count: int) -> ModuleShape:
     """Return the shape of a module.
 
     Args:
@@ -53,7 +53,7 @@ def shape_of(kind: str, count: int) -> Shape:
     """
     known = _BY_KIND.get((kind, count))
     if known is not None:
-        return Shape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
+        return ModuleShape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
     grid = filled_by(kind, count)
     if grid is not None:
         return rows_of(count, grid[1])
@@ -61,9 +61,9 @@ def shape_of(kind: str, count: int) -> Shape:
 
 
 @cache
-def rows_of(count: int, columns: int) -> Shape:
+def rows_of(count: int, columns: int) -> ModuleShape:
     cells = tuple((number // columns, 2 * (number % columns)) for number in range(count))
-    return Shape(cells, math.ceil(count / columns), 2 * columns)
+    return ModuleShape(cells, math.ceil(count / columns), 2 * columns)
 
 
 def block_columns(count: int) -> int:

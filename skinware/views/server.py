@@ -19,9 +19,9 @@ from websockets.http11 import Request, Response
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.views import operations
-from skinware.views.access import Access, Refused
+from skinware.views.access import Access, RequestRefused
 from skinware.views.following import Follower
-from skinware.views.recording import Recording, ReplayControl
+from skinware.views.recording import RecordingProgram, ReplayControl
 from skinware.views.tree import problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
@@ -54,7 +54,7 @@ class ViewServer:
     """
 
     def __init__(
-        self, follower: Follower, access: Access, recording: Recording | None = None, page: Path = PAGE
+        self, follower: Follower, access: Access, recording: RecordingProgram | None = None, page: Path = PAGE
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._replay = ReplayControl()
@@ -110,7 +110,7 @@ class ViewServer:
             if path == "/live":
                 return None
             return self._file(path, request)
-        except Refused as refused:
+        except RequestRefused as refused:
             return _response(refused.status, f"{refused}\n".encode(), "text/plain")
         except ValueError:  # the path cannot be an address
             return _response(HTTPStatus.BAD_REQUEST, b"", "text/plain")
@@ -125,7 +125,7 @@ class ViewServer:
         files |= {f"/mesh/{number}": mesh.file for number, mesh in enumerate(self._follower.robot.meshes)}
         file = files.get("/index.html" if path == "/" else path)
         if file is None or not file.is_file():
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")
+            raise RequestRefused(HTTPStatus.NOT_FOUND, "there is no such file")
         return _response(HTTPStatus.OK, file.read_bytes(), _type_of(file))
 
     async def _attend(self, connection: ServerConnection) -> None:

@@ -44,7 +44,7 @@ _STATUSES = {
 
 def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
     """Return the part of the tree for a driver, as the page reads it."""
-    lost = [bus.counters.get("lost", 0) for bus in report.buses]
+    dropped = [bus.counters.get("dropped", 0) for bus in report.buses]
     loads = [bus.load for bus in report.buses if bus.load is not None]
     return {
         "id": driver.number,
@@ -55,7 +55,7 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "age_ms": _milliseconds(report.age_ns),
         "sensors": driver.structure.n_sensors,
         "fresh": int(np.count_nonzero(driver.status == 0)),
-        "lost": sum(lost),
+        "dropped": sum(dropped),
         "load": max(loads, default=None),
         "buses": [
             {
@@ -63,10 +63,10 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
                 "state": report.last(bus.state),
                 "reason": bus.reason,
                 "load": bus.load,
-                "lost": own_lost,
+                "dropped": own_dropped,
                 "counters": _nonzero(bus.counters),
             }
-            for bus, own_lost in zip(report.buses, lost, strict=True)
+            for bus, own_dropped in zip(report.buses, dropped, strict=True)
         ],
         "patches": [
             {
@@ -110,9 +110,9 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
         if len(sensors) and driver.frame is not None:
             shares = f"{count_text(len(sensors))} of {plural(driver.structure.n_sensors, 'sensor')}"
             add(severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
-    lost = sum(bus.counters.get("lost", 0) for bus in report.buses)
-    if lost:
-        add(NOTE, f"{plural(lost, 'frame')} lost on its buses since it started")
+    dropped = sum(bus.counters.get("dropped", 0) for bus in report.buses)
+    if dropped:
+        add(NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
     return found
 
 

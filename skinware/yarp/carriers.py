@@ -18,7 +18,7 @@ _IN_TEXT = re.compile(r'"([^"]*)"|\(([^()]*)\)|(\S+)')
 _PLAIN = re.compile(r"[A-Za-z/_][^\s\"()\[\]]*")
 
 
-class Word(str):
+class YarpWord(str):
     """A word of at most four letters, which YARP writes in square brackets."""
 
     __slots__ = ()
@@ -31,7 +31,7 @@ def in_text(values: Sequence[Value]) -> str:
     """Return a list in text."""
     texts = []
     for value in values:
-        if isinstance(value, Word):
+        if isinstance(value, YarpWord):
             texts.append(f"[{value}]")
         elif isinstance(value, str):
             texts.append(value if _PLAIN.fullmatch(value) else '"' + value.replace('"', "'") + '"')
@@ -50,7 +50,7 @@ def packed(values: Sequence[Value]) -> bytes:
     """Return a list in binary."""
     parts = [struct.pack("<ii", _LIST, len(values))]
     for value in values:
-        if isinstance(value, Word):
+        if isinstance(value, YarpWord):
             parts.append(struct.pack("<i4s", _WORD, value.encode()))
         elif isinstance(value, str):
             data = value.encode()
@@ -99,7 +99,7 @@ def _unpacked_value(data: bytes, at: int, kind: int, deepest: int) -> tuple[Valu
         return struct.unpack_from("<i", data, at)[0], at + 4
     if kind == _WORD:
         (letters,) = struct.unpack_from("<4s", data, at)
-        return Word(letters.rstrip(b"\0").decode("utf-8", "replace")), at + _LETTERS
+        return YarpWord(letters.rstrip(b"\0").decode("utf-8", "replace")), at + _LETTERS
     if kind == _TEXT:
         (size,) = struct.unpack_from("<i", data, at)
         end = at + 4 + size

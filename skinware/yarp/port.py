@@ -23,7 +23,7 @@ from skinware.yarp.carriers import (
     Carrier,
     Value,
     VectorMessage,
-    Word,
+    YarpWord,
     framed,
     in_text,
     of_text,
@@ -201,7 +201,7 @@ class OutputPort:
             if command == "a":
                 answer = packed(await self._administer([str(value) for value in unpacked(data)]))
             elif command[:1] == "d":  # D expects no answer
-                answer = packed([Word("fail"), _SENDS_ONLY])
+                answer = packed([YarpWord("fail"), _SENDS_ONLY])
             elif command.startswith(("/", "!/")):
                 await self._obey(command, reader)
             caller.writer.write(answer + (framed(0) if caller.carrier.acknowledges else b""))
@@ -241,9 +241,9 @@ class OutputPort:
     async def _administer(self, words: list[str]) -> list[Value]:
         match words:
             case ["ver", *_]:
-                return [Word("ver"), 1, 2, 3]
+                return [YarpWord("ver"), 1, 2, 3]
             case ["help", *_]:
-                return [Word("many"), *_ADMINISTRATION]
+                return [YarpWord("many"), *_ADMINISTRATION]
             case ["list", "in", *_]:
                 return []
             case ["list", "out"]:
@@ -261,7 +261,7 @@ class OutputPort:
             case ["del", name, *_]:
                 said = self._remove(name)
             case _:
-                return [Word("fail"), "send [help] for list of valid commands"]
+                return [YarpWord("fail"), "send [help] for list of valid commands"]
         return [0 if said.startswith(("Added", "Removed")) else -1, said]
 
     # -- outgoing connections --------------------------------------------------------------------------------------

@@ -167,9 +167,9 @@ class YarpServer:
         self._thread.start()
 
     @property
-    def lost(self) -> int:
+    def missed(self) -> int:
         """Frames that were missed in their rings."""
-        return self._collector.lost
+        return self._collector.missed
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
         """Run until ``stop``; call ``each_second`` once a second."""

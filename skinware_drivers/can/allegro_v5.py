@@ -39,9 +39,9 @@ from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Options, Patch, taxels
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can import CanAdapter
+from skinware_drivers.fields import Byte, Identifier, Reply, Sentinel, SequenceNumber
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
-from skinware_drivers.link import Reply
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import SerialAdapter, Unframed
 

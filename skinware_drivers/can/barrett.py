@@ -30,7 +30,8 @@ from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Link, Match, Module, Options, Patch, Poll, taxels
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Packed, Values
+from skinware_drivers.fields import Bits, Byte, Identifier, Packed
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 
 FIRST_NODE, LAST_NODE = 11, 14
 CELLS = 24

@@ -18,7 +18,8 @@ from canopen.sdo.exceptions import SdoAbortedError
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
 from skinware_drivers import EXTENDED_FLAG, Link, Match, Module, Patch, Sensor
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
+from skinware_drivers.fields import Bits, Identifier, Packed
+from skinware_drivers.layout import Frame, Layout, Values
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

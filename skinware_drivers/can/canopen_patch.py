@@ -25,7 +25,8 @@ from skinware.sensor_types import CATALOGUE
 from skinware_drivers import Link, Match, Notice, Options, Patch, Poll
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
-from skinware_drivers.link import Heard, Reply
+from skinware_drivers.fields import Reply
+from skinware_drivers.link import Heard
 from skinware_drivers.options import nearest_name
 
 log: logging.Logger = logging.getLogger("skinware.driver")

@@ -34,7 +34,7 @@ from skinware.geometry import Geometry
 from skinware_drivers import Identifier, Link, Match, Options, Patch, Poll, operation
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
+from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, TouchQuestion, every_layout, parts_heard
 from skinware_drivers.hand import FINGERS, Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
@@ -261,7 +261,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return _CANDIDATES.get(kind, tuple(TOUCH))
 
 
-async def _answers(link: Link, hand: int, question: Question) -> bool:
+async def _answers(link: Link, hand: int, question: TouchQuestion) -> bool:
     timeout_s = max(_ANSWER_S, question.patience_s)
     try:
         await link.request(hand, question.payload, question.end(hand), timeout_s=timeout_s, tries=_TRIES)

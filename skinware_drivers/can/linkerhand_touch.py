@@ -14,8 +14,9 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers import Match, Module, Sensor, taxels
+from skinware_drivers.fields import Bits, Byte, Condition, Identifier, Sentinel
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import Bits, Byte, Condition, Cycle, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 PARTS = (*FINGERS, "palm")
 Beginnings = Mapping[tuple[int, int], int]
@@ -34,7 +35,7 @@ DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0, maxi
 FORCE = PRESSURE.measured(unit="counts", minimum=0, maximum=255)
 
 
-class Question(NamedTuple):
+class TouchQuestion(NamedTuple):
     """A command that asks for touch.
 
     Attributes:
@@ -53,7 +54,7 @@ class Question(NamedTuple):
         return Match(hand, prefix=self.last, shortest=self.shortest)
 
 
-class Touch(ABC):
+class TouchKind(ABC):
     """One kind of touch.
 
     Attributes:
@@ -72,7 +73,7 @@ class Touch(ABC):
         """Return the layout of the frames of hands with such identifiers."""
 
     @abstractmethod
-    def questions(self, parts: Sequence[str]) -> list[Question]:
+    def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
         """Return the questions for these parts, in order."""
 
     @abstractmethod
@@ -84,7 +85,7 @@ class Touch(ABC):
         """Return how many of a hand's frames fit this kind of touch."""
 
 
-class _OfMatrices(Touch):
+class _OfMatrices(TouchKind):
     """A matrix for each part."""
 
     types = (FORCE,)
@@ -112,7 +113,7 @@ class _OfMatrices(Touch):
 
 
 @dataclass(frozen=True)
-class Matrices(_OfMatrices):
+class RowMatrices(_OfMatrices):
     """A matrix for each part, one frame for each of its rows, in order (second generation).
 
     Attributes:
@@ -142,10 +143,10 @@ class Matrices(_OfMatrices):
         ]
         return Layout([_other(identifier), *rows], Cycle([row.name for row in rows], maximum_age_s=_LONGEST_REPLY_S))
 
-    def questions(self, parts: Sequence[str]) -> list[Question]:
+    def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
         commands = [MATRIX + PARTS.index(part) for part in parts]
         size, last = self.rows << 4 | self.columns, self.rows - 1 << 4
-        return [Question(bytes((command, size)), bytes((command, last)), 2 + self.columns) for command in commands]
+        return [TouchQuestion(bytes((command, size)), bytes((command, last)), 2 + self.columns) for command in commands]
 
     def known(self, heard: Beginnings) -> int:
         """Return the number of rows; 0 if a program asks for runs, which look like rows of six."""
@@ -178,12 +179,14 @@ class RunMatrices(_OfMatrices):
         of_palm = Cycle([run.name for run in palm], 2 * _LONGEST_RUNS_S)
         return Layout([_other(identifier), *fingers, *palm], of_finger, [of_palm])
 
-    def questions(self, parts: Sequence[str]) -> list[Question]:
+    def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
         """Return one question for each part, with the byte that makes the hand end its answer with sums."""
         questions = []
         for part in parts:
             command = MATRIX + PARTS.index(part)
-            questions.append(Question(bytes((command, *self.size(part), 1)), bytes((command, _SUMS)), 4, _RUNS_WAIT_S))
+            questions.append(
+                TouchQuestion(bytes((command, *self.size(part), 1)), bytes((command, _SUMS)), 4, _RUNS_WAIT_S)
+            )
         return questions
 
     def known(self, heard: Beginnings) -> int:
@@ -206,7 +209,7 @@ def _runs(name: str, when: Sequence[Condition], rows: int, columns: int) -> list
 
 
 @dataclass(frozen=True)
-class FingerValues(Touch):
+class FingerValues(TouchKind):
     """Four values for each finger; a frame has one of them for all fingers (first generation).
 
     Attributes:
@@ -231,10 +234,10 @@ class FingerValues(Touch):
         frame = Frame(what, is_reply, lengths, values, _HAND, _COMMAND, [_SATURATED])
         return Layout([_other(identifier), frame])
 
-    def questions(self, parts: Sequence[str]) -> list[Question]:
+    def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
         del parts
         commands = [bytes([self.command + at]) for at in range(len(self.types))]
-        return [Question(command, command, 1 + len(FINGERS)) for command in commands]
+        return [TouchQuestion(command, command, 1 + len(FINGERS)) for command in commands]
 
     def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
         grid, names = Grid(1, 1), [one.name for one in self.types]
@@ -246,9 +249,9 @@ class FingerValues(Touch):
         return sum(n for (first, length), n in heard.items() if first in commands and length in (6, 7))
 
 
-TOUCH: dict[str, Touch] = {
-    "12x6": Matrices(12, 6),
-    "10x4": Matrices(10, 4),
+TOUCH: dict[str, TouchKind] = {
+    "12x6": RowMatrices(12, 6),
+    "10x4": RowMatrices(10, 4),
     "fingers": FingerValues(0x20),
     "fingers_90": FingerValues(0x90),
     "hand_23x9": RunMatrices((23, 9), (28, 20)),
@@ -264,7 +267,7 @@ def every_layout(identifier: Identifier) -> Layout:
     return Layout([_other(identifier), *frames], None, [cycle for layout in layouts for cycle in layout.cycles])
 
 
-def parts_heard(touch: Touch, commands: Collection[int]) -> list[str]:
+def parts_heard(touch: TouchKind, commands: Collection[int]) -> list[str]:
     """Return the parts of a hand that sent frames with these first bytes; its fingers in any case."""
     if isinstance(touch, FingerValues):
         return list(FINGERS)

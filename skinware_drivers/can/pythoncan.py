@@ -75,7 +75,7 @@ class PythonCanBus(Bus):
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self.interface = interface
         self._bus: can.BusABC | None = None
-        self._messages: _Messages | None = None
+        self._messages: _MessageQueue | None = None
         self._was_open = False
         self._echoes: deque[tuple[int, int, bytes]] = deque()  # of sent frames: time, identifier, payload
 
@@ -100,7 +100,7 @@ class PythonCanBus(Bus):
             why = f"bus {self.interface}:{self.channel} cannot be opened: {error}"
             raise BusNotAvailable(why, reason=BusReason.FAILED) from None
         self._was_open = True
-        self._messages = _Messages(self._bus, f"bus {self.interface}:{self.channel}", self.counters)
+        self._messages = _MessageQueue(self._bus, f"bus {self.interface}:{self.channel}", self.counters)
 
     @property
     def note(self) -> str:
@@ -194,7 +194,7 @@ class PythonCanBus(Bus):
             messages.close()
 
 
-class _Messages:
+class _MessageQueue:
     """The messages of one opened interface. A thread takes them and shuts the interface down, as both may hang.
 
     Attributes:
@@ -255,7 +255,7 @@ class _Messages:
 
     def _take(self, message: can.Message) -> None:
         if len(self.queue) >= _QUEUE_FRAMES:
-            self._counters.lost += 1
+            self._counters.dropped += 1
             return
         identifier = message.arbitration_id
         for is_so, flag in (

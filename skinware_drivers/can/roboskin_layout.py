@@ -23,7 +23,8 @@ from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PR
 from skinware.status import Status
 from skinware_drivers import Module, Patch, Sensor
 from skinware_drivers.can.roboskin_options import CHANNELS, Inertial, InertialSensor, RoboskinOptions
-from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Byte, Flag, Identifier, Sentinel, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 OLD_SKIN, SKIN, INERTIAL = 3, 4, 5
 """Message classes: robotology/icub-firmware-shared iCubCanProto_classes.h."""

@@ -20,7 +20,7 @@ from skinware_drivers.can.roboskin_options import (
     SpecialBoards,
     runs,
 )
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.polling import Watch
 

@@ -95,7 +95,7 @@ class SocketCanBus(KernelBus):
         self.narrows: bool = self._wanted.filter == "on"
         self._filters: Sequence[Filter] = ()
         self._socket: socket.socket | None = None
-        self._lost_before = 0
+        self._dropped_before = 0
         self.granted_buffer: int = 0
         self._stamper = Stamper()
         self._health = ControllerHealth()
@@ -147,7 +147,7 @@ class SocketCanBus(KernelBus):
         self._stamper.switch_on(sock)
         sock.setblocking(False)
         self._socket = sock
-        self._lost_before = self.counters.lost
+        self._dropped_before = self.counters.dropped
 
     @property
     def note(self) -> str:
@@ -237,7 +237,7 @@ class SocketCanBus(KernelBus):
         source.fd, source.stream, source.tap = self._socket.fileno(), None, self.tap.address
         source.headers, source.control = rows.headers_address, rows.control.ctypes.data
         source.offset_ns, source.last_poll_ns = self._stamper.state
-        source.lost_before, source.lost, source.frames = self._lost_before, self.counters.lost, 0
+        source.dropped_before, source.dropped, source.frames = self._dropped_before, self.counters.dropped, 0
         source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
         source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
         return True
@@ -245,7 +245,7 @@ class SocketCanBus(KernelBus):
     def take_back(self, source: Source) -> None:
         self._stamper.state = source.offset_ns, source.last_poll_ns
         self.counters.frames += source.frames
-        self.counters.lost = source.lost
+        self.counters.dropped = source.dropped
         self.wire_bits += source.wire_bits
         self.fullest = max(self.fullest, source.fullest)
         if source.frames:
@@ -338,7 +338,7 @@ class SocketCanBus(KernelBus):
         if self._socket is not None:
             data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
             words = array.array("I", data)
-            self.counters.lost = self._lost_before + words[_MEMINFO_DROPS]
+            self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
             self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
 
 

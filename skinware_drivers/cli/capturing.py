@@ -52,7 +52,7 @@ class Capture:
     """A recorder in a process of its own.
 
     Attributes:
-        result: ``bytes``, ``lost`` and ``problem``, after the end.
+        result: ``bytes``, ``missed`` and ``problem``, after the end.
 
     Raises:
         ConfigurationError: the driver cannot be recorded; the message says why.
@@ -60,7 +60,7 @@ class Capture:
 
     def __init__(self, path: Path, driver: str, namespace: str) -> None:
         self.path = path
-        self.result: dict[str, Any] = {"bytes": 0, "lost": 0, "problem": "something else ended the recorder"}
+        self.result: dict[str, Any] = {"bytes": 0, "missed": 0, "problem": "something else ended the recorder"}
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__, str(path), driver, namespace],
             stdin=subprocess.PIPE,
@@ -117,7 +117,7 @@ def _record(path: Path, driver: str, namespace: str) -> None:
     """Record until standard input is closed."""
     from skinware.errors import SkinwareError
 
-    problem, size, lost = "", 0, 0
+    problem, size, missed = "", 0, 0
     try:
         from skinware.recording.files import Files
         from skinware.recording.recorder import Recorder
@@ -130,14 +130,14 @@ def _record(path: Path, driver: str, namespace: str) -> None:
         try:
             recorder.run()
         finally:
-            size, lost = target.size, recorder.lost
+            size, missed = target.size, recorder.missed
     except FileExistsError:
         problem = "exists already: give another name, or remove it"
     except OSError as error:
         problem = error.strerror or str(error)
     except SkinwareError as error:
         problem = str(error)
-    _say(problem=problem, bytes=size, lost=lost)
+    _say(problem=problem, bytes=size, missed=missed)
 
 
 def _end_with_input(recorder: Recorder) -> None:

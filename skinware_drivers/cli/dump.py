@@ -117,7 +117,7 @@ def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[Frame
 def _warn_of_missing(bus: Bus) -> None:
     counters = bus.counters
     missing = {
-        "lost": counters.lost,
+        "dropped": counters.dropped,
         "error frames, not shown": counters.errors,
         "remote frames, not shown": counters.refused,
     }

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Filter
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout
+from skinware_drivers.fields import Bits, Byte, Identifier
+from skinware_drivers.layout import Frame, Layout
 
 _FLAGS = EXTENDED_FLAG | REMOTE_FLAG
 
@@ -133,16 +134,16 @@ class Addresses:
 
 
 @dataclass(frozen=True)
-class Field:
+class KeyField:
     shift: int
     mask: int
     constant: int = 0
 
     @staticmethod
-    def of(bits: Bits | int | None) -> Field:
+    def of(bits: Bits | int | None) -> KeyField:
         if isinstance(bits, int):
-            return Field(0, 0, bits)
-        return Field(0, 0) if bits is None or bits.byte is not None else Field(bits.shift, (1 << bits.width) - 1)
+            return KeyField(0, 0, bits)
+        return KeyField(0, 0) if bits is None or bits.byte is not None else KeyField(bits.shift, (1 << bits.width) - 1)
 
 
 class Form:
@@ -151,7 +152,7 @@ class Form:
     def __init__(self, bus: int, frame: Frame, tables: SkinTables, first_slot: int) -> None:
         self.bus = bus
         self.conditions = [c for c in frame.when if isinstance(c, Identifier)]
-        self.patch, self.module = Field.of(frame.patch), Field.of(frame.module)
+        self.patch, self.module = KeyField.of(frame.patch), KeyField.of(frame.module)
         by_byte = frame.module_byte is not None
         known: dict[int, int] = {}
         self._anyone: dict[int, int] = {}  # patch key -> slot of "some module of this patch"

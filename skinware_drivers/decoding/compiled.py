@@ -15,8 +15,8 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout
 
 NO_KIND = 255
 """The number in place of the kind of a frame that is of no kind."""
@@ -97,7 +97,7 @@ class CompiledCycle:
             self.punctuality.forget(modules)
 
 
-class Carrier(NamedTuple):
+class UpdateMaker(NamedTuple):
     """A kind of frame by itself, or a cycle: it makes one update.
 
     Attributes:
@@ -121,7 +121,7 @@ class Groups:
             ``n_groups``: none.
     """
 
-    def __init__(self, tables: SkinTables, carriers: Sequence[Carrier]) -> None:
+    def __init__(self, tables: SkinTables, carriers: Sequence[UpdateMaker]) -> None:
         structure = tables.structure
         self._tables = tables
         self._carriers_of: list[list[int]] = [[] for _ in range(structure.n_modules)]
@@ -155,7 +155,7 @@ class Groups:
                 table[module, : len(groups)] = groups
             self.of_carrier.append(table)
 
-    def _divide(self, module: int, carriers: Sequence[Carrier]) -> list[tuple[tuple[int, ...], Indices]]:
+    def _divide(self, module: int, carriers: Sequence[UpdateMaker]) -> list[tuple[tuple[int, ...], Indices]]:
         """Return the groups of a module: the carriers that update each, and its sensors."""
         mine = self._carriers_of[module]
         sensors = np.arange(self._tables.structure.n_sensors)[self._tables.structure.module_index(module)]
@@ -273,12 +273,12 @@ class CompiledLayouts:
         ]
         self.width = width
 
-    def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
+    def _carrier(self, members: Sequence[int], period_s: float) -> UpdateMaker:
         modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
         declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
         longest_s = max([*declared_s, period_s])
         channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
-        return Carrier(sorted(modules), channels, longest_s or None)
+        return UpdateMaker(sorted(modules), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """Return a payload byte and a table over it and the length, if they determine the kind (a fast case)."""

@@ -158,7 +158,7 @@ SHARED = Rule(
     "troubleshooting.md#two-computers-or-two-programs-on-one-bus",
 )
 LOSSES = {
-    "lost": Rule(
+    "dropped": Rule(
         _ERROR,
         "frames were dropped before the driver took them",
         "enlarge the receive buffer, and start the driver with more processor time: --realtime fifo:50",
@@ -251,7 +251,7 @@ LOSSES = {
     ),
 }
 """By counter of the bus. Notes once the loss is over."""
-_OF_A_BUSY_MACHINE = ("lost", "polls_missed", "updates_skipped")
+_OF_A_BUSY_MACHINE = ("dropped", "polls_missed", "updates_skipped")
 
 
 def check(evidence: Evidence) -> Iterator[Note]:

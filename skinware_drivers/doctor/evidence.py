@@ -161,7 +161,7 @@ class DriverSeen:
         scheduling: of its process, in words; empty: unknown.
         data_path: ``native``, ``mixed``, ``python`` or ``not_told``.
         restarts: during the look, or in the recording.
-        frames_lost: number of snapshots that were published and are missing in the recording.
+        frames_missed: number of snapshots that were published and are missing in the recording.
         statuses: number of sensors with each status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``.
         lines: names of the rows and columns of matrices that were never good.
@@ -179,7 +179,7 @@ class DriverSeen:
     data_path: str
     restarts: int
     frames: int
-    frames_lost: int
+    frames_missed: int
     structure: Structure
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
@@ -280,7 +280,7 @@ class RecordingSeen:
         size: in bytes.
         is_whole: it was closed in good order.
         services: names of the services in it that are not drivers.
-        lost: number of snapshots that were published meanwhile and are missing.
+        missed: number of snapshots that were published meanwhile and are missing.
         events: number of events of each kind: ``restarted``, ``dead`` ...
         clock_sets: jumps of the wall clock.
         boots: number of starts of the machine that it spans.
@@ -293,7 +293,7 @@ class RecordingSeen:
     is_whole: bool
     problems: tuple[str, ...]
     services: tuple[str, ...]
-    lost: int
+    missed: int
     events: Counts
     clock_sets: tuple[ClockSet, ...]
     boots: int
@@ -305,14 +305,14 @@ class ReaderSeen:
     """A program that reads a driver snapshot by snapshot.
 
     Attributes:
-        frames, lost: number of snapshots that it took and missed during the look.
+        frames, missed: number of snapshots that it took and missed during the look.
     """
 
     program: str
     pid: int
     driver: str
     frames: int
-    lost: int
+    missed: int
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ DAMAGED = Rule(
     ("skin-recover {file}",),
     _RECORD,
 )
-LOST = Rule(
+MISSED = Rule(
     Severity.ERROR,
-    "the recorder lost frames",
+    "the recorder missed samples",
     "record on a machine that is less busy, or start the driver with more slots: --slots 64",
     see="how-to/record.md",
 )
@@ -136,8 +136,8 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
         yield CUT.found(name, why, file=name)
     for problem in recording.problems:
         yield DAMAGED.found(name, problem, file=name)
-    if recording.lost:
-        yield LOST.found(name, f"{plural(recording.lost, 'frame')} published meanwhile are not in it")
+    if recording.missed:
+        yield MISSED.found(name, f"{plural(recording.missed, 'sample')} published meanwhile are not in it")
     for jump in recording.clock_sets:
         yield CLOCK_SET.found(f"{name} at {age_text(jump.time_s * 1e9)}", f"by {jump.by_s:+.2f} s")
     if recording.boots > 1:

@@ -54,8 +54,8 @@ class ReadersWatch:
         for key, record in self._look().items():
             before = self._before.get(key)
             if before is not None and record.kind == _EVERY_FRAME:
-                frames, lost = record.frames - before.frames, record.lost - before.lost
-                found.append(ReaderSeen(record.program, record.pid, record.service, max(0, frames), max(0, lost)))
+                frames, missed = record.frames - before.frames, record.missed - before.missed
+                found.append(ReaderSeen(record.program, record.pid, record.service, max(0, frames), max(0, missed)))
         return tuple(found)
 
     def _look(self) -> dict[tuple[int, str], ReaderRecord]:

@@ -133,11 +133,11 @@ def check_timing(evidence: Evidence) -> Iterator[Note]:
             yield from _late(driver, evidence)
         yield from _clock(driver)
     for one in evidence.readers:
-        yield Looked(f"reader {one.program}", f"{one.frames} snapshots of {one.driver} taken, {one.lost} missed")
-        if one.lost:
+        yield Looked(f"reader {one.program}", f"{one.frames} snapshots of {one.driver} taken, {one.missed} missed")
+        if one.missed:
             yield SLOW_READER.found(
                 f"{one.program}, pid {one.pid}, reads {one.driver}",
-                f"{plural(one.lost, 'snapshot')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
+                f"{plural(one.missed, 'snapshot')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
             )
     if evidence.is_live:
         if not evidence.drivers:
@@ -233,8 +233,8 @@ def check_bridges(evidence: Evidence) -> Iterator[Note]:
 
 def _slow_services(bridge: BridgeState) -> Iterator[Finding]:
     for name, service in bridge.services.items():
-        all_hz = service.rate_hz + service.lost_hz
-        if service.state == "live" and service.lost_hz > _LOST_SHARE * all_hz and service.age_p50_ns is not None:
+        all_hz = service.rate_hz + service.gap_hz
+        if service.state == "live" and service.gap_hz > _LOST_SHARE * all_hz and service.age_p50_ns is not None:
             rates = f"{rate_text(service.rate_hz)} of {rate_text(all_hz)} come"
             seen = f"{rates}, {age_text(service.age_p50_ns)} old (p50)"
             yield SLOW_LINK.found(f"{name} of robot {bridge.robot}", seen)

@@ -73,7 +73,7 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
         is_whole=recording.is_whole,
         problems=tuple(recording.problems),
         services=tuple(name for name in recording.services if name not in recording.drivers),
-        lost=sum(_lost_in(event) for event in events),
+        missed=sum(_missed_in(event) for event in events),
         events=Counter(str(event.get("event")) for event in events),
         clock_sets=tuple(_clock_sets(clock)),
         boots=len({str(moment.get("boot")) for moment in clock}),
@@ -93,9 +93,9 @@ def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
             yield ClockSet(time_s, now - before)
 
 
-def _lost_in(event: dict[str, Any]) -> int:
+def _missed_in(event: dict[str, Any]) -> int:
     count = event.get("count")
-    return count if event.get("event") == "lost" and isinstance(count, int) else 0
+    return count if event.get("event") == "missed" and isinstance(count, int) else 0
 
 
 class _DriverTrack:
@@ -171,7 +171,7 @@ class _DriverTrack:
             data_path=newest.data_path.name.lower(),
             restarts=self._restarts,
             frames=self._frames,
-            frames_lost=sum(_lost_in(event) for event in own),
+            frames_missed=sum(_missed_in(event) for event in own),
             structure=log.structure,
             statuses=statuses,
             affected=affected,

@@ -102,7 +102,7 @@ class _DriverWatch:
             data_path="not_told" if frame is None else frame.data_path.name.lower(),
             restarts=self._restarts,
             frames=log.frames,
-            frames_lost=0,
+            frames_missed=0,
             structure=reader.structure,
             statuses=statuses,
             affected=affected,

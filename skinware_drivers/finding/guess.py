@@ -16,7 +16,8 @@ from skinware.errors import BusError, BusSendError, ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 from skinware_drivers.description import Patch
-from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout
+from skinware_drivers.fields import Bits, Identifier
+from skinware_drivers.layout import Expand, Frame, Layout
 from skinware_drivers.link import Heard, Link
 from skinware_drivers.loading import registered, short_name
 from skinware_drivers.registry import DRIVERS, load_driver

@@ -30,7 +30,7 @@ class HeardOnBus:
         rate_hz: frames per second.
         load: share of the bus' time, 0 to 1; None: the bit rate is unknown.
         trouble: state of the controller if something is wrong: ``error-passive``.
-        lost: number of frames that were read too late.
+        dropped: number of frames that were read too late.
         guesses: drivers that know the frames.
     """
 
@@ -42,7 +42,7 @@ class HeardOnBus:
     load: float | None = None
     error_frames: int = 0
     trouble: str = ""
-    lost: int = 0
+    dropped: int = 0
     classes: list[IdentifierClass] = field(default_factory=list)
     guesses: list[Guess] = field(default_factory=list)
 
@@ -94,7 +94,7 @@ async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping
         load=share_of_time(bus, bus.wire_bits - bits_before, passed_ns),
         error_frames=bus.counters.errors,
         trouble=reason_text(reason) if reason else "",
-        lost=bus.counters.lost,
+        dropped=bus.counters.dropped,
         classes=traffic.classes(),
         guesses=await guess(traffic, bus, dict(drivers)),
     )

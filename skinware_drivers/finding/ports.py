@@ -127,9 +127,9 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
     ]
 
 
-def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | None:
+def pseudo_terminal(path: str) -> SerialPort | None:
     """Return the pseudo terminal of a path, as ``skin-emulate --bus pty:port`` makes it; None if it is not one."""
-    machine = machine or Machine()
+    machine = Machine()
     real = Path(path).resolve()
     if real.parent != machine.dev / "pts" or not real.is_char_device():
         return None

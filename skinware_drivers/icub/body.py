@@ -14,8 +14,8 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup
 from skinware.tactile.regions import Region
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
-from skinware_drivers.icub.device import Port
-from skinware_drivers.icub.part import Part
+from skinware_drivers.icub.device import PortRange
+from skinware_drivers.icub.part import DevicePart
 from skinware_drivers.icub.positions import Pose, Positions, read_text
 from skinware_drivers.icub.xml_tree import Notes
 from skinware_drivers.icub.xml_tree import number as whole_number
@@ -138,8 +138,8 @@ class Body:
 
 
 def read_body(
-    part: Part,
-    ports: Sequence[Port],
+    part: DevicePart,
+    ports: Sequence[PortRange],
     positions: Mapping[str, Positions],
     drawings: Mapping[str, Drawing],
     notes: Notes,
@@ -154,7 +154,7 @@ def read_body(
     return body
 
 
-def triangles_of(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
+def triangles_of(part: DevicePart, port: PortRange, notes: Notes) -> dict[int, Place]:
     order = part.host_order
     triangles: dict[int, Place] = {}
     for index in range(port.first, port.last + 1):
@@ -169,7 +169,7 @@ def triangles_of(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
     return triangles
 
 
-def _place(body: Body, port: Port, positions: Positions, triangles: Mapping[int, Place], notes: Notes) -> None:
+def _place(body: Body, port: PortRange, positions: Positions, triangles: Mapping[int, Place], notes: Notes) -> None:
     all_poses = [positions.poses[first : first + CHANNELS] for first in range(0, len(positions.poses), CHANNELS)]
     lost, without_a_place = 0, []
     for number, poses in enumerate(all_poses):
@@ -196,7 +196,7 @@ def _place(body: Body, port: Port, positions: Positions, triangles: Mapping[int,
         notes.add("info", positions.path, f"taxels without a place: {places_text(without_a_place)}")
 
 
-def _group(port: Port, place: Place, type_name: str, frame: str, known: Mapping[int, Pose]) -> GeometryGroup:
+def _group(port: PortRange, place: Place, type_name: str, frame: str, known: Mapping[int, Pose]) -> GeometryGroup:
     normals = [normal for _, normal in known.values()]
     return GeometryGroup(
         type=type_name,
@@ -218,7 +218,7 @@ def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
     return ("palm" if len(non_tactile) == 1 else "triangle"), non_tactile
 
 
-def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Place], notes: Notes) -> None:
+def _draw(body: Body, port: PortRange, drawing: Drawing, triangles: Mapping[int, Place], notes: Notes) -> None:
     outside = [number for number in drawing.shapes if number not in triangles]
     if outside:
         text = f"draws triangles {runs_text(outside)}, which the port {port.name} does not have; left out"
@@ -246,7 +246,7 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
                 notes.add("odd", name, f"{what}: {places_text(which)}", element="skinGui's drawing")
 
 
-def places_of(part: Part, ports: Sequence[Port]) -> dict[str, set[Place]]:
+def places_of(part: DevicePart, ports: Sequence[PortRange]) -> dict[str, set[Place]]:
     quiet = Notes()
     return {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
 

@@ -185,7 +185,7 @@ _UNUSED = {
 
 
 @dataclass(frozen=True)
-class Port:
+class PortRange:
     """A body part in a skin device's index.
 
     Attributes:
@@ -209,7 +209,7 @@ class Wrapper:
     """
 
     device: str
-    ports: tuple[Port, ...]
+    ports: tuple[PortRange, ...]
 
 
 def read_wrapper(group: Group, notes: Notes) -> Wrapper:
@@ -219,7 +219,7 @@ def read_wrapper(group: Group, notes: Notes) -> Wrapper:
 
 class _WrapperReader(ValueReader):
     def read(self, group: Group) -> Wrapper:
-        ports: list[Port] = []
+        ports: list[PortRange] = []
         for element in group.lists.get("ports", ()):
             port = self._port(element)
             if port is not None:
@@ -244,7 +244,7 @@ class _WrapperReader(ValueReader):
                 self.note("unknown", element, f"not understood{f': {element.text!r}' if element.text else ''}")
         return Wrapper(names[0] if names else "", tuple(ports))
 
-    def _port(self, element: Element) -> Port | None:
+    def _port(self, element: Element) -> PortRange | None:
         row = self.numbers(element)
         if row is None:
             return None
@@ -255,7 +255,7 @@ class _WrapperReader(ValueReader):
         if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
             self.refuse(element, f"{element.text!r}: the two ranges differ in length")
             return None
-        return Port(element.name, element, first, last, local_first)
+        return PortRange(element.name, element, first, last, local_first)
 
     @staticmethod
     def _rest(group: Group) -> list[Element]:

@@ -22,8 +22,8 @@ from skinware_drivers.icub.body import (
     read_drawing,
     regions_of,
 )
-from skinware_drivers.icub.device import WRAPPER, DeviceReader, Port, Wrapper, read_wrapper
-from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
+from skinware_drivers.icub.device import WRAPPER, DeviceReader, PortRange, Wrapper, read_wrapper
+from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.translate import (
     TranslatedBus,
@@ -34,7 +34,7 @@ from skinware_drivers.icub.translate import (
     yarp_configuration_text,
 )
 from skinware_drivers.icub.xml_tree import Element, Level, Notes, shown
-from skinware_drivers.icub.yarp import YarpPort, yarp_ports
+from skinware_drivers.icub.yarp import PartPort, yarp_ports
 
 _SUFFIXES = (".xml", ".txt", ".ini")
 _MOST_FILES = 20_000
@@ -54,10 +54,10 @@ class ImportedPart:
     """
 
     name: str
-    part: Part
-    ports: Sequence[Port]
+    part: DevicePart
+    ports: Sequence[PortRange]
     buses: list[TranslatedBus]
-    yarp: list[YarpPort]
+    yarp: list[PartPort]
     groups: list[GeometryGroup]
     regions: list[Region]
     triangles: int
@@ -257,7 +257,7 @@ class _Wrappers:
                 self._others.append(device)
         self._used: set[int] = set()
 
-    def ports_of(self, part: Part, notes: Notes) -> Sequence[Port]:
+    def ports_of(self, part: DevicePart, notes: Notes) -> Sequence[PortRange]:
         """Return the ports of a device; with several robots, those of the wrapper in the nearest folder."""
         where = part.element.file.resolve().parts
         of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
@@ -298,7 +298,7 @@ class _BodyFiles:
             self._drawings.append((read_drawing(path, own), own))
         self._used: set[Path] = set()
 
-    def of_ports(self, ports: Sequence[Port]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
+    def of_ports(self, ports: Sequence[PortRange]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
         positions, drawings = {}, {}
         for port in ports:
             path = self._chosen.get(port.name) or self._positions_of(port)
@@ -323,7 +323,7 @@ class _BodyFiles:
             if path not in self._used:
                 self._notes.add("info", path, "no body part of this name is imported")
 
-    def _positions_of(self, port: Port) -> Path | None:
+    def _positions_of(self, port: PortRange) -> Path | None:
         """Find it by the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
         exact = [path for path in self._positions if path.stem == port.name]
         similar = [path for path in self._positions if path.stem.startswith(f"{port.name}_")]
@@ -338,7 +338,7 @@ class _BodyFiles:
             return None
         return candidates[0] if candidates else None
 
-    def _drawing_of(self, port: Port) -> Drawing | None:
+    def _drawing_of(self, port: PortRange) -> Drawing | None:
         found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
         self._used.update(drawing.path for drawing, _ in found)
         if len(found) > 1:
@@ -348,5 +348,5 @@ class _BodyFiles:
             self._notes.take(own)
         return found[0][0] if found else None
 
-    def _note(self, port: Port, level: Level, text: str) -> None:
+    def _note(self, port: PortRange, level: Level, text: str) -> None:
         self._notes.add(level, port.element.file, text, line=port.element.line, element=port.element.label)

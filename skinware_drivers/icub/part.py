@@ -57,7 +57,7 @@ class OldBoard:
 
 
 @dataclass
-class Part:
+class DevicePart:
     """A skin device.
 
     Attributes:
@@ -93,7 +93,7 @@ class Part:
         return [(patch, board) for patch in sorted(self.boards, reverse=True) for board in self.boards[patch]]
 
 
-def read_part(name: str, device_type: str, group: Group, notes: Notes) -> Part:
+def read_part(name: str, device_type: str, group: Group, notes: Notes) -> DevicePart:
     """Read a skin device; note values that make no sense."""
     return _PartReader(name, device_type, group, notes).read()
 
@@ -102,11 +102,11 @@ class _PartReader(ValueReader):
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
         super().__init__(notes)
         self._group = group
-        self._part = Part(name, group.element, device_type)
+        self._part = DevicePart(name, group.element, device_type)
         self._can_device: int | None = None
         self._other_patches: set[int] = set()
 
-    def read(self) -> Part:
+    def read(self) -> DevicePart:
         self._read_boards()
         old = [name for name in self._group.params if name.startswith(("4C_", "4E_"))]
         if self._part.device_type == CAN and not {"defaultCfgBoard", "defaultCfgTriangle"} & set(self._group.groups):

@@ -23,7 +23,7 @@ from skinware_drivers.can.roboskin_options import (
 )
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.icub.body import Body, Place, places_text
-from skinware_drivers.icub.part import ETHERNET, Part
+from skinware_drivers.icub.part import ETHERNET, DevicePart
 from skinware_drivers.icub.xml_tree import Notes
 from skinware_drivers.streams.yarp import YarpOptions
 
@@ -118,7 +118,7 @@ class TranslatedBus:
 
 
 def translate(
-    part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes, *, wants_names: bool = True
+    part: DevicePart, body: Body, bus_names: Mapping[int, str], notes: Notes, *, wants_names: bool = True
 ) -> list[TranslatedBus]:
     """Return the buses of a part with triangles that are switched on, in the order of their patches.
 
@@ -175,7 +175,7 @@ def service_name(name: str, taken: set[str]) -> str:
     return found
 
 
-def _options(part: Part, patch: int) -> RoboskinOptions:
+def _options(part: DevicePart, patch: int) -> RoboskinOptions:
     special = [SpecialBoards(s.boards, **_taken(s, _OF_A_BOARD)) for s in part.board_sets if s.patch == patch]
     modules = [
         Kind(s.board, s.triangles, enabled=s.enabled, shift=s.shift, cdc_offset=s.cdc_offset)
@@ -191,7 +191,7 @@ def _options(part: Part, patch: int) -> RoboskinOptions:
     )
 
 
-def _old_options(part: Part, patch: int, notes: Notes) -> RoboskinOptions:
+def _old_options(part: DevicePart, patch: int, notes: Notes) -> RoboskinOptions:
     """Return options of the old set-up: one shift and offset for a bus; the rest can differ from board to board."""
     boards = part.boards[patch]
     each = {board: _OldSettings(part, board, notes) for board in boards}
@@ -220,7 +220,7 @@ def _taken(source: object, names: Sequence[str]) -> dict[str, Any]:
 
 
 class _OldSettings:
-    def __init__(self, part: Part, board: int, notes: Notes) -> None:
+    def __init__(self, part: DevicePart, board: int, notes: Notes) -> None:
         values = part.old[board].values
         period_ms = float(_USUAL_OLD_PERIOD_MS)
         if values["4C_Timer"] & 0xF == _OWN_TIMER:
@@ -263,7 +263,7 @@ def _with_kinds(options: RoboskinOptions, patch: int, body: Body) -> RoboskinOpt
     return msgspec.structs.replace(options, modules=(*options.modules, *more))
 
 
-def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, notes: Notes) -> None:
+def _check_set_up(part: DevicePart, patch: int, options: RoboskinOptions, body: Body, notes: Notes) -> None:
     for board in options.boards:
         set_up = BoardSetUp(options, board)
         if set_up.wiped:
@@ -290,5 +290,5 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
         _note(notes, "todo", part, text)
 
 
-def _note(notes: Notes, level: Any, part: Part, text: str) -> None:
+def _note(notes: Notes, level: Any, part: DevicePart, text: str) -> None:
     notes.add(level, part.element.file, text, line=part.element.line, element=part.element.label)

@@ -171,12 +171,8 @@ class Element:
         for child in self.children:
             yield from child.walk()
 
-    def understand(self) -> None:
-        for element in self.walk():
-            element.understood = True
 
-
-def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """Read an ordinary file that is not too large.
 
     Raises:
@@ -186,13 +182,13 @@ def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
         if not path.is_file():
             raise ConfigurationError(f"{path}: not there, or not an ordinary file")
         with path.open("rb") as file:
-            data = file.read(limit + 1)
+            data = file.read(LARGEST_FILE + 1)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror}") from None
     except ValueError as error:  # a NUL in the path
         raise ConfigurationError(f"{str(path)!r}: {error}") from None
-    if len(data) > limit:
-        raise ConfigurationError(f"{path}: larger than {limit >> 20} MiB, too large for a robot's configuration")
+    if len(data) > LARGEST_FILE:
+        raise ConfigurationError(f"{path}: larger than {LARGEST_FILE >> 20} MiB, too large for a robot's configuration")
     return data
 
 

@@ -14,8 +14,8 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE
 from skinware_drivers.description import Module
 from skinware_drivers.icub.body import Body, Place, triangles_of
-from skinware_drivers.icub.device import Port
-from skinware_drivers.icub.part import Part
+from skinware_drivers.icub.device import PortRange
+from skinware_drivers.icub.part import DevicePart
 from skinware_drivers.icub.translate import TranslatedBus
 from skinware_drivers.icub.xml_tree import Notes
 from skinware_drivers.streams.yarp import Triangles, YarpOptions
@@ -24,7 +24,7 @@ _CHANNEL = 0xFF
 
 
 @dataclass(frozen=True)
-class YarpPort:
+class PartPort:
     """One port of a part.
 
     Attributes:
@@ -50,8 +50,8 @@ class YarpPort:
 
 
 def yarp_ports(
-    part: Part, ports: Sequence[Port], buses: Sequence[TranslatedBus], body: Body, notes: Notes
-) -> list[YarpPort]:
+    part: DevicePart, ports: Sequence[PortRange], buses: Sequence[TranslatedBus], body: Body, notes: Notes
+) -> list[PartPort]:
     """Return the ports of a part with a triangle that is switched on, in the order of the port map.
 
     Args:
@@ -71,7 +71,7 @@ def yarp_ports(
             notes.add("odd", of_name[0].element.file, f"port {name} is left out: {error}")
             continue
         if on:
-            found.append(YarpPort(name, options, _groups(on, body)))
+            found.append(PartPort(name, options, _groups(on, body)))
     return found
 
 

@@ -16,11 +16,11 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.status import Status
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import Identifier
-from skinware_drivers.layout import AnyFlag, Frame, Layout
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import AnyFlag, Identifier, Match
+from skinware_drivers.layout import Frame, Layout
+from skinware_drivers.link import Link
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.master import ANSWERS

@@ -23,10 +23,10 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
+from skinware_drivers.fields import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers

@@ -21,8 +21,8 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.fields import Above, AnyFlag, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
@@ -33,7 +33,7 @@ _FIRST, _BYTES = 3000, 2
 _FULL_SCALE = 4096
 
 
-class _Matrix(NamedTuple):
+class _PadMatrix(NamedTuple):
     part: str
     name: str
     address: int
@@ -42,23 +42,23 @@ class _Matrix(NamedTuple):
 
 
 _MATRICES = (
-    _Matrix("little", "tip", 3000, 3, 3),
-    _Matrix("little", "top", 3018, 12, 8),
-    _Matrix("little", "pad", 3210, 10, 8),
-    _Matrix("ring", "tip", 3370, 3, 3),
-    _Matrix("ring", "top", 3388, 12, 8),
-    _Matrix("ring", "pad", 3580, 10, 8),
-    _Matrix("middle", "tip", 3740, 3, 3),
-    _Matrix("middle", "top", 3758, 12, 8),
-    _Matrix("middle", "pad", 3950, 10, 8),
-    _Matrix("index", "tip", 4110, 3, 3),
-    _Matrix("index", "top", 4128, 12, 8),
-    _Matrix("index", "pad", 4320, 10, 8),
-    _Matrix("thumb", "tip", 4480, 3, 3),
-    _Matrix("thumb", "top", 4498, 12, 8),
-    _Matrix("thumb", "middle", 4690, 3, 3),
-    _Matrix("thumb", "pad", 4708, 12, 8),
-    _Matrix("palm", "", 4900, 8, 14),
+    _PadMatrix("little", "tip", 3000, 3, 3),
+    _PadMatrix("little", "top", 3018, 12, 8),
+    _PadMatrix("little", "pad", 3210, 10, 8),
+    _PadMatrix("ring", "tip", 3370, 3, 3),
+    _PadMatrix("ring", "top", 3388, 12, 8),
+    _PadMatrix("ring", "pad", 3580, 10, 8),
+    _PadMatrix("middle", "tip", 3740, 3, 3),
+    _PadMatrix("middle", "top", 3758, 12, 8),
+    _PadMatrix("middle", "pad", 3950, 10, 8),
+    _PadMatrix("index", "tip", 4110, 3, 3),
+    _PadMatrix("index", "top", 4128, 12, 8),
+    _PadMatrix("index", "pad", 4320, 10, 8),
+    _PadMatrix("thumb", "tip", 4480, 3, 3),
+    _PadMatrix("thumb", "top", 4498, 12, 8),
+    _PadMatrix("thumb", "middle", 4690, 3, 3),
+    _PadMatrix("thumb", "pad", 4708, 12, 8),
+    _PadMatrix("palm", "", 4900, 8, 14),
 )
 
 
@@ -103,13 +103,13 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
         return OrderWatch(tables, _FULL_SCALE)
 
 
-def _channels(matrix: _Matrix) -> list[int]:
+def _channels(matrix: _PadMatrix) -> list[int]:
     grid = np.arange(matrix.rows * matrix.columns).reshape(matrix.rows, matrix.columns)
     order = grid[::-1].T if matrix.part == "palm" else grid
     return [int(place) for place in order.ravel()]
 
 
-def _uids(matrix: _Matrix) -> list[int]:
+def _uids(matrix: _PadMatrix) -> list[int]:
     """Return the number of each taxel's register, from 3000 on, row by row."""
     first = (matrix.address - _FIRST) // _BYTES
     return [first + int(place) for place in np.argsort(_channels(matrix))]

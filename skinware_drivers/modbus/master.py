@@ -15,7 +15,7 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guests, Retry
-from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
+from skinware_drivers.modbus.registers import Image, Overheard, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -28,8 +28,6 @@ _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
 """In place of the number of a read: a question of the driver's own, and one of another program."""
 _MANUALS_COUNT_FROM = 30_001
-_OVERHEARD_NS = NS_PER_S
-"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 class Timing(NamedTuple):
@@ -332,31 +330,6 @@ class Master(Talk):
         self._open = Open(message, read, time_ns + self._timing.timeout_ns, tries + 1)
         self._counters.sent += 1
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
-
-
-class Overheard:
-    """Join what another master reads.
-
-    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
-    """
-
-    def __init__(self, wanted: Wanted) -> None:
-        self._image = Image(wanted)
-        reads = wanted.reads()
-        self._first = (reads[0].unit, reads[0].question) if reads else None
-        self._cycle_ns = 0
-
-    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
-        """Take a reply; return the frames that are whole now.
-
-        Args:
-            registers: bytes of the registers in the reply.
-            time_ns: when it came.
-        """
-        if (asked.unit, asked.data) == self._first:
-            self._cycle_ns = time_ns
-        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
-        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)
 
 
 class Listener(Talk):

@@ -15,11 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.layout import AnyFlag, Packed, Values
-from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
+from skinware.realtime import NS_PER_S
+from skinware_drivers.fields import AnyFlag, Packed
+from skinware_drivers.layout import Values
+from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, Message, question_to_read
 
 Order = Literal["big", "little"]
 _LAST_ADDRESS = 0xFFFF
+_OVERHEARD_NS = NS_PER_S
+"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 @dataclass(frozen=True)
@@ -278,3 +282,28 @@ def _turned(data: bytes, run: Values) -> bytes:
     """Return the values of a run with their registers in the other order."""
     words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
     return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()
+
+
+class Overheard:
+    """Join what another master reads.
+
+    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
+    """
+
+    def __init__(self, wanted: Wanted) -> None:
+        self._image = Image(wanted)
+        reads = wanted.reads()
+        self._first = (reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
+
+    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
+        """Take a reply; return the frames that are whole now.
+
+        Args:
+            registers: bytes of the registers in the reply.
+            time_ns: when it came.
+        """
+        if (asked.unit, asked.data) == self._first:
+            self._cycle_ns = time_ns
+        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
+        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)

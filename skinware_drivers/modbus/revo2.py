@@ -27,10 +27,11 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, taxels
+from skinware_drivers.fields import AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import AnyFlag, Flag, Sentinel, Values
+from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
 from skinware_drivers.modbus.registers import Registers
@@ -219,7 +220,7 @@ class Revo2Watch(ZeroWatch):
             )
 
 
-class _Said(NamedTuple):
+class _SaidEdition(NamedTuple):
     """The edition that the hand reports, and the kind of values of the Pressure edition."""
 
     edition: EditionName
@@ -236,7 +237,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
 
     def __init__(self, options: Revo2Options) -> None:
         self._unit = options.unit or _UNITS[options.side or "right"]
-        self._said = _Said(options.edition or "touch")
+        self._said = _SaidEdition(options.edition or "touch")
         self._is_asked = False
         self._declare(self._said, options.side or "right", with_status=options.status)
         super().__init__(options)
@@ -320,7 +321,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             return "left" if self._unit == _UNITS["left"] else "right"
         return "left" if said[0] in _LEFT_SKUS else "right"
 
-    async def _look(self, link: Link) -> _Said:
+    async def _look(self, link: Link) -> _SaidEdition:
         edition = self.options.edition
         if edition is None:
             said = await self.read_or_none(link, _EDITION_AT, unit=self._unit)
@@ -329,11 +330,11 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
                 raise BusError(f"{link.bus_name}: register 970 says {number}: no edition that this driver reads")
             edition = list(_EDITIONS)[number - 1] if number else "touch"  # 0: old firmware
         if edition != "pressure":
-            return _Said(edition)
+            return _SaidEdition(edition)
         kind = await self.read_or_none(link, _KIND_AT, unit=self._unit)
         if kind and kind[0] > 2:
             raise BusError(f"{link.bus_name}: register 6000 says {kind[0]}: neither raw, calibrated nor force")
-        return _Said(edition, kind[0] if kind else 0)
+        return _SaidEdition(edition, kind[0] if kind else 0)
 
     async def _is_off(self, link: Link) -> bool:
         if self._said.edition == "touch":
@@ -350,7 +351,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             found.append(f"{what} {''.join(one for one in text if one.isprintable()) or 'not said'}")
         return ", ".join(found)
 
-    def _declare(self, said: _Said, side: _Side, *, with_status: bool) -> None:
+    def _declare(self, said: _SaidEdition, side: _Side, *, with_status: bool) -> None:
         what = _content(said.edition, self._unit, kind=said.kind, with_status=with_status)
         self.types: Sequence[SensorType] = what.types
         self.registers: Sequence[Registers] = what.registers

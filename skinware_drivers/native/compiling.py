@@ -13,8 +13,8 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.compiled import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
+from skinware_drivers.fields import Above, Byte, Packed, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Expand, Frame
 from skinware_drivers.native import structs
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")

@@ -6,7 +6,7 @@
 
 struct tap { /* wire_tap.py: what goes over a wire, kept until Python fetches it */
     uint8_t *bytes;
-    int64_t room, size, lost;
+    int64_t room, size, missed;
 };
 
 struct asked_block { /* registers that make one frame */
@@ -44,7 +44,7 @@ struct source { /* a serial line, or a socket whose datagrams are struct can_fra
     struct tap *tap;                           /* NULL: nobody wants what comes */
     int64_t headers, control;                  /* addresses of a mmsghdr and of 8 words for every row of the batch */
     int64_t offset_ns, last_poll_ns;           /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
-    int64_t lost_before, lost, frames, heard_ns; /* lost: ever; frames: since Python looked */
+    int64_t dropped_before, dropped, frames, heard_ns; /* dropped: ever; frames: since Python looked */
     int64_t is_counted, is_watched;            /* bits on the wire are; Python wants to know that frames come */
     int64_t is_small;                          /* its buffer is full after a few frames */
     double speed_up, wire_bits, fullest;

@@ -190,7 +190,7 @@ struct plan {
     int64_t *skipped;              /* (n_buses,) updates that were never published, since Python looked */
     const int64_t *skipped_before; /* (n_buses,) and before that */
     const int64_t *patch_bus;
-    int64_t skipped_column, lost_column, frames_column, errors_column, refused_column;
+    int64_t skipped_column, dropped_column, frames_column, errors_column, refused_column;
     int64_t bytes_column; /* of a line: bytes_in, and the five behind it */
     int64_t *timing;  /* (2, n_patches, SKINWARE__BUCKETS) */
     int64_t *timing_before_ns;

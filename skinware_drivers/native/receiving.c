@@ -96,13 +96,13 @@ static void read_memory(struct path *path, struct source *source)
     if (getsockopt((int)source->fd, SOL_SOCKET, MEMORY_INFO, words, &size) || size < sizeof words)
         return;
     double full = (double)words[MEMORY_USED] / words[MEMORY_SIZE];
-    int64_t lost = source->lost_before + words[MEMORY_DROPS];
+    int64_t dropped = source->dropped_before + words[MEMORY_DROPS];
     if (full > source->fullest)
         source->fullest = full;
-    if (lost == source->lost)
+    if (dropped == source->dropped)
         return;
-    source->lost = lost;
-    path->plan->counts[source->bus * path->plan->n_counts + path->plan->lost_column] = lost;
+    source->dropped = dropped;
+    path->plan->counts[source->bus * path->plan->n_counts + path->plan->dropped_column] = dropped;
     path->plan->interrupted[source->bus] = 1;
 }
 

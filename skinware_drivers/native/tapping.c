@@ -18,7 +18,7 @@ static uint8_t *begin_piece(struct tap *tap, uint8_t form, int64_t count, int64_
     uint8_t *at = tap->bytes + tap->size;
     int64_t size = (int64_t)sizeof head + n_bytes;
     if (tap->size + size > tap->room) {
-        tap->lost += count;
+        tap->missed += count;
         return NULL;
     }
     head.size = (uint32_t)size;

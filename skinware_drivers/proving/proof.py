@@ -136,8 +136,8 @@ class ProofFiles:
     def capture_text(self, *, is_whole: bool) -> str:
         beginning = "from the first byte on" if is_whole else "without the frames before skin-prove began"
         text = f"{self.capture.name}, {beginning}"
-        if self.captured.get("lost"):
-            text += f"; {self.captured['lost']} frames lost"
+        if self.captured.get("missed"):
+            text += f"; {self.captured['missed']} frames missed"
         return text + (f"; ended early: {self.captured['problem']}" if self.captured.get("problem") else "")
 
     def write(self, proof: Proof) -> OSError | None:

@@ -94,6 +94,7 @@ class _Walk:
     def __init__(self, reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
         self._reader, self._person, self._manner, self._proof = reader, person, manner, proof
         structure = self._structure = reader.structure
+        self._names = structure.module_names
         names = [one.name for one in structure.types]
         chosen = manner.type_name or next((name for name in _FIRST_CHOICE if name in names), names[0])
         self._type = structure.type(chosen)
@@ -113,10 +114,6 @@ class _Walk:
         self._threshold = 0.0
         self._first: DriverSnapshot | None = None
         self._last: DriverSnapshot | None = None
-
-    @property
-    def _names(self) -> Sequence[str]:
-        return self._structure.module_names
 
     def go(self) -> None:
         self._proof.about["sensors"] = f"{self._structure.n_sensors}, judged by {self._type.name} ({self._type.unit})"
@@ -329,5 +326,5 @@ class _Walk:
         return ", ".join(names[taxel] for taxel in taxels[:_MOST_NAMES]) + more
 
 
-_LOSSES = ("lost", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
+_LOSSES = ("dropped", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")
 """Counters of losses and damage on a bus."""

@@ -144,7 +144,7 @@ class BusLine:
     def losses(self) -> tuple[int, ...]:
         """Numbers that change whenever frames are known to be lost: dropped, or not received."""
         counters = self.bus.counters
-        return counters.lost, counters.overflows, counters.bus_offs, self.connection.opened_ns
+        return counters.dropped, counters.overflows, counters.bus_offs, self.connection.opened_ns
 
     async def open(self) -> None:
         """Open the bus.

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch, is_read_natively
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.bus_line import BusLine

@@ -117,17 +117,12 @@ class Backoff:
 
     def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
         self._first_s = first_s
-        self._longest_s = longest_s
+        self.longest_s = longest_s
         self._begin_s = 0.0 if at_once else first_s
         self._next_s = self._begin_s
 
-    @property
-    def longest_s(self) -> float:
-        """The longest pause; after so long without trouble, call ``begin_again``."""
-        return self._longest_s
-
     def next_s(self) -> float:
-        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self.longest_s)
         return pause_s
 
     def begin_again(self) -> None:

@@ -18,7 +18,7 @@ from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch, compile_decoder
-from skinware_drivers.running.path_hooks import Listeners, PathHooks, SharedArrays
+from skinware_drivers.running.path_hooks import PathHooks, SharedArrays
 from skinware_drivers.running.publisher import Publisher
 
 _real_now_ns = now_ns
@@ -62,17 +62,12 @@ class NativePath:
             raise MemoryError("no memory for the data path of a driver")
         self._path = path = ctypes.c_void_p(made)
         count = self._quick.skinware_path_count_strangers
-        self.named = self._hooks.named
+        self.listeners, self.named = self._hooks.listeners, self._hooks.named
         self._hooks.count_strangers = lambda rows, n: count(path, ctypes.c_void_p(rows), ctypes.c_int64(n))
 
     def __del__(self) -> None:
         if hasattr(self, "_path"):
             self._quick.skinware_path_free(self._path)
-
-    @property
-    def listeners(self) -> Listeners:
-        """Functions of other parts of the driver that C calls."""
-        return self._hooks.listeners
 
     def announce_waits(self, expects_data: bool, awaited: Sequence[Filter]) -> None:
         """Set the frames that coroutines wait for, before a call of C.
@@ -131,10 +126,6 @@ class NativePath:
         self._leave()
         return result
 
-    def leave_soon(self) -> None:
-        """Let ``run`` return after its first take."""
-        self._words.must_leave = True
-
     @property
     def deadline_ns(self) -> int:
         """The latest time of the next call of ``publish_if_due``, CLOCK_MONOTONIC ns."""
@@ -186,7 +177,7 @@ def _compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs
     counts = publisher.count_buses()
     plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
     plan.skipped_column = _SKIPPED
-    for name in ("lost", "frames", "errors", "refused"):
+    for name in ("dropped", "frames", "errors", "refused"):
         setattr(plan, f"{name}_column", OWN_BUS_COUNTERS.index(name))
     plan.bytes_column = OWN_BUS_COUNTERS.index("bytes_in")
     plan.skipped, plan.skipped_before = arrays.at(exchange.skipped), arrays.at(exchange.skipped_before)

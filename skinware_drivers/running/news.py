@@ -247,7 +247,7 @@ class BusLimits:
         self._clock = clock
         self._looked_ns = clock()
         self._bits = bus.wire_bits
-        self._lost = bus.counters.lost
+        self._dropped = bus.counters.dropped
         self._logged: set[str] = set()
         self.load: float | None = None
         self.load_from_ns = 0
@@ -265,9 +265,9 @@ class BusLimits:
             self._log_once("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
         if fill > HIGH_FILL:
             self._log_once("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little time")
-        if bus.counters.lost > self._lost:
-            lost = bus.counters.lost - self._lost
-            self._log_once("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+        if bus.counters.dropped > self._dropped:
+            dropped = bus.counters.dropped - self._dropped
+            self._log_once("dropped", f"{dropped} frames dropped: the receive buffer was full (or the adapter's queue)")
 
     @property
     def is_full(self) -> bool:

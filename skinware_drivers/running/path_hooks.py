@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Decoder, Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
 from skinware_drivers.polling import Watch

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from skinware.errors import BusSendError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Match
+from skinware_drivers.link import Link
 from skinware_drivers.polling import Poll
 from skinware_drivers.running.guard import Backoff
 

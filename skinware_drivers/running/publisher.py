@@ -15,8 +15,7 @@ from skinware.samples import SAMPLE, SAMPLES
 from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, age_limit_ns
 from skinware.structure import Structure
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, SkinState, Updates
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS, Decoder, SkinState, Updates
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.guard import hook
 

@@ -99,7 +99,7 @@ class Wires:
             for batch in line.bus.tap.fetch() if not is_new else (memoryview(b""), *line.bus.tap.fetch()):
                 columns = writer.begin()
                 columns["bus"][()], columns["used"][()] = line.ordinal, len(batch)
-                columns["lost"][()] = line.bus.tap.lost
+                columns["missed"][()] = line.bus.tap.missed
                 columns["pieces"][: len(batch)] = np.frombuffer(batch, np.uint8)
                 writer.commit(now_ns())
 

@@ -25,8 +25,9 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Options, Patch, Poll, taxels
+from skinware_drivers.fields import Bits, Identifier, Packed, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout, Packed, Sentinel, Values
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")

@@ -11,9 +11,8 @@ import numpy as np
 from skinware.errors import BusError
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.fields import Identifier
+from skinware_drivers.fields import Identifier, Match
 from skinware_drivers.layout import Frame
-from skinware_drivers.link import Match
 from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import Poll
 from skinware_drivers.serial.bus import SerialBus

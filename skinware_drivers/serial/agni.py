@@ -29,7 +29,8 @@ from msgspec import Meta
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers.fields import DeviceTime, Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
 
 log: logging.Logger = logging.getLogger("skinware.driver")

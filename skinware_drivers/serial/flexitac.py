@@ -27,8 +27,9 @@ from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, taxels
+from skinware_drivers.fields import Byte, Identifier, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
 

@@ -18,19 +18,8 @@ from skinware.errors import BusError, StructureError
 from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
 from skinware.status import Status
 from skinware_drivers import Module, Patch, Sensor
-from skinware_drivers.layout import (
-    AnyFlag,
-    Bits,
-    DeviceTime,
-    Flag,
-    Frame,
-    Identifier,
-    Layout,
-    Sentinel,
-    SequenceNumber,
-    StatusBytes,
-    Values,
-)
+from skinware_drivers.fields import AnyFlag, Bits, DeviceTime, Flag, Identifier, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Frame, Layout, Values
 
 MAJOR, MINOR = 1, 0
 MOST_PAYLOAD = 1024
@@ -122,7 +111,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Kind:
+class ModuleKind:
     """A kind of module.
 
     Attributes:
@@ -159,7 +148,7 @@ class Description:
     shortest_us: int
     longest_us: int
     types: Sequence[SensorType]
-    kinds: Sequence[Kind]
+    kinds: Sequence[ModuleKind]
     modules: Sequence[int]
 
     @property
@@ -199,7 +188,7 @@ def read_description(items: Sequence[bytes], crc: int) -> Description:
         raise BadDescription("the description changed while it was being read")
     found: Description | None = None
     types: list[SensorType] = []
-    kinds: list[Kind] = []
+    kinds: list[ModuleKind] = []
     modules: list[int] = []
     for number, item in enumerate(items):
         reader = _Reader(item, f"item {number} of the description")
@@ -221,7 +210,7 @@ def read_description(items: Sequence[bytes], crc: int) -> Description:
     return found
 
 
-def _patch(reader: _Reader, types: list[SensorType], kinds: list[Kind], modules: list[int]) -> Description:
+def _patch(reader: _Reader, types: list[SensorType], kinds: list[ModuleKind], modules: list[int]) -> Description:
     """Read the first item; the lists are filled by the items behind it."""
     period_us, shortest_us, longest_us = reader.take("<III")
     product, serial_number, firmware = (reader.text(MAX_NAME_BYTES) for _ in range(3))
@@ -248,7 +237,7 @@ def _type(reader: _Reader) -> SensorType:
         raise reader.bad(str(error)) from None
 
 
-def _kind(reader: _Reader, types: Sequence[SensorType]) -> Kind:
+def _kind(reader: _Reader, types: Sequence[SensorType]) -> ModuleKind:
     name = reader.text(_MAX_KIND_BYTES)
     dtype, n_runs = reader.take("BB")
     if dtype >= len(_DTYPES):
@@ -269,7 +258,7 @@ def _kind(reader: _Reader, types: Sequence[SensorType]) -> Kind:
             taxels += [[None if axis == _PADDING else types[axis].name for axis in axes]] * count
     if not 1 <= size <= _MOST_VALUE_BYTES:
         raise reader.bad(f"kind {name!r} has {size} bytes of values; 1 to {_MOST_VALUE_BYTES} fit into a message")
-    return Kind(name, _DTYPES[dtype], taxels)
+    return ModuleKind(name, _DTYPES[dtype], taxels)
 
 
 def _modules(reader: _Reader, n_kinds: int) -> list[int]:
@@ -301,7 +290,7 @@ def _check(found: Description) -> None:
         raise BadDescription("the patch has 32-bit whole numbers beside floating point: no common dtype holds both")
 
 
-def _frame(number: int, kind: Kind) -> Frame:
+def _frame(number: int, kind: ModuleKind) -> Frame:
     values = Values(_DATA_HEADER, kind.dtype, kind.n_values)
     flags: list[AnyFlag] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
     lengths = [values.end]

@@ -34,7 +34,7 @@ from skinware_drivers.serial import (
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, Board
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, PaxiniBoard
 
 _HEADERS = 48
 """At least the bytes around the taxels in any body."""
@@ -99,7 +99,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
             report=self.tell,
         )
         self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
-        self._board: Board | None = None
+        self._board: PaxiniBoard | None = None
         self._is_asking = False
 
     @property
@@ -169,7 +169,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         await self._described.tare(link, patches)
 
     @property
-    def _described(self) -> Board:
+    def _described(self) -> PaxiniBoard:
         if self._board is None:
             raise BusError("the board was not found yet")
         return self._board
@@ -177,7 +177,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
     def _is_away(self) -> bool:
         return self._line is not None and self._line.fileno() < 0
 
-    async def _find(self, link: Link) -> Board:
+    async def _find(self, link: Link) -> PaxiniBoard:
         """Return the board of the options, or the one that streams or answers."""
         if self.options.board == "converter":
             return self._converter

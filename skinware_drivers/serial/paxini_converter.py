@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers import Byte, Frame, Identifier, Layout, Link, Match, Notice, Patch, Poll
-from skinware_drivers.layout import Condition
+from skinware_drivers.fields import Condition
 from skinware_drivers.serial import LRC, Field, Length, Packet, Refused
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     POINTS_OF_PART,
     SATURATED,
     TAXEL,
-    Board,
+    PaxiniBoard,
     model_of,
     module,
     values,
@@ -86,7 +86,7 @@ def version_in(reply: bytes) -> str:
     return "".join(c for c in reply[_BODY_HEADER:].decode("ascii", "replace") if c.isprintable()).strip()
 
 
-class Head(NamedTuple):
+class ReplyHead(NamedTuple):
     """The beginning of a reply; -1 if the reply is too short."""
 
     function: int
@@ -94,24 +94,24 @@ class Head(NamedTuple):
     status: int
 
     @staticmethod
-    def of(payload: bytes) -> Head:
+    def of(payload: bytes) -> ReplyHead:
         if len(payload) < _BODY_HEADER:
-            return Head(-1, -1, -1)
+            return ReplyHead(-1, -1, -1)
         function, address, _, status = struct.unpack_from("<xBIHB", payload)
-        return Head(function, address, status)
+        return ReplyHead(function, address, status)
 
     def in_words(self, sensor: int) -> str:
         return f"sensor {sensor} answers with function {self.function:#04x}, status {self.status}, at {self.address}"
 
 
-class ConverterBoard(Board):
+class ConverterBoard(PaxiniBoard):
     """The sensors on one line. A sensor that fell silent is asked for its version before it is asked for data again.
 
     Args:
         sensors: ids of the sensors that must answer; none: all that answer.
         points: taxels of each; 0: by their part codes.
         is_away: returns whether the line is closed.
-        how: see :class:`Board`; ``period_s`` is the time between two questions to the same sensor.
+        how: see :class:`PaxiniBoard`; ``period_s`` is the time between two questions to the same sensor.
     """
 
     framing = Packet(
@@ -198,7 +198,7 @@ class ConverterBoard(Board):
                 sensor = reply.identifier & _SENSOR_MASK
                 if reply.payload[1] != _ERROR:
                     self._heard_who(link, sensor, version_in(reply.payload))
-                elif (text := Head.of(reply.payload).in_words(sensor)) != error:
+                elif (text := ReplyHead.of(reply.payload).in_words(sensor)) != error:
                     error = text
                     log.warning("%s: %s", link.bus_name, text)
 
@@ -212,7 +212,7 @@ class ConverterBoard(Board):
             sensor = patch.key
             done_or_refused = Match(_identifier(sensor, _WRITE, _ZERO), IDENTIFIER.mask & ~_ERROR_MASK)
             reply = await link.request(sensor, write(sensor, _ZERO, 1), done_or_refused, timeout_s=_TIMEOUT_OF_ZERO_S)
-            head = Head.of(reply.payload)
+            head = ReplyHead.of(reply.payload)
             if (head.function, head.address, head.status) != (_WRITE, _ZERO, 0):
                 raise Refused(head.in_words(sensor), head.status)
 

@@ -29,15 +29,15 @@ from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers import Flag, Frame, Identifier, Layout, Link, Match, Notice, Patch
+from skinware_drivers.fields import Reply
 from skinware_drivers.hand import Hand
-from skinware_drivers.link import Reply
 from skinware_drivers.serial import LRC, Field, Length, LengthTable, Packet, Refused, Split
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     SATURATED,
     TAXEL,
-    Board,
+    PaxiniBoard,
     Slot,
     module,
     nominal_places,
@@ -105,7 +105,7 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 """All streamed frames are strange as long as the slots are unknown."""
 
 
-class HighSpeedBoard(Board):
+class HighSpeedBoard(PaxiniBoard):
     """One board: a patch with a module for each connected slot."""
 
     def __init__(self, hand: Hand, **how: Any) -> None:

@@ -162,7 +162,7 @@ def nominal_places(slots: Sequence[Slot], hand: Hand) -> Geometry | None:
     return Geometry.joined(found) if found else None
 
 
-class Board(ABC):
+class PaxiniBoard(ABC):
     """One board on a line; the methods are those of a driver, see :class:`skinware_drivers.adapter.Adapter`.
 
     Attributes:

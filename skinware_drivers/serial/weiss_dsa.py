@@ -29,8 +29,9 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Module, Options, Patch, operation, taxels
+from skinware_drivers.fields import Above, AnyFlag, DeviceTime, Identifier, Sentinel
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet

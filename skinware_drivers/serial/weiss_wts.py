@@ -24,7 +24,8 @@ from msgspec import Meta
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
 from skinware_drivers import Link, Module, Options, Patch, Sensor, operation
-from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Byte, DeviceTime, Identifier
+from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import Answers, Refused
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 

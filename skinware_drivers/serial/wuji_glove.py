@@ -23,7 +23,8 @@ from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Options, Patch, Sensor, operation
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
+from skinware_drivers.fields import DeviceTime, Identifier, Sentinel, SequenceNumber
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
 log: logging.Logger = logging.getLogger("skinware.driver")

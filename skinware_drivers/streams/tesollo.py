@@ -30,9 +30,10 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.fields import Identifier, Match, Sentinel
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, Poll, ZeroWatch

@@ -28,9 +28,10 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import DeviceTime, Identifier, Match, Reply, Sentinel
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
@@ -57,7 +58,7 @@ class XelaMessages(Framing):
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
     def framer(self) -> Framer:
-        return _Messages()
+        return _SeenMessages()
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Refuse: nothing is sent to the server.
@@ -68,7 +69,7 @@ class XelaMessages(Framing):
         raise ValueError(f"XELA's server is only read ({identifier:#x}, {len(payload)} bytes)")
 
 
-class _Messages(Framer):
+class _SeenMessages(Framer):
     def __init__(self) -> None:
         super().__init__()
         self._seen: Seen = {}

@@ -27,8 +27,9 @@ from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.layout import Bits, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Bits, DeviceTime, Identifier, Match, Sentinel
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.adapter import SerialAdapter

@@ -309,7 +309,7 @@ class YarpBus(ServerBus):
             for start in range(0, len(messages), CHUNK):
                 self._hear(messages[start : start + CHUNK], time_ns)
         if isinstance(port, YarpPort):
-            self.counters.lost += port.passed_over
+            self.counters.dropped += port.passed_over
             port.passed_over = 0
 
 

@@ -63,7 +63,7 @@ class YarpMessages(Framing):
     maximum_body: int = field(default=4 + 4 * VALUES_OF_A_FRAME, init=False)
 
     def framer(self) -> Framer:
-        return _Messages(self)
+        return _Vectors(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Refuse: nothing is sent to the port.
@@ -89,7 +89,7 @@ def message_size(stream: bytes, start: int = 0) -> int | None:
     return size if min(blocks) >= 0 and size <= LONGEST else 0
 
 
-class _Messages(Framer):
+class _Vectors(Framer):
     def __init__(self, framing: YarpMessages) -> None:
         super().__init__()
         self._length, self._parts = framing.length, framing.parts

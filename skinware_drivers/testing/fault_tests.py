@@ -12,7 +12,7 @@ import pytest
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.polling import Watch
 from skinware_drivers.testing.comparison import ShownUpdates

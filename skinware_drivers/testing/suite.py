@@ -93,7 +93,7 @@ class Suite:
     @staticmethod
     def require_all_counted(rig: Running) -> None:
         counters = rig.counters()
-        came = counters["frames"] + counters["refused"] + counters["lost"]
+        came = counters["frames"] + counters["refused"] + counters["dropped"]
         if rig.adapter.medium == "can":
             require(came == rig.wire.frames, f"{rig.wire.frames} frames came, the bus counted {came}")
         layout = rig.adapter.layout

@@ -16,7 +16,7 @@ from skinware_drivers.virtual.hand_clock import HandClock
 _BURSTS = 24
 _SILENCE_S = 1.5
 _RATE_TOLERANCE = 0.3
-_NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")
+_NOTHING_OF_THESE = ("dropped", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")
 
 
 class ValueTests(Suite):

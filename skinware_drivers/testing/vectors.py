@@ -33,8 +33,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.counters import BusCounters, FramerCounters
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.layout import Layout

@@ -42,7 +42,7 @@ class VirtualCanBus(Bus):
     """Emulated hardware as a bus.
 
     Frames are stamped with the time at which they went onto the emulated wire, and arrive in that order. Frames that
-    are not fetched for a second are dropped and counted in ``counters.lost``.
+    are not fetched for a second are dropped and counted in ``counters.dropped``.
 
     Its name is ``virtual:NAME?key=value``, with an emulator as NAME (an entry point of the group
     ``skinware.emulators``; ``roboskin`` if empty) and the emulator's options.
@@ -207,7 +207,7 @@ class VirtualCanBus(Bus):
 
     def _fetch(self, now_ns: int) -> None:
         if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
-            self.counters.lost += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+            self.counters.dropped += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         frames = self.hardware.emit(now_ns)
         fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
         for frame in frames:

@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
+from skinware_drivers.virtual.device import DATA, Actor, Device
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.stage import DATA, Actor, Device, OptionsT, Stage
+from skinware_drivers.virtual.stage import OptionsT, Stage
 
 CanFrame = tuple[int, bytes]
 """Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""
@@ -33,7 +34,7 @@ _RADIUS = 0.22
 """Radius of the pressed spot; the device is 1 wide."""
 
 
-class Press:
+class WanderingPress:
     """A wandering press on one device.
 
     Args:
@@ -94,7 +95,7 @@ class Emulator(Stage[OptionsT]):
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
         super().__init__(options, log=log)
         self._source = source
-        self._press: dict[int, Press] = {}
+        self._press: dict[int, WanderingPress] = {}
         self._n_values = 0
 
     # A subclass defines these
@@ -164,7 +165,7 @@ class Emulator(Stage[OptionsT]):
         """Make the devices and everything else on the bus."""
         places = self.places()
         self._n_values = len(places)
-        self._press = {number: Press(self.options.seed, number, places) for number in self.numbers}
+        self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
         return super().power_up(now_ns)
 
     def check_frame(self, frame: CanFrame) -> None:

@@ -16,18 +16,15 @@ from typing import Any, Protocol
 
 import skinware.realtime
 from skinware.errors import PlatformError
+from skinware.memory.futex import Timespec
 
 _CLOCK_MONOTONIC = 1
 _TFD_NONBLOCK, _TFD_CLOEXEC = os.O_NONBLOCK, os.O_CLOEXEC
 _TFD_TIMER_ABSTIME = 1
 
 
-class _Timespec(ctypes.Structure):
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
 class _Itimerspec(ctypes.Structure):
-    _fields_ = (("it_interval", _Timespec), ("it_value", _Timespec))
+    _fields_ = (("it_interval", Timespec), ("it_value", Timespec))
 
 
 class Timer(Protocol):
@@ -74,7 +71,7 @@ class MonotonicTimer:
             OSError: the timer is closed.
         """
         value = self._spec.it_value
-        value.tv_sec, value.tv_nsec = (0, 0) if time_ns is None else divmod(max(time_ns, 1), 1_000_000_000)
+        value.seconds, value.nanoseconds = (0, 0) if time_ns is None else divmod(max(time_ns, 1), 1_000_000_000)
         if self._settime(self._fd, _TFD_TIMER_ABSTIME, ctypes.byref(self._spec), None) < 0:
             raise OSError(ctypes.get_errno(), f"timerfd_settime: {os.strerror(ctypes.get_errno())}")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_check
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.loading import Kind, load, registered
+from skinware_drivers.loading import ClassKind, load, registered
 from skinware_drivers.virtual.events import Event
 
 if TYPE_CHECKING:  # needs numpy: commands show the options of emulators fast
@@ -138,7 +138,7 @@ class HardwareFactory(Protocol):
         """Make the devices. ``options`` is an instance of ``Options``; ``log`` receives their events."""
 
 
-_EMULATOR = Kind(
+_EMULATOR = ClassKind(
     "emulator",
     EMULATORS,
     "Emulator",

@@ -10,8 +10,8 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from skinware_drivers.virtual.device import Device
 from skinware_drivers.virtual.serial_device import OptionsT, SerialEmulator
-from skinware_drivers.virtual.stage import Device
 
 _HEADER_OF_TCP = 6
 _READS, _WRITE_ONE, _WRITE_MANY = (3, 4), 6, 16

@@ -9,9 +9,8 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.virtual.device import Device, EmulatorOptions
 from skinware_drivers.virtual.emulator import CanFrame, Emulator
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
-from skinware_drivers.virtual.stage import Device
 
 _HEARD = "heard"  # in the memory of a device: the beginning of a command, and when it came
 _LONGEST_PAUSE_NS = 200_000_000

@@ -6,114 +6,28 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import HasOptions
-from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.device import DATA, Actor, Device, EmulatorOptions, Scheduled
 from skinware_drivers.virtual.events import Event, FrameDamage
 from skinware_drivers.virtual.hardware import EventLog, WireFrame
-from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Transmitter, Wire
+from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Wire
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
-DATA = "data"
-"""The timer of a device's bursts."""
 
 _IDENTIFIER_MASK = 0x1FFF_FFFF
 _MOST_LISTED = 40
 _REPLY_NS = 200_000
 _LONGEST_CATCH_UP_NS = 1_000_000_000
 """Time that ``skip`` still emulates frame by frame; earlier time is jumped over."""
-
-
-class Actor(Protocol):
-    """Something on the wire that does things by itself."""
-
-    def next_event_ns(self) -> int | None:
-        """Return the time at which ``run`` has something to do."""
-
-    def run(self, now_ns: int) -> None:
-        """Do what is due: queue frames on the wire."""
-
-    def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
-
-
-class Device:
-    """One emulated device.
-
-    Attributes:
-        number: its name in the emulator's options.
-        stage: the emulator.
-        memory: settings by commands; gone after a restart.
-        cycle: bursts sent since the first power-up; the number of the next one.
-        alive: it has power.
-        ready_ns: since when it can hear and send, after it last got power.
-        streams_from_ns: when it began to send by itself; None: it does not.
-        sampled_ns: when the values of its last burst were felt.
-        random: source of the faults of its frames.
-    """
-
-    def __init__(self, number: int, stage: Stage[Any], transmitter: Transmitter, now_ns: int) -> None:
-        self.number = number
-        self.stage = stage
-        self.transmitter = transmitter
-        self.memory: dict[str, Any] = {}
-        self.cycle: int = 0
-        self.alive = True
-        self.ready_ns = now_ns
-        self.streams_from_ns: int | None = None
-        self.sampled_ns = now_ns
-        self.random = np.random.default_rng([stage.options.seed, number, 1])
-        self._timers: dict[str, tuple[int, int]] = {}  # name -> next, period
-
-    def every(self, name: str, period_ns: int, first_ns: int) -> None:
-        """Start a timer that calls ``on_timer`` of the emulator with ``name``, first at ``first_ns``."""
-        self._timers[name] = first_ns, period_ns
-
-    def stop(self, name: str) -> None:
-        """Stop a timer. Idempotent."""
-        self._timers.pop(name, None)
-
-    def runs(self, name: str) -> bool:
-        """Return whether a timer runs."""
-        return name in self._timers
-
-    def clear(self) -> None:
-        """Forget everything, as without power."""
-        self.memory = {}
-        self._timers = {}
-        self.streams_from_ns = None
-
-    def next_event_ns(self) -> int | None:
-        """Return the time at which ``run`` has something to do."""
-        return min((next_ns for next_ns, _ in self._timers.values()), default=None)
-
-    def run(self, now_ns: int) -> None:
-        """Do what is due."""
-        for name, (next_ns, period_ns) in list(self._timers.items()):
-            if next_ns <= now_ns and name in self._timers:
-                self._timers[name] = next_ns + period_ns, period_ns
-                self.stage.on_timer(self, name, next_ns)
-
-    def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
-        skipped = 0
-        for name, (next_ns, period_ns) in self._timers.items():
-            times = max(0, -((next_ns - now_ns) // period_ns))
-            self._timers[name] = next_ns + times * period_ns, period_ns
-            skipped += self.stage.skipped(self, name, times)
-        return skipped
-
-
-class _Scheduled(NamedTuple):
-    time_ns: int
-    action: Callable[[int], object]
 
 
 class Stage(ABC, HasOptions[OptionsT]):
@@ -127,7 +41,6 @@ class Stage(ABC, HasOptions[OptionsT]):
         frame_faults: the damage that each option with a probability does to data frames.
         longest_queue: frames that a device keeps for the wire; more are lost.
         silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
-        devices: by number, once powered up.
     """
 
     medium: ClassVar[str] = "can"
@@ -152,13 +65,13 @@ class Stage(ABC, HasOptions[OptionsT]):
             numbers = getattr(options, self.numbered_by)
             self.numbers = numbers if isinstance(numbers, tuple) else (numbers,)
         self.wire: Wire = Wire()
-        self.log: EventLog = _Unlogged() if log is None else log
+        self.log: EventLog = deque(maxlen=0) if log is None else log
         counted = ("frames", "bursts", "commands", *self.counted, "silenced", "unheard")
         self.counts: dict[str, int] = dict.fromkeys(counted, 0)
         self.silent: set[str] = set()
         self.devices: dict[int, Device] = {}
         self._actors: list[Actor] = []
-        self._scheduled: list[_Scheduled] = []
+        self._scheduled: list[Scheduled] = []
         self._now_ns: int | None = None
         self._event_ns: int | None = None
         for name in ("dead", "restart", "faulty"):
@@ -199,6 +112,7 @@ class Stage(ABC, HasOptions[OptionsT]):
     # A subclass may use these
 
     def reply(self, device: Device, frame: tuple[int, bytes], now_ns: int) -> None:
+        """Send one frame besides the data."""
         self.check_frame(frame)
         device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
@@ -243,7 +157,8 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.schedule(ready_ns, boot)
 
     def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
-        self._scheduled.append(_Scheduled(time_ns, action))
+        """Call ``action`` with the time when it has come."""
+        self._scheduled.append(Scheduled(time_ns, action))
         self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
 
     def run_to(self, now_ns: int) -> int:
@@ -483,8 +398,3 @@ class Stage(ABC, HasOptions[OptionsT]):
                     self.note_fault(device, now_ns, (burst.cycle, at), frame, "unsent", reason)
         device.transmitter.queue.clear()
         device.clear()
-
-
-class _Unlogged:
-    def append(self, event: Event) -> None:
-        """Drop the event."""

@@ -98,7 +98,7 @@ def test_every_frame_comes_and_what_is_lost_is_counted_exactly(namespace: Namesp
                     until_read(there, sequence)
             ends.net.loses = lambda _kind, _key: False
             until_read(there, publish(writer))
-            assert there.lost + len(taken[there.name]) == writer.sequence - first + 1
+            assert there.missed + len(taken[there.name]) == writer.sequence - first + 1
 
 
 def test_a_pulled_frame_is_the_difference_to_one_that_is_kept_and_comes_once(namespace: Namespace) -> None:
@@ -221,7 +221,7 @@ def test_the_network_is_cut_and_heals(ends: Ends) -> None:
             ends.net.is_cut = False
             wait_until(lambda: ends.joiner.is_connected)
             until_read(there, publish(writer))
-            assert there.lost + len(taken[there.name]) == writer.sequence - first + 1
+            assert there.missed + len(taken[there.name]) == writer.sequence - first + 1
     events = [event["event"] for event in ends.events if event["event"] in ("connected", "disconnected")]
     assert events[:3] == ["connected", "disconnected", "connected"]
 

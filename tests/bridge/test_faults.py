@@ -89,7 +89,7 @@ class Witness:
         if number not in self.taken[-1:]:
             self.taken.append(number)
         assert self.taken == sorted(self.taken)
-        assert self._reader.lost + len(self.taken) == number - self.taken[0] + 1
+        assert self._reader.missed + len(self.taken) == number - self.taken[0] + 1
         self.is_fresh = bool(frame.fresh("pressure").all())
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ def test_two_commands_are_enough(namespace: Namespace, here: Namespace) -> None:
             frame = reader.read()
             assert frame.fresh("pressure").all()
             assert (frame.values == frame.values[0]).all()
-        assert serve.wait_for("status", lambda event: "arm" in event["services"])["lost"] == 0
+        assert serve.wait_for("status", lambda event: "arm" in event["services"])["missed"] == 0
 
 
 @pytest.mark.thorough
@@ -138,10 +138,10 @@ def test_a_slow_link_has_the_newest_and_a_fast_one_has_all(namespace: Namespace,
         with joining(slow.port, here) as join:
             status(join, lambda arm: arm["mode"] == "pull" and arm["rate_hz"] > 0)
             status(join, lambda arm: arm["mode"] == "pull" and arm["age_ms"]["p50"] < 1000)
-            begin = status(fast, lambda arm: arm["mode"] == "push")["services"]["arm"]["lost"]
-            slow_begin = status(join, lambda _: True)["services"]["arm"]["lost"]
-            status(join, lambda arm: arm["lost"] > slow_begin + 200)
-            lost = status(fast, lambda _: True)["services"]["arm"]["lost"] - begin
+            begin = status(fast, lambda arm: arm["mode"] == "push")["services"]["arm"]["gap"]
+            slow_begin = status(join, lambda _: True)["services"]["arm"]["gap"]
+            status(join, lambda arm: arm["gap"] > slow_begin + 200)
+            lost = status(fast, lambda _: True)["services"]["arm"]["gap"] - begin
             assert lost < 20  # 0 on a quiet machine (tools/bench bridge)
     shutil.rmtree(beside.path, ignore_errors=True)
 

@@ -32,7 +32,7 @@ from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.service import ServiceReader
-from skinware.transfer.codec import CodedColumn, Decoder, Encoder
+from skinware.transfer.codec import CodedColumn, FrameDecoder, FrameEncoder
 from tests.bridge.rig import publish, structure
 from tests.streams.peers import free_port
 
@@ -243,7 +243,7 @@ def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
             frame = reader.read()
             message = raw_message(frame)
             assert split_frame(message) == (RAW, frame.generation, frame.slot, False)
-            encoder = Encoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
+            encoder = FrameEncoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
             coded = encoder.encode(frame)
             for keeps in (True, False):
                 expected = FrameMessage(CODED, frame.generation, memoryview(coded), keeps)
@@ -268,7 +268,7 @@ def test_frames_one_after_the_other_are_those_that_were_coded(namespace: Namespa
         with DriverReader("arm", namespace=namespace) as reader:
             segment = reader._ring.segment
             columns = [CodedColumn.of(column) for column in segment.layout.slot]
-            encoder, decoder = Encoder(columns), Decoder(columns, segment.layout.slot_stride)
+            encoder, decoder = FrameEncoder(columns), FrameDecoder(columns, segment.layout.slot_stride)
             for number in range(60):
                 frames = writer.begin(from_last=True)
                 frames["values"][:] = generator.integers(0, 65536, 256) if number % 3 else 5

@@ -66,7 +66,7 @@ def driver(namespace: Namespace, operations: Mapping[str, Callable[..., object]]
         operations=operations,
         rate_hz=50,
         driver_type="virtual",
-        bus_counters=["lost", "read"],
+        bus_counters=["dropped", "read"],
         patch_counters=["late"],
     )
 
@@ -294,7 +294,7 @@ def test_lost_is_that_of_the_robot(net: Net, namespace: Namespace) -> None:
         with DriverReader("hand", namespace=ends.here, timeout_s=PATIENCE_S) as reader:
             publish(writer)
             wait_until(lambda: int(reader.read().values[0]) == writer.sequence - 1)
-            before = reader.lost
+            before = reader.missed
             net.loses = lambda kind, _key: kind == "frame"
             offered = net.offered
             for number in range(1, 8):
@@ -303,7 +303,7 @@ def test_lost_is_that_of_the_robot(net: Net, namespace: Namespace) -> None:
             net.loses = lambda _kind, _key: False
             publish(writer)
             wait_until(lambda: int(reader.read().values[0]) == writer.sequence - 1)
-            assert reader.lost - before == 7
+            assert reader.missed - before == 7
 
 
 def test_operations_are_those_of_the_whole_driver(net: Net, namespace: Namespace) -> None:

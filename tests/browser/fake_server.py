@@ -181,10 +181,10 @@ class FakeDriver:
             "age_ms": 4.2 if alive else 1840.0,
             "fresh": fresh,
             "sensors": self.n,
-            "lost": 0,
+            "dropped": 0,
             "load": 0.31,
             "buses": [
-                {"name": "can0", "state": "live" if alive else "was live", "reason": "", "load": 0.31, "lost": 0}
+                {"name": "can0", "state": "live" if alive else "was live", "reason": "", "load": 0.31, "dropped": 0}
             ],
             "patches": patches,
         }

@@ -98,7 +98,7 @@ def test_a_slow_page_delays_nobody(large: None, address: str, open_page: OpenPag
         assert late_s < 3 * early_s  # nothing queues
         enough.set()
         assert frames.result() > 50
-        assert reader.lost == 0
+        assert reader.missed == 0
     slow.close()
     quick_turns.ages_s.clear()
     pass_by(quick, lambda: len(quick_turns.ages_s) >= 50)

@@ -15,7 +15,8 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.driving import Driving, driving_lines
 

@@ -97,5 +97,5 @@ def test_a_driver_and_its_emulator(
                 assert (again.values == frame.values).all()  # nobody touches it
             (shown,) = running.status()["buses"]
     # on a starved machine answers come after the question was given up; nobody knows them then, but nothing is damaged
-    assert shown["lost"] == shown["bad_length"] == shown["bad_content"] == shown["errors"] == 0
+    assert shown["dropped"] == shown["bad_length"] == shown["bad_content"] == shown["errors"] == 0
     assert emulator.last["send_failures"] == 0

@@ -230,8 +230,9 @@ def test_frames_that_do_not_fit_are_counted_and_disturb_nothing(vcan: Callable[[
         out.send(can_frame(0x80000000 | TIP_IDENTIFIER, bytes(8)))
         wait_until(lambda: driver.status()["buses"][0]["unknown"] > before["unknown"])
         shown = driver.status()["buses"][0]
-        counted = {name: shown[name] - before[name] for name in ("bad_length", "refused", "unknown", "lost", "errors")}
-        assert counted == {"bad_length": 8, "refused": 3, "unknown": 1, "lost": 0, "errors": 0}
+        names = ("bad_length", "refused", "unknown", "dropped", "errors")
+        counted = {name: shown[name] - before[name] for name in names}
+        assert counted == {"bad_length": 8, "refused": 3, "unknown": 1, "dropped": 0, "errors": 0}
         read_until(reader, is_in_order)
 
 
@@ -248,7 +249,7 @@ def test_a_babbling_node_and_foreign_traffic_cost_no_data(vcan: Callable[[], str
             sent += len(foreign)
         wait_until(lambda: driver.status()["buses"][0]["unknown"] >= sent)
         shown = driver.status()["buses"][0]
-        assert (shown["unknown"], shown["lost"], shown["state"]) == (sent, 0, "live")
+        assert (shown["unknown"], shown["dropped"], shown["state"]) == (sent, 0, "live")
         assert sent > 2000
         frames = list(iter_until_now(reader, start))
         assert len(frames) > 10  # it published all the time
@@ -358,6 +359,6 @@ def test_what_the_machine_drops_before_any_socket_is_told_apart(
         finally:
             setting.write_text(before)
         (bus,) = driver.status()["buses"]
-        assert bus["lost"] == 0  # the socket knows nothing of it
+        assert bus["dropped"] == 0  # the socket knows nothing of it
         wait_until(lambda: driver.status()["buses"][0]["load"] is not None, 60)
     assert caplog.text.count("before any socket saw them") == 1

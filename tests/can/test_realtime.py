@@ -58,7 +58,7 @@ def test_a_driver_under_fifo_holds_it_and_publishes(vcan: Callable[[], str]) -> 
             assert scheduling.policy(process) == (os.SCHED_FIFO, 50)
             stopped = driver.stop()
     assert "refused" not in driver.errors
-    assert stopped["buses"][0]["lost"] == 0
+    assert stopped["buses"][0]["dropped"] == 0
 
 
 def test_the_normal_profile_holds() -> None:

@@ -57,12 +57,12 @@ def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
                     # a burst in which the emulation had no processor time makes two frames; both show the other boards
                     updates += int((fresh & (frame.module_time_ns > before_ns)).sum())
                     before_ns = frame.module_time_ns.copy()
-                assert reader.lost == 0
+                assert reader.missed == 0
                 totals = emulator.stop()
                 read_until(reader, is_silent)
             stopped = driver.stop()
     (shown,) = stopped["buses"]
-    assert shown["lost"] == shown["bad_length"] == shown["unknown"] == shown["bad_content"] == 0
+    assert shown["dropped"] == shown["bad_length"] == shown["unknown"] == shown["bad_content"] == 0
     # a pair of each board can be cut in two when the emulation ends; and when a board that an emulation without
     # processor time kept silent for too long is set up anew
     cuts = 4 + driver.errors.count("it has restarted")
@@ -203,7 +203,7 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
     """Fingertips of board 1 send the slices, one per cycle; the first one until somebody reads, at the end the last."""
     from skinware_drivers.can.socketcan import SocketCanBus
     from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
-    from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+    from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
     from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
     begun = itertools.count()
@@ -215,7 +215,7 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
         values = slices[slice_of[cycle]]
         return values[12 * triangle : 12 * triangle + 12] if triangle < 5 else [240] * 12
 
-    options = RoboskinOptions(boards=(1,))
+    options = EmulatedRoboskinOptions(boards=(1,))
     hardware = EmulatedRoboskin(options, source=source)
     bus = SocketCanBus(bus_name)
     with open(os.devnull, "w") as nowhere, SignalWatch() as stop:

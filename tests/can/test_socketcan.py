@@ -13,7 +13,8 @@ import pytest
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 
@@ -58,7 +59,7 @@ def test_frames_arrive_whole_in_order_and_stamped(vcan: Callable[[], str]) -> No
     assert before <= stamps.min()
     assert stamps.max() <= after
     assert np.all(np.diff(stamps) >= 0)
-    assert (bus.counters.frames, bus.counters.lost) == (600, 0)
+    assert (bus.counters.frames, bus.counters.dropped) == (600, 0)
     bus.close()
     bus.close()
 
@@ -120,8 +121,8 @@ def test_drops_are_counted_exactly(vcan: Callable[[], str]) -> None:
     batch = FrameBatch(3000)
     while bus.receive(batch, 0):
         pass
-    assert bus.counters.lost > 0
-    assert bus.counters.frames + bus.counters.lost == 2000
+    assert bus.counters.dropped > 0
+    assert bus.counters.frames + bus.counters.dropped == 2000
     bus.close()
 
 

@@ -25,7 +25,7 @@ from skinware.samples import SAMPLE, SAMPLES
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.testing.waiting import wait_until
 
-BUS_COUNTERS = ("frames", "lost", "errors", "unknown")
+BUS_COUNTERS = ("frames", "dropped", "errors", "unknown")
 PATCH_COUNTERS = ("orphans", "updates")
 TAXELS, THERMAL = 10, 2
 

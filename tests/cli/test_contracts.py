@@ -30,7 +30,7 @@ def test_skin_driver_tells_what_it_does() -> None:
         assert (ready["driver"], ready["sensors"], ready["modules"], ready["patches"]) == ("roboskin", 384, 32, 2)
         status = driver.wait_for("status", all_live)
         (bus,) = status["buses"]
-        assert (bus["name"], bus["state"], bus["lost"], bus["errors"]) == ("virtual?boards=7,8", "live", 0, 0)
+        assert (bus["name"], bus["state"], bus["dropped"], bus["errors"]) == ("virtual?boards=7,8", "live", 0, 0)
         assert bus["frames"] > 0
         assert [(p["name"], p["state"], p["orphans"]) for p in status["patches"]] == [
             ("board 7", "live", 0),

@@ -47,8 +47,8 @@ def test_json_contract(capsys: pytest.CaptureFixture[str]) -> None:
     first = frames[0]["sequence"]
     assert [frame["sequence"] for frame in frames] == list(range(first, first + 5))
     for frame in frames:
-        assert frame.keys() == {"driver", "sequence", "acquired_ns", "age_ms", "lost", "values", "status"}
-        assert (frame["driver"], frame["lost"]) == ("torso", 0)
+        assert frame.keys() == {"driver", "sequence", "acquired_ns", "age_ms", "missed", "values", "status"}
+        assert (frame["driver"], frame["missed"]) == ("torso", 0)
         assert len(frame["values"]) == len(frame["status"]) == 96
         assert (frame["status"][4:7], frame["age_ms"] >= 0) == ([0, int(Status.STALE), 0], True)
     times = [frame["acquired_ns"] for frame in frames]
@@ -109,7 +109,7 @@ def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFix
         frames = dumped(capsys, "--rate", "50", "-n", "5")
     sequences = [frame["sequence"] for frame in frames]
     assert sequences == sorted(set(sequences))
-    assert frames[-1]["lost"] == sequences[-1] - sequences[0] - 4
+    assert frames[-1]["missed"] == sequences[-1] - sequences[0] - 4
 
 
 def test_without_a_name_the_only_driver_is_taken(capsys: pytest.CaptureFixture[str]) -> None:

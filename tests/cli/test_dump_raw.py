@@ -124,10 +124,10 @@ def test_the_log_plays_on_a_bus_of_python_can(capsys: pytest.CaptureFixture[str]
 
 def test_what_is_not_shown_is_said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     bus = troubled(boards=(7,), streaming=True)
-    bus.counters.lost, bus.counters.errors = 5, 2
+    bus.counters.dropped, bus.counters.errors = 5, 2
     monkeypatch.setattr("skinware_drivers.registry.make_bus", lambda *_, **__: bus)
     assert exit_status(command, ["--raw", "virtual", "-n", "1"]) == 0
-    assert capsys.readouterr().err == "skin-dump: 5 lost, 2 error frames, not shown\n"
+    assert capsys.readouterr().err == "skin-dump: 5 dropped, 2 error frames, not shown\n"
     assert bus.fileno() == -1
 
 

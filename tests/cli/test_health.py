@@ -114,7 +114,7 @@ def test_a_driver_in_a_few_figures() -> None:
     assert (report.name, report.life, report.rate_hz, report.sensors) == ("a", "live", 19.5, 96)
     assert report.statuses["fresh"] == 48 - 7
     assert report.patch_states == {"live": 1, "stale": 1}
-    assert report.counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
+    assert report.counters == {"frames": 5156, "dropped": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
 
 
 def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:

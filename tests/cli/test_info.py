@@ -64,12 +64,12 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert driver["age_ms"] >= 0
     assert driver["rate_hz"] > 0
     assert driver["buses"] == [
-        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
-        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
+        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "dropped": 2, "errors": 0, "unknown": 7},
+        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "dropped": 0, "errors": 0, "unknown": 0},
     ]
     (record,) = driver["readers"]
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
-    counts = {"frames", "lost", "overruns", "missed_periods", "rate_hz", "age_ms"}
+    counts = {"frames", "missed", "overruns", "missed_periods", "rate_hz", "age_ms"}
     assert record.keys() == {"service", "pid", "program", "kind", "wall", "cpu", "age", "lateness"} | counts
     assert driver["statistics"]["wall"]["count"] == 8
     assert driver["statistics"]["wall"]["worst_ns"] >= driver["statistics"]["wall"]["mean_ns"] > 0
@@ -383,9 +383,9 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
         "  sensors: 80 pressure in counts, 16 temperature in degC",
     ]
     assert lines[6:9] == [
-        "  bus   state  frames  lost  unknown",  # no errors: not shown
-        "  can0  live    5,156     2        7",
-        "  can1  live        0     0        0",
+        "  bus   state  frames  dropped  unknown",  # no errors: not shown
+        "  can0  live    5,156        2        7",
+        "  can1  live        0        0        0",
     ]
     assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])

@@ -38,7 +38,7 @@ from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.cli.test_calibrate import calm_skin, finger_presses, stroked_state, strokes
@@ -462,7 +462,7 @@ def test_an_emulation() -> None:
     out = io.StringIO()
     bus = HostBus()
     stop = _Stop(bus)
-    options = RoboskinOptions(boards=(7,), streaming=True)
+    options = EmulatedRoboskinOptions(boards=(7,), streaming=True)
     emulation = Emulation(bus, EmulatedRoboskin(options), JsonReport(out), clock=lambda: bus.time_ns, poll=stop.wait)
     emulation.run(stop, bus_name="host", driver="roboskin", options=options)
     printed = [json.loads(line) for line in out.getvalue().splitlines()]

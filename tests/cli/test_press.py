@@ -14,7 +14,7 @@ from skinware.cli.press import command as press
 from skinware.geometry import read_geometry
 from skinware_drivers.cli.emulate import command as emulate
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import run, running
 
@@ -113,7 +113,7 @@ def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: p
     arguments = ["--bus", BUS, "--boards", "7,9", "--geometry", str(file), "-T", "0"]
     assert exit_status(emulate, arguments) == 0
     written = read_geometry(file)
-    own = EmulatedRoboskin(RoboskinOptions(boards=(7, 9))).geometry()
+    own = EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7, 9))).geometry()
     assert written.type_name.tolist() == own.type_name.tolist()
     assert (set(written.frame), written.uid.tolist()) == ({"arm"}, own.uid.tolist())
     for name in ("position_m", "normal", "radius_m"):

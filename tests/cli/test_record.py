@@ -45,7 +45,7 @@ def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespa
         stopped = recorder.stop(number)
         assert recorder.process.returncode == 0
     assert stopped["event"] == "stopped"
-    assert (stopped["file"], stopped["files"], stopped["lost"]) == (str(file), [str(file)], 0)
+    assert (stopped["file"], stopped["files"], stopped["missed"]) == (str(file), [str(file)], 0)
     assert stopped["messages"]["/skin/torso/frame"] == skin.writer.sequence
     assert stopped["bytes"] == file.stat().st_size
     with skinware.recording.open(file) as opened:
@@ -59,7 +59,7 @@ def test_a_recording_of_nothing_is_whole_too(tmp_path: Path) -> None:
     with running("skin-record", "-o", str(file)) as recorder:
         recorder.wait_for("ready")
         stopped = recorder.stop()
-    assert (stopped["event"], stopped["file"], stopped["lost"]) == ("stopped", str(file), 0)
+    assert (stopped["event"], stopped["file"], stopped["missed"]) == ("stopped", str(file), 0)
     with skinware.recording.open(file) as opened:
         assert opened.is_whole
         assert opened.services == ()
@@ -89,7 +89,7 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert out.startswith(
         f"recording torso of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
     )
-    assert " MB, nothing lost\n" in out
+    assert " MB, nothing missed\n" in out
     assert "/skin/torso/frame: " in out
     data = file.read_bytes()
     cut = tmp_path / "cut.mcap"

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from skinware.sensor_types import PRESSURE
-from skinware.views.history import Rest
+from skinware.views.history import DriverRest
 from tests.cli.fake_skin import fake_structure
 
 STRUCTURE = fake_structure(1, 1)
@@ -20,7 +20,7 @@ class Watching:
     """Shows values to a baseline, at 20 Hz."""
 
     def __init__(self) -> None:
-        self.rest = Rest(STRUCTURE)
+        self.rest = DriverRest(STRUCTURE)
         self.time_ns = 10**9
 
     def see(

@@ -29,7 +29,7 @@ def test_a_line_per_driver(capsys: pytest.CaptureFixture[str]) -> None:
         first, second = lines(capsys, "--plain", "-T", "0.01")
     assert first.startswith("a  ")
     assert " Hz  age " in first
-    assert "sensors 24 (fresh 24, stale 0)  patches 1 live  lost 0  orphans 0" in first
+    assert "sensors 24 (fresh 24, stale 0)  patches 1 live  dropped 0  orphans 0" in first
     assert second == "b  starting, no frame yet  sensors 768"
 
 

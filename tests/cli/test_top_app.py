@@ -139,7 +139,7 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
                 assert line(app, "head").startswith("skin-top   namespace ")
                 assert line(app, "title") == "torso: 4 patches, 640 pressure sensors"
                 assert line(app, "scale").startswith("change 0 ")
-                assert line(app, "detail") == "frames 5,156  lost 2  unknown 7  orphans 3  updates 640"
+                assert line(app, "detail") == "frames 5,156  dropped 2  unknown 7  orphans 3  updates 640"
                 drawn = picture(app)
                 assert len(drawn) == 12  # all of it, unscrolled
                 assert [text[:8].strip() for text in drawn[::3]] == ["board 7", "board 8", "board 9", "board 10"]

@@ -21,7 +21,7 @@ from skinware.state import BusReport, DriverReport, PatchReport, report_of
 from skinware.text import counters_text
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
-BUS_REPORT = BusReport("can0", "live", None, None, {"frames": 5156, "lost": 0})
+BUS_REPORT = BusReport("can0", "live", None, None, {"frames": 5156, "dropped": 0})
 PATCH_REPORT = PatchReport("board 7", 0, "live", 192, 192, 0, 12_000_000, None, {"orphans": 0})
 STALE, UNCOUNTED = replace(PATCH_REPORT, state="stale"), replace(PATCH_REPORT, counters={})
 REPORT = DriverReport(
@@ -38,7 +38,7 @@ REPORT = DriverReport(
 
 def test_a_plain_line() -> None:
     assert plain_line(REPORT) == (
-        "roboskin  20.0 Hz  age 12 ms  sensors 768 (fresh 766, stale 2)  patches 4 live  lost 0  orphans 3"
+        "roboskin  20.0 Hz  age 12 ms  sensors 768 (fresh 766, stale 2)  patches 4 live  dropped 0  orphans 3"
     )
 
 
@@ -52,7 +52,7 @@ def test_a_plain_line() -> None:
         (replace(REPORT, life="starting", age_ns=None), "roboskin  starting, no frame yet  sensors 768"),
         (
             replace(REPORT, patches=(*[PATCH_REPORT] * 3, replace(PATCH_REPORT, state="stale"))),
-            "patches 3 live, 1 stale  lost 0",
+            "patches 3 live, 1 stale  dropped 0",
         ),
         (replace(REPORT, statuses={"fresh": 1, "stale": 0, "never_seen": 7}), "(fresh 1, stale 0, never seen 7)"),
         (
@@ -64,7 +64,7 @@ def test_a_plain_line() -> None:
 )
 def test_plain_lines_of_all_kinds(report: DriverReport, words: str) -> None:
     assert words in plain_line(report)
-    assert ("lost" in plain_line(report)) == ("lost" in report.counters and report.life != "starting")
+    assert ("dropped" in plain_line(report)) == ("dropped" in report.counters and report.life != "starting")
 
 
 def test_json_of_a_plain_line() -> None:
@@ -76,7 +76,7 @@ def test_json_of_a_plain_line() -> None:
         "sensors": 768,
         "status": {"fresh": 766, "stale": 2, "never_seen": 0},
         "patches": {"live": 4},
-        "counters": {"frames": 5156, "lost": 0, "orphans": 3},
+        "counters": {"frames": 5156, "dropped": 0, "orphans": 3},
         "contacts": [],
     }
     nothing = as_data(replace(REPORT, rate_hz=None, age_ns=None), [])
@@ -106,7 +106,7 @@ def test_a_row_per_driver_bus_and_patch() -> None:
     assert re.fullmatch(r"[\d.]+ ms", cells[2][3])
     assert cells[6][1:3] + cells[6][4:] == ("stale", "", "0/24", "", "0", "")
     assert rows[6].state == "stale"
-    assert rows[1].counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7}
+    assert rows[1].counters == {"frames": 5156, "dropped": 2, "errors": 0, "unknown": 7}
     assert [patches_of(row.key, frame.structure) for row in rows] == [[0, 1, 2, 3], [0, 1], [0], [1], [2, 3], [2], [3]]
     assert patches_of(RowKey("torso", PATCH, 9), frame.structure) == []
     assert patches_of(RowKey("torso", BUS, 9), frame.structure) == []
@@ -141,7 +141,7 @@ def test_the_last_states_of_a_dead_driver_are_told_as_such() -> None:
 
 
 def test_counters_in_words() -> None:
-    counters = {"frames": 12345, "lost": 1, "send_failures": 2, "sent": 0}
-    assert counters_text(counters) == "frames 12,345  lost 1  send failures 2"
-    assert counters_text(counters, besides=("lost",)) == "frames 12,345  send failures 2"
+    counters = {"frames": 12345, "dropped": 1, "send_failures": 2, "sent": 0}
+    assert counters_text(counters) == "frames 12,345  dropped 1  send failures 2"
+    assert counters_text(counters, besides=("dropped",)) == "frames 12,345  send failures 2"
     assert counters_text({}) == ""

@@ -144,7 +144,7 @@ def test_a_cancelled_wait_leaves_everything_as_it_was() -> None:
                     await asyncio.wait_for(reader.read(newer_than=frame, timeout_s=None), 0.02)
                 publish(writer, 2)
                 assert (await soon(reader.read(newer_than=frame))).sequence == 2
-                assert reader.sync.lost == 0
+                assert reader.sync.missed == 0
 
     asyncio.run(main())
 

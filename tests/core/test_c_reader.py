@@ -77,7 +77,13 @@ def as_json(array: np.ndarray[Any, Any]) -> list[Any]:
 def test_c_reads_what_python_reads(any_program: Path, dtype: str) -> None:
     made = structure(dtype=dtype)
     with DriverWriter(
-        "x", made, driver_type="test", bus_counters=("frames", "lost"), patch_counters=("cycles",), rate_hz=20, slots=5
+        "x",
+        made,
+        driver_type="test",
+        bus_counters=("frames", "dropped"),
+        patch_counters=("cycles",),
+        rate_hz=20,
+        slots=5,
     ) as writer:
         columns = writer.begin()
         generator = np.random.default_rng(1)

@@ -234,7 +234,7 @@ def sleep_in_the_loop(board: Path, row: int, way: str) -> None:
         frames = reader.in_order(timeout_s=PATIENCE_S) if way == "in order" else reader.frames(timeout_s=PATIENCE_S)
         for frame in frames:
             rows[row, FIRST] = rows[row, FIRST] or frame.sequence
-            rows[row, LAST], rows[row, TAKEN], rows[row, LOST] = frame.sequence, reader.statistics.frames, reader.lost
+            rows[row, LAST], rows[row, TAKEN], rows[row, LOST] = frame.sequence, reader.statistics.frames, reader.missed
             if rows[0, LAST]:
                 return
             time.sleep(0.5)

@@ -97,7 +97,7 @@ def test_frames_that_are_left_out_are_lost_to_readers_and_the_newest_is_always_t
             assert writer.commit(sequence) == writer.sequence == sequence
             frame = next(frames)
             assert (frame.sequence, frame.column("values").tolist()) == (sequence, [sequence] * 4)
-            assert reader.lost == lost
+            assert reader.missed == lost
             with pytest.raises(ServiceError, match="commit without begin"):
                 writer.commit(sequence)
 

@@ -378,5 +378,5 @@ def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(name
                 ):
                     with contextlib.suppress(SkinwareError):
                         take()
-                assert reader.statistics.lost >= 0
+                assert reader.statistics.missed >= 0
                 assert reader.rate_hz() is None or reader.writer_statistics.published >= 0

@@ -107,7 +107,7 @@ class Reading:
             self.lost += max(0, sequence - self.taken - 1)
         self.frames += 1
         self.taken, self.begun = sequence, True
-        assert (self.reader.statistics.frames, self.reader.lost) == (self.frames, self.lost)
+        assert (self.reader.statistics.frames, self.reader.missed) == (self.frames, self.lost)
 
 
 class Lifecycle(RuleBasedStateMachine):

@@ -147,7 +147,7 @@ def test_both_ways_count_the_same(skins: dict[str, Skin]) -> None:
             counts = {}
             for path, skin in skins.items():
                 told = skin.reader(name).statistics
-                counts[path] = told.frames, told.lost, told.overruns, told.age.total, told.wall.count, told.cpu.count
+                counts[path] = told.frames, told.missed, told.overruns, told.age.total, told.wall.count, told.cpu.count
             assert counts["C"] == counts["Python"]
             assert counts["C"][0] == 21
 
@@ -158,7 +158,7 @@ def test_more_looks_than_are_noted_at_once_are_all_counted(skins: dict[str, Skin
         for _ in range(700):
             skins["C"].read()
         told = skins["C"].reader("a").statistics
-        assert (told.frames, told.age.total, told.lost) == (700, 700, 0)
+        assert (told.frames, told.age.total, told.missed) == (700, 700, 0)
 
 
 # -- memory that is used again -------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def test_readers_of_single_drivers_do_not_confuse_the_skin(skins: dict[str, Skin
         for name in "ab":
             told = [skin.reader(name).statistics for skin in skins.values()]
             assert told[0].frames == told[1].frames
-            assert told[0].lost == told[1].lost
+            assert told[0].missed == told[1].missed
 
 
 # -- whoever ends a wait -------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ def test_generations_that_came_and_went_between_two_reads_are_counted() -> None:
                 publish(writer, 0)
             if count == 5:
                 assert reader.read().sequence == 5
-    assert reader.lost == 104
+    assert reader.missed == 104
     reader.close()
 
 
@@ -63,7 +63,7 @@ def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequ
             if dice.random() < 0.5 and reader.refresh() not in (None, reader._last):
                 newest = int(reader.read().column("values")[0])
                 taken += 1
-                assert reader.lost == newest - first + 1 - taken
+                assert reader.missed == newest - first + 1 - taken
         writer.close()
     assert taken > 20
 
@@ -80,7 +80,7 @@ def test_frames_of_another_structure_are_counted_too() -> None:
             reader.read(newer_than=frame)
         reader.reattach()
         assert reader.read().sequence == 7
-        assert reader.lost == 3 + 6
+        assert reader.missed == 3 + 6
 
 
 def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namespace) -> None:
@@ -94,7 +94,7 @@ def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namesp
         for _ in range(3):
             publish(writer, 0)
         reader.read()
-    assert reader.lost == 2
+    assert reader.missed == 2
     reader.close()
 
 
@@ -110,17 +110,17 @@ def test_a_view_that_became_invalid_was_not_taken() -> None:
         publish(writer, 1)
         with pytest.raises(Overrun):
             overwritten_while_viewed(reader, writer)
-        assert (reader.statistics.frames, reader.lost) == (0, 0)
+        assert (reader.statistics.frames, reader.missed) == (0, 0)
         with reader.view() as frame:
             assert frame.sequence == 4
-        assert (reader.statistics.frames, reader.lost) == (1, 0)
+        assert (reader.statistics.frames, reader.missed) == (1, 0)
         publish(writer, 3)
         with pytest.raises(Overrun):
             overwritten_while_viewed(reader, writer)
         with reader.view() as frame:
             assert frame.sequence == 8
-        assert (reader.statistics.frames, reader.lost) == (2, 3)
+        assert (reader.statistics.frames, reader.missed) == (2, 3)
         with reader.view():
             publish(writer, 5)
             reader.read()  # counted before the older one's view ends
-        assert (reader.statistics.frames, reader.lost) == (3, 3)
+        assert (reader.statistics.frames, reader.missed) == (3, 3)

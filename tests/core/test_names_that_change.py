@@ -95,12 +95,12 @@ def attached(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the services that a skin has attached to."""
     names: list[str] = []
 
-    class Counted(skin_module._Reader):
+    class Counted(skin_module._SkinReader):
         def __init__(self, name: str, **options: Any) -> None:
             names.append(name)
             super().__init__(name, **options)
 
-    monkeypatch.setattr(skin_module, "_Reader", Counted)
+    monkeypatch.setattr(skin_module, "_SkinReader", Counted)
     return names
 
 

@@ -155,7 +155,7 @@ def test_readers_see_what_the_specification_sees(
                 seen[path].append((frame.generation, frame.sequence, *times, frame.stale))
     assert seen["ring"] == seen["specification"]
     told = {path: reader.statistics for path, reader in readers.items()}
-    counts = {path: (one.frames, one.lost, one.overruns, one.age.total, one.wall.count) for path, one in told.items()}
+    counts = {path: (one.frames, one.missed, one.overruns, one.age.total, one.wall.count) for path, one in told.items()}
     assert counts["ring"] == counts["specification"]
     for reader in readers.values():
         reader.close()
@@ -264,7 +264,7 @@ def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str) -> None:
         publish(writer, 2)
         assert is_whole(next(frames()), 2)
         assert reader.statistics.frames == 2
-        assert reader.lost == 0
+        assert reader.missed == 0
 
 
 def test_a_killed_writer_is_noticed_by_a_loop() -> None:
@@ -366,5 +366,5 @@ def test_a_reader_beside_a_thread_that_computes_gets_every_frame() -> None:
         finally:
             over.set()
             thread.join()
-        assert reader.lost == 0
+        assert reader.missed == 0
         wait_until(lambda: not thread.is_alive())

@@ -90,9 +90,9 @@ def test_losses_are_counted_exactly() -> None:
         for value in range(2, 12):
             publish(writer, value)
         frame = reader.read()
-        assert (frame.sequence, reader.statistics.frames, reader.lost) == (11, 2, 9)
+        assert (frame.sequence, reader.statistics.frames, reader.missed) == (11, 2, 9)
         assert reader.read().sequence == 11
-        assert reader.lost == 9
+        assert reader.missed == 9
 
 
 def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> None:
@@ -103,11 +103,11 @@ def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> N
         for value in (2, 3, 4):
             publish(writer, value)
         assert [next(frames).sequence for _ in range(3)] == [2, 3, 4]
-        assert reader.lost == 0
+        assert reader.missed == 0
         for value in range(5, 21):
             publish(writer, value)
         assert next(frames).sequence == 18  # the oldest that cannot be overwritten next
-        assert reader.lost == 13
+        assert reader.missed == 13
 
 
 def test_the_first_view_after_a_restart_shows_the_new_life() -> None:
@@ -135,7 +135,7 @@ def test_losses_over_a_restart_are_counted() -> None:
             publish(again, 4)
             newer = reader.read(newer_than=frame)
             assert newer.generation != frame.generation
-            assert reader.lost == 2
+            assert reader.missed == 2
 
 
 # -- waiting ------------------------------------------------------------------------------------------------------

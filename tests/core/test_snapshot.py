@@ -125,13 +125,13 @@ def test_only_chosen_drivers_take_part_and_wake_anybody() -> None:
 def test_drivers_without_the_types_stay_out_until_they_have_them(monkeypatch: pytest.MonkeyPatch) -> None:
     near = Structure(**tables(types=[PROXIMITY], sensor_type=[PROXIMITY.id] * 4, sensor_uid=[1, 2, 3, 4]))
     attached: list[str] = []
-    attach = skinware.skin._Reader
+    attach = skinware.skin._SkinReader
 
     def note(name: str, **more: Any) -> Any:
         attached.append(name)
         return attach(name, **more)
 
-    monkeypatch.setattr(skinware.skin, "_Reader", note)
+    monkeypatch.setattr(skinware.skin, "_SkinReader", note)
     with DriverWriter("near", near) as writer, DriverWriter("arm", fake_structure(1, 1)) as arm:
         publish(writer, 1)
         publish(arm, 1)
@@ -167,7 +167,7 @@ def test_aligned_snapshots_show_one_moment() -> None:
                 skin.read(newer_than=aligned, align=True, timeout_s=0.1)
             publish(slow, 3, now)
             assert skin.read(newer_than=aligned, align=True).raw("pressure").tolist() == [41] * 10 + [3] * 10
-            assert skin.reader("fast").lost == 0  # an older one, taken later, makes none lost
+            assert skin.reader("fast").missed == 0  # an older one, taken later, makes none lost
 
 
 def test_a_silent_driver_does_not_hold_the_moment_back() -> None:

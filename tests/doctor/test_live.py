@@ -21,7 +21,7 @@ from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.cli.test_regions import placed_structure
@@ -87,7 +87,7 @@ class _TwoWithOneAddress:
     """Two boards with address 7 beside board 8, each with a clock of its own; the host hears all."""
 
     def __init__(self) -> None:
-        self._boards = [EmulatedRoboskin(RoboskinOptions(boards=boards)) for boards in ((7, 8), (7,))]
+        self._boards = [EmulatedRoboskin(EmulatedRoboskinOptions(boards=boards)) for boards in ((7, 8), (7,))]
         self._later_ns = 23_000_000
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from skinware import Status
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
 from skinware_drivers.polling import Notice

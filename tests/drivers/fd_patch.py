@@ -16,7 +16,8 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid

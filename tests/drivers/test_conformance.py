@@ -67,7 +67,7 @@ from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaServer
 from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 from tests.specification.path_tests import DriverConformance
@@ -186,7 +186,7 @@ class EmulatedTriangles(EmulatedRoboskin):
 
     def __init__(
         self,
-        options: RoboskinOptions,
+        options: EmulatedRoboskinOptions,
         *,
         log: EventLog | None = None,
         source: Callable[[int, int], Sequence[int]] | None = None,

@@ -19,8 +19,9 @@ from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5Options, A
 from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH
 from skinware_drivers.description import Patch, assemble
+from skinware_drivers.fields import Match
 from skinware_drivers.hand import FINGERS
-from skinware_drivers.link import Link, Match
+from skinware_drivers.link import Link
 from skinware_drivers.registry import NamedBus, load_driver
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips

@@ -14,8 +14,9 @@ from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import Bits, Byte, Identifier
 from skinware_drivers.finding.guess import Guess, Traffic, guess, known_drivers
-from skinware_drivers.layout import Bits, Byte, Cycle, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.finding.fakes import SKIN, traffic_of

@@ -36,7 +36,7 @@ from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, Emul
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.hardware import EmulatedHardware
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 

@@ -11,7 +11,6 @@ from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.cli.import_ import command
-from skinware_drivers.options import describe_options
 from skinware_drivers.testing.waiting import read_until
 from tests.commands import running
 from tests.icub.conftest import WRAPPER, Made, configuration, device
@@ -30,14 +29,6 @@ def test_the_example_of_a_configuration_is_one() -> None:
     assert options.modules[0].kind == "palm"
 
 
-def test_every_option_stands_in_the_table() -> None:
-    table = re.findall(r"^\| (`.*?) \|", (DOCS / "configuration.md").read_text(), re.MULTILINE)
-    named = {name for row in table for name in re.findall(r"`(\w+)`", row)}
-    options = {option.name for option in describe_options(RoboskinOptions)} | {"special_boards", "modules"}
-    assert options <= named
-
-
-@pytest.mark.thorough
 def test_the_snippet_of_the_how_to_finds_the_load(
     made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,8 +29,8 @@ from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble, join_types
+from skinware_drivers.fields import Match
 from skinware_drivers.layout import Frame
-from skinware_drivers.link import Match
 from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.bus_line import BusLine
@@ -155,9 +155,9 @@ class _Can(_Wire):
 
     def check(self) -> None:
         counters = self.bus.counters
-        counted = counters.frames + counters.errors + counters.refused + counters.lost
+        counted = counters.frames + counters.errors + counters.refused + counters.dropped
         assert counted == self.sent or not self.is_whole, f"{self.sent} datagrams, {counters}"
-        assert self.kept() + self.bus.tap.lost == counted - counters.lost, f"{self._kept} kept, {counters}"
+        assert self.kept() + self.bus.tap.missed == counted - counters.dropped, f"{self._kept} kept, {counters}"
 
     def close(self) -> None:
         self.bus.close()
@@ -190,7 +190,7 @@ class _Line(_Wire):
     def check(self) -> None:
         found = self.bus.counters.framing
         assert found.bytes_in == self.sent or not self.is_whole, f"{self.sent} bytes, {found}"
-        assert self.kept() + self.bus.tap.lost == found.bytes_in, f"{self._kept} bytes kept, {found}"
+        assert self.kept() + self.bus.tap.missed == found.bytes_in, f"{self._kept} bytes kept, {found}"
         assert 0 <= found.frame_bytes + found.idle_bytes + found.skipped_bytes <= found.bytes_in
 
     def close(self) -> None:

@@ -20,22 +20,18 @@ from skinware.status import Status
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, wire_dtype
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import (
+from skinware_drivers.fields import (
     Bits,
     Byte,
-    Cycle,
     DeviceTime,
-    Expand,
     Flag,
-    Frame,
     Identifier,
-    Layout,
     Packed,
     Sentinel,
     SequenceNumber,
     StatusBytes,
-    Values,
 )
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import flow_fuzzing

@@ -18,25 +18,21 @@ from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
-from skinware_drivers.layout import (
+from skinware_drivers.fields import (
     Above,
     AnyFlag,
     Bits,
     Byte,
     Condition,
-    Cycle,
     DeviceTime,
-    Expand,
     Flag,
-    Frame,
     Identifier,
-    Layout,
     Packed,
     Sentinel,
     SequenceNumber,
     StatusBytes,
-    Values,
 )
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from skinware_drivers.layout_check import check_layout
 
 _EXTENDED_BASE = EXTENDED_FLAG | 0x18DA_0000

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG
 from skinware_drivers.description import Patch
-from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout, SequenceNumber
+from skinware_drivers.fields import Bits, Byte, Identifier, SequenceNumber
+from skinware_drivers.layout import Frame, Layout
 from tests.native.skins import SkinDesign
 from tests.specification.both_paths import Pair
 from tests.specification.one_path import Way

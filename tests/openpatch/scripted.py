@@ -10,7 +10,8 @@ from typing import Any
 from skinware.errors import HandshakeTimeout
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Patch, assemble
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.fields import Match, Reply
+from skinware_drivers.link import Link
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from tests.openpatch import wire

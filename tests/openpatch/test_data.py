@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware import Status
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from tests.openpatch import wire
 from tests.openpatch.scripted import data, decoded

@@ -103,13 +103,13 @@ def test_no_module_is_torn_and_no_sample_lost(firmware: Path) -> None:
     with Microcontroller(firmware, "hand") as patch, driven(patch, rate_hz=100) as (_, reader):
         read_until(reader, is_fresh)
         shown: list[int] = []
-        overlooked = -reader.lost
+        overlooked = -reader.missed
         for count, frame in enumerate(reader.in_order(timeout_s=30)):
             sample = samples_of(frame)[0]
             shown += [sample] if sample not in shown else []
             if count >= 100:
                 break
-        overlooked += reader.lost  # by this program, if the machine did not let it run
+        overlooked += reader.missed  # by this program, if the machine did not let it run
         assert sum((after - before) % 251 - 1 for before, after in pairwise(shown)) <= overlooked
         assert len(shown) > 50
         assert reader.patch_counters(frame)[0]["sequence_lost"] == 0

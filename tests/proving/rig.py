@@ -16,7 +16,8 @@ from skinware import DriverReader
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import NoOptions

@@ -131,7 +131,7 @@ def use(file: Path, beside: Path) -> Sequence[str]:
 
 
 def _read(opened: skinware.recording.Recording) -> None:
-    assert opened.lost >= 0
+    assert opened.missed >= 0
     assert all(isinstance(event["time_s"], float) for event in [*opened.events, *opened.clock])
     for name in opened.services:
         for part in opened[name].parts:
@@ -148,6 +148,6 @@ def _read(opened: skinware.recording.Recording) -> None:
     for wire in opened.wires:
         wire.frames()
         list(wire.items())
-        assert wire.lost >= 0
+        assert wire.missed >= 0
     for driver in opened.drivers:
         opened.about(driver)

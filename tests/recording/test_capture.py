@@ -56,7 +56,7 @@ def test_a_capture_is_whole_and_begins_with_the_first_question(tmp_path: Path, n
     with running("skin-driver", *options, "--bus", "virtual", "--capture", str(path)) as driver:
         frames_come(driver, "weiss_wts")
         told = driver.stop(number)
-    assert told == {"event": "captured", "file": str(path), "bytes": path.stat().st_size, "lost": 0, "problem": ""}
+    assert told == {"event": "captured", "file": str(path), "bytes": path.stat().st_size, "missed": 0, "problem": ""}
     with skinware.recording.open(path) as recording:
         assert recording.is_whole
         assert recording.problems == []

@@ -73,20 +73,20 @@ def of_frames(path: Path, made: bytes, n: int = 3, service: str = "big", time_ns
     ("text", "says"),
     [
         (b"[" * 100_000, "nested deeper than 32"),
-        (b'{"event":"lost","count":"x"}', "Expected `int`"),
-        (b'{"event":"lost","count":1e400}', "out of range"),
-        (b'{"event":"lost","count":-1}', ">= 0"),
-        (b'{"event":"lost","count":NaN}', "malformed"),
-        (b'{"event":"lost","time_ns":9223372036854775807}', "<= 46116"),
+        (b'{"event":"missed","count":"x"}', "Expected `int`"),
+        (b'{"event":"missed","count":1e400}', "out of range"),
+        (b'{"event":"missed","count":-1}', ">= 0"),
+        (b'{"event":"missed","count":NaN}', "malformed"),
+        (b'{"event":"missed","time_ns":9223372036854775807}', "<= 46116"),
         (b"[]", "Expected `object`"),
     ],
 )
 def test_events_that_cannot_be_read_are_left_out_and_said(path: Path, text: bytes, says: str) -> None:
-    good = b'{"event":"lost","count":2,"service":"big"}'
+    good = b'{"event":"missed","count":2,"service":"big"}'
     write(path, [("big", GENERATION, head(64)), ("big", FRAME, frame(1, 1)), ("", EVENTS, good), ("", EVENTS, text)])
     with skinware.recording.open(path) as opened:
-        assert opened.lost == 2
-        assert [event["event"] for event in opened.events] == ["lost"]
+        assert opened.missed == 2
+        assert [event["event"] for event in opened.events] == ["missed"]
         assert [problem for problem in opened.problems if "/skin/events" in problem and says in problem]
         list(opened.moments())
 

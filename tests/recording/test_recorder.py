@@ -50,10 +50,11 @@ def test_a_driver_and_a_service_that_come_later_are_recorded_whole(path: Path, n
                 time.sleep(0.002)
             seen = publish(skin, 60)
             wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 60)
-        assert recorder.lost == 0
+        assert recorder.missed == 0
     with skinware.recording.open(path) as opened:
         assert opened.is_whole
-        assert (opened.services, opened.drivers, opened.lost, opened.problems) == (("pose", "torso"), ("torso",), 0, [])
+        assert (opened.services, opened.drivers) == (("pose", "torso"), ("torso",))
+        assert (opened.missed, opened.problems) == (0, [])
         assert recorded(opened, "torso") == seen
         torso, pose_track = opened["torso"], opened["pose"]
         assert torso.structure == skin.structure
@@ -77,7 +78,7 @@ def test_restarts_and_another_structure_are_followed(path: Path) -> None:
                 seen.append(publish(skin, 20))
                 number = sum(map(len, seen))
                 wait_until(lambda number=number: recorder.messages.get("/skin/torso/frame", 0) == number)  # type: ignore[misc]
-        assert recorder.lost == 0
+        assert recorder.missed == 0
     with skinware.recording.open(path) as opened:
         torso = opened["torso"]
         assert recorded(opened, "torso") == seen[0] | seen[1] | seen[2]
@@ -121,11 +122,11 @@ def test_what_could_not_be_taken_is_told(path: Path) -> None:
         for _ in range(30):
             skin.publish(40)  # at once: the ring has 4 slots
             time.sleep(0.01)
-        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == 1201)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.missed == 1201)
     with skinware.recording.open(path) as opened:
         sequence = opened["torso"].read(["status"]).sequence.astype(int)
-        assert opened.lost == recorder.lost > 0
-        told = {event["before"]: event["count"] for event in opened.events if event["event"] == "lost"}
+        assert opened.missed == recorder.missed > 0
+        told = {event["before"]: event["count"] for event in opened.events if event["event"] == "missed"}
         gaps = np.diff(sequence, prepend=0)  # the first one of all may be lost too
         assert {int(sequence[at]): int(gaps[at]) - 1 for at in np.flatnonzero(gaps > 1)} == told
 
@@ -173,7 +174,7 @@ def test_files_of_a_size_each_complete_and_the_oldest_removed(path: Path) -> Non
             sequence = opened["torso"].read(["status"]).sequence
             assert following in (None, sequence[0])
             following = sequence[-1] + 1
-    assert recorder.lost == 0
+    assert recorder.missed == 0
     assert following == 601
 
 

@@ -119,7 +119,7 @@ def test_playing_goes_on_from_there_without_a_gap(file: Path) -> None:
                 if len(found) == len(expected):
                     break
             assert found == expected
-            assert torso.lost == 0
+            assert torso.missed == 0
             wait_until(lambda: control.call("replay")["paused"])  # it stays, at its end
             told = control.call("replay")
             assert told["time_s"] == told["duration_s"] >= frames[-1][0]

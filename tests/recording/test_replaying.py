@@ -64,7 +64,7 @@ def test_record_replay_record_is_the_same(tmp_path: Path, namespace: Namespace) 
         wait_until(lambda: recorder.messages.get("/skin/arm/frame", 0) == replayer.frames["arm"])
     with skinware.recording.open(first) as then, skinware.recording.open(second) as now:
         assert then.services == now.services == ("arm", "pose", "torso")
-        assert now.lost == 0
+        assert now.missed == 0
         for name in then.services:
             assert values_of(then, name) == values_of(now, name)
             pairs = list(zip(then[name].generations, now[name].generations, strict=True))
@@ -141,19 +141,19 @@ def test_frames_that_the_recording_lost_are_lost_in_the_replay(tmp_path: Path, m
                     time.sleep(0.1)
                 wait_until(
                     lambda published=published: (  # type: ignore[misc]
-                        recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == published
+                        recorder.messages.get("/skin/torso/frame", 0) + recorder.missed == published
                     )
                 )
-        lost = recorder.lost
+        lost = recorder.missed
     assert lost > 200
     with recording(second) as recorder, replaying(first, speed=0.5):
-        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == published)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.missed == published)
     with skinware.recording.open(first) as then, skinware.recording.open(second) as now:
         old, new = then["torso"].read(["status"]), now["torso"].read(["status"])
         assert new.sequence.tolist() == old.sequence.tolist()
         losses = [
-            [(event["count"], event["before"]) for event in opened.events if event["event"] == "lost"]
+            [(event["count"], event["before"]) for event in opened.events if event["event"] == "missed"]
             for opened in (then, now)
         ]
         assert losses[0] == losses[1]
-        assert sum(count for count, _ in losses[0]) == lost == now.lost
+        assert sum(count for count, _ in losses[0]) == lost == now.missed

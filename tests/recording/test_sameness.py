@@ -110,7 +110,7 @@ class Programs:
                 except StructureChanged:
                     reader.reattach()
                     self.told[name].append("another structure")
-            self.told[f"{name}, lost"] = [reader.lost]
+            self.told[f"{name}, lost"] = [reader.missed]
 
     def _skin(self) -> None:
         tell = self._list("skin", lambda snapshot: [told_by(frame) for frame in snapshot.frames])

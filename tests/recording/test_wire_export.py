@@ -55,7 +55,7 @@ def write_recording(path: Path, fill: Callable[[dict[tuple[str, str], WireTap]],
     chunk.add(*channels.of_all("/skin/clock"), 0, EPOCH_NS, b"{}")
     for (driver, bus), tap in taps.items():
         for number, batch in enumerate(tap.fetch()):
-            head = struct.pack("<QQqQ", 1, number, MONOTONIC_NS + _PUBLISHED_NS, tap.lost)
+            head = struct.pack("<QQqQ", 1, number, MONOTONIC_NS + _PUBLISHED_NS, tap.missed)
             chunk.add(*channels.of_wire(driver, bus), number, EPOCH_NS + _PUBLISHED_NS, head + bytes(batch))
     file.add(chunk.close())
     file.finish()

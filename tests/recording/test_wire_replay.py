@@ -19,7 +19,8 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
 from skinware_drivers.bus_names import BusName
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.captures import check_capture
 from skinware_drivers.registry import load_driver, make_bus

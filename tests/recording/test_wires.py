@@ -27,8 +27,9 @@ from skinware.wire import COLUMNS, IS_CUT, IS_FD, KIND, WISH, service_name
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.pythoncan import PythonCanBus
+from skinware_drivers.fields import Identifier
 from skinware_drivers.layout import Frame as FrameKind
-from skinware_drivers.layout import Identifier, Layout, Values
+from skinware_drivers.layout import Layout, Values
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.driving import Driving, driving_lines, emulated_skin
@@ -92,7 +93,7 @@ def frames_of(wire: WireTrack) -> list[Frame]:
 def batches_lost(opened: skinware.recording.Recording, driver: str) -> int:
     """How many batches of a driver's wires the recorder missed."""
     events = [event for event in opened.events if event["service"] == service_name(driver)]
-    return sum(event.get("count", 0) for event in events if event["event"] == "lost")
+    return sum(event.get("count", 0) for event in events if event["event"] == "missed")
 
 
 @contextmanager
@@ -124,7 +125,7 @@ def test_a_can_bus_is_recorded_with_everything_on_it(path: Path, cable: Cable, w
         assert (opened.services, opened.problems) == (("tip",), [])
         assert not batches_lost(opened, "tip")
         (wire,) = opened.wires
-        assert (wire.driver, wire.bus, wire.lost) == ("tip", "can0", 0)
+        assert (wire.driver, wire.bus, wire.missed) == ("tip", "can0", 0)
         assert frames_of(wire) == [expected for _ in range(200) for _, expected in EVERYTHING] + [
             (True, 0x321, 0, b"sent")
         ]
@@ -199,8 +200,8 @@ def test_the_bytes_of_a_serial_line_are_recorded_as_they_were_read(path: Path) -
         (wire,) = opened.wires
         received = [piece for piece in wire.pieces() if not piece.is_sent]
         data = b"".join(piece.data for piece in received)
-        assert len(data) == framing.bytes_in - wire.lost
-        assert wire.lost == 0
+        assert len(data) == framing.bytes_in - wire.missed
+        assert wire.missed == 0
         assert len(wire.frames()) == 0
         times = np.concatenate([piece.time_ns for piece in received])
         assert (np.diff(times) >= 0).all()
@@ -300,12 +301,12 @@ def test_frames_that_had_no_room_are_counted_in_the_file(path: Path, namespace: 
         with ServiceWriter(service_name("tip"), COLUMNS, static, kind=KIND) as writer:
             for lost in (0, 3, 7):
                 columns = writer.begin()
-                for name, value in {"bus": 0, "used": 0, "lost": lost}.items():
+                for name, value in {"bus": 0, "used": 0, "missed": lost}.items():
                     columns[name][()] = value
                 writer.commit(time.monotonic_ns())
             is_recorded(recorder, 3)
     with skinware.recording.open(path) as opened:
-        assert opened.wires[0].lost == 7
+        assert opened.wires[0].missed == 7
 
 
 @pytest.mark.parametrize("static", [{}, {"driver": np.array([b"\xff"]), "bus_name": np.array([b"can0"])}])
@@ -338,7 +339,7 @@ def test_damaged_messages_are_told_and_never_raise(path: Path) -> None:
     with skinware.recording.open(path) as opened:
         (wire,) = opened.wires
         assert len(wire.frames()) == 0
-        assert wire.lost >= 0
+        assert wire.missed >= 0
         assert sorted(opened.problems) == [
             "wire of can0: a message has a time that no clock has",
             "wire of can0: a message is shorter than its header",

@@ -23,7 +23,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.dds import _type
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
@@ -32,7 +32,14 @@ _SAYING = threading.Lock()
 _HEAD = 64
 _TYPES = {
     each.name: each
-    for each in (types.POINTS, types.IMAGE, types.SKIN_FRAME, types.SENSORS, types.DIAGNOSTICS, types.PARTICIPANT)
+    for each in (
+        messages.POINTS,
+        messages.IMAGE,
+        messages.SKIN_FRAME,
+        messages.SENSORS,
+        messages.DIAGNOSTICS,
+        messages.PARTICIPANT,
+    )
 }
 _RELIABLE = Policy.Reliability.Reliable(max_blocking_time=10**9)
 
@@ -77,7 +84,7 @@ def look(participant: DomainParticipant) -> None:
 
 def call(participant: DomainParticipant, service: str) -> None:
     """Ask a service twice, under two identities; say what is answered."""
-    request, answer = (_type(each, True) for each in (types.TRIGGER.request, types.TRIGGER.response))
+    request, answer = (_type(each, True) for each in (messages.TRIGGER.request, messages.TRIGGER.response))
     qos = Qos(_RELIABLE, Policy.History.KeepLast(10))
     reader = DataReader(participant, Topic(participant, f"rr{service}Reply", answer), qos)
     writer = DataWriter(participant, Topic(participant, f"rq{service}Request", request), qos)

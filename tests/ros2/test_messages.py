@@ -13,7 +13,7 @@ from skinware.conversion import ros_messages
 from skinware.conversion.ros_messages import Cdr
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
-from skinware.ros2 import messages, types
+from skinware.ros2 import messages
 from skinware.ros2.messages import DiagnosticLevel, DiagnosticStatus
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity
 from tests.cli.fake_skin import FakeSkin, fake_structure
@@ -50,15 +50,15 @@ def test_all_of_the_message_package_is_known_here() -> None:
 
 MESSAGE_TYPES = [
     *(
-        types.POINTS,
-        types.IMAGE,
-        types.SKIN_FRAME,
-        types.SENSORS,
-        types.DIAGNOSTICS,
-        types.TRANSFORMS,
-        types.PARTICIPANT,
+        messages.POINTS,
+        messages.IMAGE,
+        messages.SKIN_FRAME,
+        messages.SENSORS,
+        messages.DIAGNOSTICS,
+        messages.TRANSFORMS,
+        messages.PARTICIPANT,
     ),
-    *(types.TRIGGER.request, types.TRIGGER.response),
+    *(messages.TRIGGER.request, messages.TRIGGER.response),
 ]
 
 
@@ -68,7 +68,7 @@ def test_hashes_are_those_of_the_definitions(message_type: MessageType) -> None:
 
 
 def test_the_hash_of_a_service_is_the_one_that_ros_has() -> None:
-    assert types.TRIGGER.hash == with_chars_of_ros(typestore()).hash_rihs01("std_srvs/srv/Trigger")
+    assert messages.TRIGGER.hash == with_chars_of_ros(typestore()).hash_rihs01("std_srvs/srv/Trigger")
 
 
 def test_frames_and_sensors() -> None:
@@ -129,7 +129,7 @@ def test_points_and_images() -> None:
         pictures = list(showing.pictures(frame, SECOND_NS))
         assert {each.topic: each.schema for each in pictures} == showing.topics
         for each in pictures:
-            name = types.OF_SCHEMAS[each.schema.name].name
+            name = messages.OF_SCHEMAS[each.schema.name].name
             assert serialised(STORE.deserialize_cdr(each.data, name), name) == each.data
         only = sorted(showing.topics)[0]
         assert [each.topic for each in showing.pictures(frame, SECOND_NS, wanted=only.__eq__)] == [only]
@@ -159,7 +159,7 @@ def test_ages_of_points_are_those_of_their_modules() -> None:
 def test_diagnostics() -> None:
     told = [
         messages.DiagnosticStatus(
-            messages.DiagnosticLevel.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"lost": "2"}
+            messages.DiagnosticLevel.WARN, "skin: arm", "3 of 4 sensors are fresh", "roboskin", {"dropped": "2"}
         ),
         DiagnosticStatus(DiagnosticLevel.OK, "skin: arm: can0", "live", "can0", {}),
     ]
@@ -210,5 +210,5 @@ def test_what_tells_which_node_has_which_endpoints(distro: Distro) -> None:
 
 
 def test_endpoints_tell_the_hash_of_their_type() -> None:
-    assert messages.endpoint_data(types.IMAGE.hash, Distro.JAZZY) == f"typehash={types.IMAGE.hash};".encode()
-    assert messages.endpoint_data(types.IMAGE.hash, Distro.HUMBLE) == b""
+    assert messages.endpoint_data(messages.IMAGE.hash, Distro.JAZZY) == f"typehash={messages.IMAGE.hash};".encode()
+    assert messages.endpoint_data(messages.IMAGE.hash, Distro.HUMBLE) == b""

@@ -17,7 +17,7 @@ import pytest
 from skinware import DriverReader, Namespace
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError
-from skinware.ros2 import dds, types
+from skinware.ros2 import dds, messages
 from skinware.ros2.transport import Distro, NodeIdentity, Qos
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
@@ -98,7 +98,7 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
         with peer(domain, "--look") as looking:
             found = looking.wait_for("publication", lambda event: event["topic"] == POINTS[0])
             assert found["type"] == "sensor_msgs::msg::dds_::PointCloud2_"
-            assert found["data"] == f"typehash={types.POINTS.hash};"
+            assert found["data"] == f"typehash={messages.POINTS.hash};"
         with peer(domain, "--listen-late", *info) as theirs:  # the two events have no order in one program
             told = message(
                 theirs,
@@ -155,8 +155,8 @@ def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.Monke
     monkeypatch.setattr(dds, "_write_bytes", None)
     node = dds.DdsNode(NodeIdentity("skin", domain=domain))
     try:
-        with peer(domain, "--listen", "rt/x", types.SKIN_FRAME.name) as theirs:
-            publisher = node.publisher("/x", types.SKIN_FRAME, Qos())
+        with peer(domain, "--listen", "rt/x", messages.SKIN_FRAME.name) as theirs:
+            publisher = node.publisher("/x", messages.SKIN_FRAME, Qos())
             assert not publisher.is_wanted or theirs
             wait_until(lambda: publisher.is_wanted)
             sent = made_frame()

@@ -51,7 +51,7 @@ def test_every_frame_comes_to_who_wants_each(namespace: Namespace) -> None:
         graph.wanted = {FRAMES}
         heard_from(graph, FRAMES, skin)
         wait_until(lambda: graph.heard(FRAMES)[-1].sequence == skin.writer.sequence)
-        begin, lost = skin.writer.sequence, server.drivers()["arm"].lost
+        begin, lost = skin.writer.sequence, server.drivers()["arm"].missed
         for _ in range(50):
             skin.publish()
             wait_until(lambda: graph.heard(FRAMES)[-1].sequence == skin.writer.sequence)
@@ -60,7 +60,7 @@ def test_every_frame_comes_to_who_wants_each(namespace: Namespace) -> None:
         (sensors,) = graph.heard(SENSORS)
         assert sensors.generation == graph.heard(FRAMES)[-1].generation
         assert np.array_equal(sensors.uid, skin.structure.sensor_uid)
-        assert server.drivers()["arm"].lost == lost
+        assert server.drivers()["arm"].missed == lost
         assert graph.heard(POINTS) == []  # nobody wants them
 
 
@@ -79,14 +79,14 @@ def test_frames_that_were_too_fast_are_counted_only_for_who_wants_each(namespace
         skin.publish()
         told(graph, SENSORS)
         skin.publish(30)
-        assert server.drivers()["arm"].lost == 0
+        assert server.drivers()["arm"].missed == 0
         graph.wanted = {FRAMES}
         heard_from(graph, FRAMES, skin)
         heard_from(graph, FRAMES, skin)
 
         def lost_some() -> bool:
             skin.publish(30)  # at once: most of them cannot be taken
-            return server.drivers()["arm"].lost > 0
+            return server.drivers()["arm"].missed > 0
 
         wait_until(lost_some)
 

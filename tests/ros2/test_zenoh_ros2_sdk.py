@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from skinware import DriverWriter, Structure
 from skinware.geometry import Geometry
 from skinware.realtime import now_ns
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import Running, running
@@ -108,13 +108,13 @@ def array(told: dict[str, str]) -> npt.NDArray[Any]:
 
 
 def check_points(sdk: SdkPeer) -> None:
-    told = sdk.ask(ask="message", topic="/skin/arm/points/pressure", type_name=types.POINTS.name)
+    told = sdk.ask(ask="message", topic="/skin/arm/points/pressure", type_name=messages.POINTS.name)
     message = told["message"]
     fields = {field["name"]: field["offset"] for field in message["fields"]}
     rows = array(message["data"]).reshape(SENSORS, message["point_step"])
     intensity = np.ascontiguousarray(rows[:, fields["intensity"] :][:, :4]).view("<f4")[:, 0]
     x = np.ascontiguousarray(rows[:, fields["x"] :][:, :4]).view("<f4")[:, 0]
-    assert told["hash"] == types.POINTS.hash
+    assert told["hash"] == messages.POINTS.hash
     assert message["header"]["frame_id"] == "hand"
     assert (message["width"], message["height"], message["row_step"]) == (SENSORS, 1, rows.size)
     assert np.array_equal(intensity, VALUES)
@@ -122,19 +122,19 @@ def check_points(sdk: SdkPeer) -> None:
 
 
 def check_image(sdk: SdkPeer) -> None:
-    told = sdk.ask(ask="message", topic="/skin/arm/image/palm/pressure", type_name=types.IMAGE.name)
+    told = sdk.ask(ask="message", topic="/skin/arm/image/palm/pressure", type_name=messages.IMAGE.name)
     message = told["message"]
     pixels = array(message["data"]).view("<u2").reshape(message["height"], message["width"])
-    assert told["hash"] == types.IMAGE.hash
+    assert told["hash"] == messages.IMAGE.hash
     assert (message["encoding"], message["is_bigendian"], message["step"]) == ("mono16", 0, 2 * message["width"])
     assert pixels.shape == (3, 4)
     assert np.array_equal(pixels.ravel(), (VALUES / 2000 * 65534 + 1).astype(np.uint16))
 
 
 def check_frame(sdk: SdkPeer) -> None:
-    told = sdk.ask(ask="message", topic="/skin/arm/frame", type_name=types.SKIN_FRAME.name)
+    told = sdk.ask(ask="message", topic="/skin/arm/frame", type_name=messages.SKIN_FRAME.name)
     message = told["message"]
-    assert told["hash"] == types.SKIN_FRAME.hash
+    assert told["hash"] == messages.SKIN_FRAME.hash
     assert np.array_equal(array(message["value"]), VALUES)
     assert not array(message["status"]).any()
     assert message["generation"] > 0
@@ -144,7 +144,7 @@ def check_frame(sdk: SdkPeer) -> None:
 def check_tare(sdk: SdkPeer, tared: list[bool]) -> None:
     wait_until(lambda: sdk.ask(ask="services") == {"/skin/arm/tare": ["std_srvs/srv/Trigger"]})
     told = sdk.ask(ask="trigger", service="/skin/arm/tare")
-    assert told == {"hash": types.TRIGGER.hash, "answer": {"success": True, "message": ""}}
+    assert told == {"hash": messages.TRIGGER.hash, "answer": {"success": True, "message": ""}}
     assert tared
 
 
@@ -154,18 +154,18 @@ def test_the_sdk_lists_topics_decodes_them_and_tares(tmp_path: Path, texts: dict
     with router() as at, driver(tared), bridge(at, "--tare") as ros2, sdk_peer(at.port, tmp_path, texts) as sdk:
         wait_for_live(ros2)
         topics = {
-            "/diagnostics": [types.DIAGNOSTICS.name],
-            "/skin/arm/frame": [types.SKIN_FRAME.name],
-            "/skin/arm/image/palm/pressure": [types.IMAGE.name],
-            "/skin/arm/points/pressure": [types.POINTS.name],
-            "/skin/arm/sensors": [types.SENSORS.name],
+            "/diagnostics": [messages.DIAGNOSTICS.name],
+            "/skin/arm/frame": [messages.SKIN_FRAME.name],
+            "/skin/arm/image/palm/pressure": [messages.IMAGE.name],
+            "/skin/arm/points/pressure": [messages.POINTS.name],
+            "/skin/arm/sensors": [messages.SENSORS.name],
         }
         wait_until(lambda: bool(sdk.ask(ask="topics") == topics))
         check_points(sdk)
         check_image(sdk)
         check_frame(sdk)
-        diagnostics = sdk.ask(ask="message", topic="/diagnostics", type_name=types.DIAGNOSTICS.name)
-        assert diagnostics["hash"] == types.DIAGNOSTICS.hash
+        diagnostics = sdk.ask(ask="message", topic="/diagnostics", type_name=messages.DIAGNOSTICS.name)
+        assert diagnostics["hash"] == messages.DIAGNOSTICS.hash
         assert diagnostics["message"]["status"]
         check_tare(sdk, tared)
 

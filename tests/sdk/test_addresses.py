@@ -13,9 +13,10 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch, wire_dtype
 from skinware_drivers.decoding.addresses import Addresses
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, join_types, taxels
-from skinware_drivers.layout import MOST_FRAMES, Bits, Byte, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Byte, Identifier, SequenceNumber
+from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout, Values
 from tests.specification.decoding import SpecifiedDecoder, slots_of
 
 TYPES = [PRESSURE.measured(unit="counts")]

@@ -16,14 +16,15 @@ from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.running import bus_line, connection, news, runner
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.clock import Clock
 from tests.sdk.driving import TroubledBus, driving, emulated, follow, hardware_of, read_until
@@ -72,7 +73,7 @@ class SlowBus(ReportingBus):
 
 
 def reporting(kind: type[ReportingBus] = ReportingBus, **options: object) -> ReportingBus:
-    return kind.with_hardware(EmulatedRoboskin(RoboskinOptions(boards=(7,), **options)))  # type: ignore[arg-type]
+    return kind.with_hardware(EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,), **options)))  # type: ignore[arg-type]
 
 
 def told(caplog: pytest.LogCaptureFixture, bus: str) -> list[str]:
@@ -146,7 +147,7 @@ def test_a_loss_that_a_send_swallowed_is_found_and_the_bus_opened_again() -> Non
 
         def vanish() -> None:
             bus.lost_in_silence = True
-            bus.hardware = EmulatedRoboskin(RoboskinOptions(boards=(9,)))  # nothing that is heard
+            bus.hardware = EmulatedRoboskin(EmulatedRoboskinOptions(boards=(9,)))  # nothing that is heard
 
         running.do(vanish)
         gone = read_until(reader, lambda f: f.bus_state[0] == BusState.GONE)
@@ -238,7 +239,7 @@ def test_interfaces_are_closed_side_by_side(caplog: pytest.LogCaptureFixture) ->
                 self.all_at_once.wait(30)
             super().close()
 
-    buses = [Closing.with_hardware(EmulatedRoboskin(RoboskinOptions(boards=(7,)))) for _ in range(3)]
+    buses = [Closing.with_hardware(EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,)))) for _ in range(3)]
     with driving(*buses):
         pass
     assert [bus.fileno() for bus in buses] == [-1, -1, -1]

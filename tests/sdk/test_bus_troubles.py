@@ -206,13 +206,13 @@ def test_what_a_bus_counts_and_notes_is_told(caplog: pytest.LogCaptureFixture, m
 
     def count() -> None:
         counters = buses[1].counters
-        counters.lost, counters.errors, counters.refused, counters.send_failures = 3, 5, 2, 1
+        counters.dropped, counters.errors, counters.refused, counters.send_failures = 3, 5, 2, 1
 
     with caplog.at_level(logging.WARNING), driving(*buses) as running, DriverReader("roboskin") as reader:
         running.do(count)
-        frame = read_until(reader, lambda f: reader.bus_counters(f)[1]["lost"] == 3)
+        frame = read_until(reader, lambda f: reader.bus_counters(f)[1]["dropped"] == 3)
         shown = reader.bus_counters(frame)
-        names = ("lost", "errors", "refused", "send_failures")
+        names = ("dropped", "errors", "refused", "send_failures")
         assert [[row[name] for name in names] for row in shown] == [[0, 0, 0, 0], [3, 5, 2, 1]]
         told = running.status()["buses"]
         assert [[row[name] for name in names] for row in told] == [[0, 0, 0, 0], [3, 5, 2, 1]]
@@ -272,7 +272,7 @@ def test_a_set_up_of_thousands_of_frames_starves_no_reception() -> None:
     with driving(bus, other, driver=Talkative) as running, DriverReader("roboskin") as reader:
         wait_until(lambda: running.status()["buses"][0]["sent"] >= 4000)  # boards send data before all is said
         read_until(reader, lambda f: not f.status.any())
-        assert all(row["lost"] == 0 for row in running.status()["buses"])
+        assert all(row["dropped"] == 0 for row in running.status()["buses"])
     assert sum(sent_between) == 4000
     assert max(sent_between) < 1000  # the boards deliver every 50 ms, in which the pace allows 200
     assert looks[0] > 4

@@ -8,9 +8,10 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.decoding.decoder import BUS_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Cycle, DeviceTime, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import DeviceTime, Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000

@@ -14,7 +14,7 @@ from skinware.errors import DriverError, PeerGone, RequestFailed
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
@@ -23,7 +23,7 @@ from skinware_drivers.running import serving
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of, troubled
 

@@ -16,8 +16,9 @@ from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameB
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.socketcan import MOST_FILTERS, SocketCanBus
 from skinware_drivers.decoding.addresses import fewest, filters_of
-from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Byte, Condition, Identifier, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 
 EVERY_STANDARD = np.arange(2048, dtype=np.int64)
 

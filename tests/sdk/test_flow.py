@@ -27,7 +27,7 @@ from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.emulation import Emulation, JsonReport
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.native.structs import Source
 from skinware_drivers.polling import Watch
@@ -35,7 +35,7 @@ from skinware_drivers.running.flow import FlowLoop, FlowSelector
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.cable import Cable
 from tests.sdk.driving import emulated, follow
@@ -119,7 +119,7 @@ def test_a_driver_flows_and_its_frames_are_whole(cable: Cable) -> None:
         wait_until(lambda: running.status()["buses"][0]["frames"] > 1000)
         counters = reader.bus_counters(reader.read())[0]
         assert counters["frames"] <= bus.counters.frames + 200
-        assert counters["lost"] == bus.counters.lost == 0
+        assert counters["dropped"] == bus.counters.dropped == 0
 
 
 def test_a_bus_that_c_cannot_read_is_read_beside_one_that_it_can(cable: Cable, spare_cable: Cable) -> None:
@@ -220,9 +220,9 @@ def test_losses_are_counted_and_nothing_is_joined_over_them(cable: Cable) -> Non
                 cable.put(0x6F3)
 
         running.do(flood)
-        wait_until(lambda: bus.counters.lost > 0)
+        wait_until(lambda: bus.counters.dropped > 0)
         frame = follow(reader, lambda f: not f.status.any())
-        wait_until(lambda: reader.bus_counters(reader.read())[0]["lost"] == bus.counters.lost)
+        wait_until(lambda: reader.bus_counters(reader.read())[0]["dropped"] == bus.counters.dropped)
         assert frame.data_path == DataPath.NATIVE
 
 

@@ -10,8 +10,9 @@ import pytest
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch, check_identifier, identifier_text
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Identifier, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 WRONG, RIGHT = 0x18DA00F1, EXTENDED_FLAG | 0x18DA00F1

@@ -12,7 +12,7 @@ from skinware_drivers.virtual.hand_clock import HandClock
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 
-@pytest.mark.parametrize("counter", ["lost", "overflows", "bus_offs"])
+@pytest.mark.parametrize("counter", ["dropped", "overflows", "bus_offs"])
 def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, namespace: object) -> None:
     case = Case(Fingertips, EmulatedFingertips, {}, {}, lambda felt: felt)
 

@@ -15,24 +15,10 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import (
-    Above,
-    Bits,
-    Byte,
-    Cycle,
-    Expand,
-    Flag,
-    Frame,
-    Identifier,
-    Layout,
-    Packed,
-    Sentinel,
-    SequenceNumber,
-    StatusBytes,
-    Values,
-)
+from skinware_drivers.fields import Above, Bits, Byte, Flag, Identifier, Packed, Sentinel, SequenceNumber, StatusBytes
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from tests.specification.both_paths import require_same
 from tests.specification.decoding import SpecifiedDecoder
 

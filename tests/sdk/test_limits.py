@@ -47,7 +47,7 @@ def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: 
         for _ in range(10):
             bus.wire_bits += 2 * 910_000
             bus.fullest = 0.7
-            bus.counters.lost += 3
+            bus.counters.dropped += 3
             clock.pass_s(2)
             limits.look()
             limits.look()  # within the same second: nothing new
@@ -55,7 +55,7 @@ def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: 
     assert load.startswith("bus can0: about 91% of its time is in use")
     assert load_report(limits.permille) == {"load": 0.91, "load_unknown": None}
     assert fill.startswith("bus can0: the receive buffer was 70% full")
-    assert lost.startswith("bus can0: 3 frames were lost")
+    assert lost.startswith("bus can0: 3 frames dropped")
     assert bus.fullest == 0.0
 
 

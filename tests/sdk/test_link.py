@@ -9,7 +9,8 @@ import pytest
 
 from skinware.errors import BusSendError, ConfigurationError, HandshakeTimeout
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.link import AT_ONCE, Link, Match, Reply
+from skinware_drivers.fields import Match, Reply
+from skinware_drivers.link import AT_ONCE, Link
 
 
 class Nowhere:

@@ -14,8 +14,9 @@ from skinware.errors import DriverError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, SequenceNumber, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Bits, Identifier, Match, SequenceNumber
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Notice
 from skinware_drivers.testing.waiting import wait_until

@@ -9,7 +9,8 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.decoding.device_numbers import read_numbers
-from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Bits, Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000

@@ -21,8 +21,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.fields import Bits, Identifier, Match, Reply
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Poll, check_polls
 from skinware_drivers.running.poller import Poller
@@ -84,7 +85,7 @@ def test_answers_to_polls_are_published_one_by_one_at_absolute_deadlines() -> No
             values = [int(next(fresh).values[0]) for _ in range(20)]
         asked_ns = device.asked_ns.copy()
         missed = running.status()["buses"][0]["polls_missed"]  # by then, and perhaps a few since
-    assert all(0 <= b - a <= 1 + reader.lost for a, b in pairwise(values))  # and a reader that was held up misses some
+    assert all(0 <= b - a <= 1 + reader.missed for a, b in pairwise(values))  # a reader that was held up misses some
     # no drift: polls lie on one grid of 20 ms, but for how late each was sent; what it lacks was counted
     deadlines = [(asked - asked_ns[0]) / (20 * MS) for asked in asked_ns]
     assert max(round(d) for d in deadlines) <= len(deadlines) - 1 + missed + 1

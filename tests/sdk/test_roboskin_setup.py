@@ -15,7 +15,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.roboskin.boards import Board
+from skinware_drivers.virtual.roboskin.boards import EmulatedBoard
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.virtual.rig import Rig
 
@@ -202,7 +202,7 @@ def test_what_the_driver_believes_to_be_on_is_on_in_the_firmware(
     for payload in sent(set_up):
         rig.send(0x207, payload.hex())
     (board,) = rig.hardware.devices.values()
-    assert isinstance(board, Board)
+    assert isinstance(board, EmulatedBoard)
     assert set_up.enabled == {t for t in range(16) if board._active[t]}
     assert board._period_ns == set_up.period_ms * MS
     assert not set_up.wiped & set_up.enabled

@@ -17,7 +17,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import Event, damaged_cycles
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import EveryFrame, LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 
@@ -142,7 +142,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
                 cycles = set(values[module].tolist())
                 assert len(cycles) == 1, f"module {module} is torn: {values[module]}"
                 shown[module].add(int(values[module][0]))
-        assert reader.lost == 0
+        assert reader.missed == 0
         orphans = [counters["orphans"] for counters in reader.patch_counters(frame)]
         assert min(orphans) > 10
         told = running.status()["patches"]
@@ -175,7 +175,7 @@ def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
                 assert len(set(values)) == 1, "a frame holds two bursts of a board"
                 assert len(set(frame.status[192 * board :][:192].tolist())) == 1, "part of a board is stale"
                 shown[board].append(values[0])
-        assert every.reader.lost == 0
+        assert every.reader.missed == 0
     for cycles in shown:
         assert set((np.diff(cycles) % 256).tolist()) <= {0, 1}
         assert len(set(cycles)) >= 25
@@ -366,4 +366,4 @@ def test_a_full_batch_loses_nothing() -> None:
         total += bus.receive(batch, 0)
         assert len(batch) <= 10
     bus.close()
-    assert bus.counters.lost == 0
+    assert bus.counters.dropped == 0

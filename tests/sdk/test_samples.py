@@ -14,7 +14,8 @@ from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import Samples
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Byte, Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import Packet

@@ -37,7 +37,7 @@ def test_frames_arrive_whole_in_order_and_as_often_as_they_were_sent(cable: Cabl
     assert wire["length"].tolist() == [number % 9 for number in range(700)]
     assert wire["payload"][8].tolist() == [8] * 8
     assert set(batch.bus[:700].tolist()) == {3}
-    assert (bus.counters.frames, bus.counters.lost) == (700, 0)
+    assert (bus.counters.frames, bus.counters.dropped) == (700, 0)
 
 
 def test_a_full_batch_leaves_the_rest_for_the_next_one(cable: Cable) -> None:
@@ -68,19 +68,19 @@ def test_drops_are_counted_exactly_and_go_on_counting_when_the_bus_is_opened_aga
         cable.put(0x123)
     batch = FrameBatch(2000)
     drain(bus, batch)
-    dropped = bus.counters.lost
+    dropped = bus.counters.dropped
     assert dropped > 0
     assert bus.counters.frames + dropped == 1000
     bus.close()
     bus.adopt(spare_cable.end)
     spare_cable.put(0x123)
     drain(bus, batch)
-    assert bus.counters.lost == dropped
+    assert bus.counters.dropped == dropped
     for _ in range(1000):
         spare_cable.put(0x123)
     drain(bus, batch)
-    assert bus.counters.lost > dropped
-    assert bus.counters.frames + bus.counters.lost == 2001
+    assert bus.counters.dropped > dropped
+    assert bus.counters.frames + bus.counters.dropped == 2001
 
 
 # The receive buffer
@@ -248,7 +248,7 @@ def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:
                 break
             seen += batch.wire["identifier"][: len(batch)].tolist()
     assert seen == list(range(20))
-    assert (bus.counters.errors, bus.counters.overflows, bus.counters.lost) == (2000, 2000, 0)
+    assert (bus.counters.errors, bus.counters.overflows, bus.counters.dropped) == (2000, 2000, 0)
 
 
 @pytest.mark.parametrize(

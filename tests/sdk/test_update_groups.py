@@ -14,7 +14,8 @@ from skinware import PatchState, Status
 from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables, assemble, taxels
-from skinware_drivers.layout import Cycle, Expand, Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.one_path import Publishing
 

@@ -47,7 +47,7 @@ def test_nothing_is_kept_while_it_is_closed() -> None:
     tap.keep_frame(1, 0x123, b"abc")
     tap.keep_bytes(1, b"abc")
     tap.keep_rows(np.zeros(3, wire_dtype(8)), np.zeros(3, np.int64))
-    assert (tap.address, tap.lost, list(tap.fetch())) == (0, 0, [])
+    assert (tap.address, tap.missed, list(tap.fetch())) == (0, 0, [])
     tap.open()
     tap.keep_bytes(1, b"abc")
     tap.close()
@@ -89,7 +89,7 @@ def test_what_has_no_room_is_counted_and_the_rest_goes_on(tap: WireTap) -> None:
     for _ in range(11):
         tap.keep_bytes(1, chunk)
     kept = sum(len(piece.data) for piece in pieces_of(tap))
-    assert kept + tap.lost == 1_100_000
+    assert kept + tap.missed == 1_100_000
     assert kept > 1_000_000
     tap.keep_bytes(2, b"more")
     assert [piece.data for piece in pieces_of(tap)] == [b"more"]

@@ -17,8 +17,9 @@ import numpy as np
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.fields import Identifier, Match
+from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner

@@ -15,7 +15,8 @@ from skinware.sensor_types import PRESSURE
 from skinware.status import BusReason, BusState, DataPath
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus

@@ -16,9 +16,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.decoding.skin_state import SkinState, Updates
+from skinware_drivers.decoding.decoder import SkinState, Updates
 from skinware_drivers.running.publisher import BurstPauses, Pace
-from tests.specification.decoding import join, take
+from tests.specification.decoding import join
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -99,7 +99,7 @@ class Bursts:
         if not old.any():
             return updates
         self._skip(np.bincount(self._group_patch[updates.group[old & updates.whole]], minlength=self._n_patches))
-        return take(updates, ~old)
+        return updates.take(~old)
 
     def _show_the_newest(self, updates: Updates) -> None:
         of_group = np.bincount(updates.group[updates.whole], minlength=len(self._group_patch))
@@ -134,15 +134,15 @@ class Bursts:
         while begin < len(updates):
             end = int(np.searchsorted(reach, threshold))
             if end > begin:
-                self._show(take(updates, slice(begin, end)))
+                self._show(updates.take(slice(begin, end)))
             if end == len(updates):
                 return None
             if self._left <= 0:
-                return take(updates, slice(end, None))
+                return updates.take(slice(end, None))
             open_patches = self.in_the_middle(living, int(updates.oldest_ns[end]))
             open_patches[self._group_patch[updates.group[end]]] = False
             if open_patches.any():
-                rest = take(updates, slice(end, None))
+                rest = updates.take(slice(end, None))
                 return self._finish(rest, before[end:] >= threshold, open_patches, living, publish)
             publish()
             begin, threshold = end, end + 1
@@ -165,8 +165,8 @@ class Bursts:
                 rows = rows[: next_burst[0]]
                 open_patches[number] = False
             early[rows] = True
-        self._show(take(rest, early))
-        rest = take(rest, ~early)
+        self._show(rest.take(early))
+        rest = rest.take(~early)
         if (open_patches & self.in_the_middle(living, int(rest.newest_ns[-1]))).any():
             self._held = rest
             return None
@@ -190,7 +190,7 @@ class Bursts:
         # slow groups come at any time: they neither begin nor end a burst
         prompt = np.arange(len(group)) if self._all_prompt else np.flatnonzero(self._state.is_prompt[group])
         if len(prompt):
-            of_prompt = updates if self._all_prompt else take(updates, prompt)
+            of_prompt = updates if self._all_prompt else updates.take(prompt)
             self._find_pauses(of_prompt, patch[prompt], prompt, found)
         return found
 

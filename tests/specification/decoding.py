@@ -14,15 +14,14 @@ import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Field, Form
+from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
-from skinware_drivers.decoding.decoder import NONE_YET, Decoder
+from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates
 from skinware_drivers.decoding.device_numbers import read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
-from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import SequenceNumber
-from skinware_drivers.layout import Byte, Layout
+from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.layout import Layout
 from tests.specification.pairing import Pairing
 from tests.specification.reading import name_modules, read_updates
 
@@ -48,21 +47,6 @@ def join(parts: Sequence[Updates]) -> Updates:
         np.concatenate([p.oldest_ns for p in parts]),
         np.concatenate([p.newest_ns for p in parts]),
         any(p.flagged for p in parts),
-    )
-
-
-def take(updates: Updates, which: slice | npt.NDArray[Any]) -> Updates:
-    """Return some of the updates."""
-    return Updates(
-        updates.module[which],
-        updates.groups[which],
-        updates.whole[which],
-        updates.sensors[which],
-        updates.values[which],
-        updates.status[which],
-        updates.oldest_ns[which],
-        updates.newest_ns[which],
-        updates.flagged,
     )
 
 
@@ -93,7 +77,7 @@ def _look_up(form: Form, bus: npt.NDArray[np.uint16], identifier: Indices, slots
             slots[rows[hits[known]]] = found[at[known]]
 
 
-def _field(field: Field, identifier: Indices) -> Indices:
+def _field(field: KeyField, identifier: Indices) -> Indices:
     return identifier >> field.shift & field.mask | field.constant
 
 
@@ -186,9 +170,9 @@ class SpecifiedDecoder(Decoder):
         updates = join([part for part, _ in parts])
         newest_ns = updates.newest_ns
         if len(parts) > 1:
-            updates = take(updates, np.lexsort((np.concatenate([rows for _, rows in parts]), newest_ns)))
+            updates = updates.take(np.lexsort((np.concatenate([rows for _, rows in parts]), newest_ns)))
         elif (newest_ns[1:] < newest_ns[:-1]).any():
-            updates = take(updates, np.argsort(newest_ns, kind="stable"))
+            updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
 
     def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:

@@ -14,8 +14,7 @@ from skinware.memory.namespace import Namespace
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, read_own
-from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Decoder, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import now_ns
 from skinware.status import PatchState, Status
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.running.publisher import NEVER_NS, PatchTiming, Publisher
 from tests.specification.bursts import Bursts
 from tests.specification.decoding import SpecifiedState

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
-from skinware_drivers.layout import Above, Expand, Flag, Packed, Sentinel, StatusBytes, Values
+from skinware_drivers.fields import Above, Flag, Packed, Sentinel, StatusBytes
+from skinware_drivers.layout import Expand, Values
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]

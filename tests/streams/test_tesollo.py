@@ -12,7 +12,8 @@ import pytest
 from skinware import Status
 from skinware.errors import BusError, ConfigurationError
 from skinware.status import PatchState
-from skinware_drivers.link import Link, Reply
+from skinware_drivers.fields import Reply
+from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.tesollo import _TIPS, TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.testing.driving import emulated_on, emulated_skin

@@ -6,8 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.geometry import Geometry
+from skinware.tactile.tracking import TrackingSettings
 
 PITCH_M = 0.0065
+AT_ONCE = TrackingSettings(frames=1)
+"""What is touched in one frame is a contact."""
 
 
 def placed(position_m: npt.ArrayLike, frame: npt.ArrayLike = "chest", normal: npt.ArrayLike | None = None) -> Geometry:

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
 from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.rule import BaselineSettings, Why
 from skinware.tactile.testing import World, grid
 from tests.cli.fake_skin import FakeSkin
 
@@ -373,6 +373,88 @@ def test_an_eased_grip_stays_felt(held_s: int, grip: float, eased: float) -> Non
     assert not bench.run(2).touched.any()
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("eased", [15, 30, 50])
+def test_an_eased_grip_shows_what_is_left_of_it_also_where_the_patch_drifts(eased: float) -> None:
+    bench = Bench()
+    bench.run(120, per_s=0.05)
+    bench.run(60, on(3, load=150), per_s=0.05)
+    shown: list[float] = []
+    bench.run(120, on(3, load=eased), each=lambda calm: shown.append(float(calm.value[3])), per_s=0.05)
+    assert min(shown) > 0
+    assert abs(np.mean(shown) / eased - 1) < 0.2
+    assert not bench.run(2, per_s=0.05).touched.any()
+
+
+def test_the_uncertainty_grows_under_a_touch_by_the_drift_alone_and_shrinks_after_it() -> None:
+    still, drifting = Bench(), Bench()
+    for bench, per_s in ((still, 0.0), (drifting, 0.1)):
+        bench.run(20, per_s=per_s)
+        before = bench.calm.uncertainty[3]
+        calm = bench.run(60, on(3), per_s=per_s)
+        assert calm.why[3] == Why.HELD
+        assert (calm.uncertainty[3] > 2 * before) == (per_s > 0)
+        assert calm.uncertainty[3] < 1
+        assert bench.run(10, per_s=per_s).uncertainty[3] < max(0.2, 1.2 * before)
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_taxels_with_two_or_three_levels_are_touched_at_the_first(levels: int) -> None:
+    bench = Bench(noise=0.0)
+    bench.level[:] = 0
+    bench.run(6)
+    calm = bench.run(30, on(3, load=levels))
+    assert np.flatnonzero(calm.touched).tolist() == [3]
+    assert calm.value[3] == pytest.approx(levels, abs=0.1)
+    assert (calm.why == Why.NO_RESOLUTION).all()
+    assert not bench.run(1).touched.any()
+
+
+def test_a_press_of_three_counts_is_felt_where_the_noise_is_small() -> None:
+    bench = Bench(noise=0.3)
+    bench.run(10)
+    assert np.flatnonzero(bench.run(1, on(3, load=3)).touched).tolist() == [3]
+    assert not bench.run(1).touched.any()
+
+
+@pytest.mark.parametrize("counts", [3, 6, -6, -30])
+def test_a_board_that_moves_its_own_baseline_by_a_little_is_no_touch(counts: float) -> None:
+    bench = Bench()
+    bench.run(10)
+    bench.level[:12] += counts
+    bench.run(2)
+    assert not bench.run(5).touched.any()
+    assert np.flatnonzero(bench.run(1, on(5)).touched).tolist() == [5]
+
+
+def test_touches_that_lower_values_are_none_and_their_polarity_is_doubted() -> None:
+    bench = Bench()
+    bench.run(10)
+    for _ in range(3):
+        bench.run(4, -on(5))
+        calm = bench.run(4)
+        assert not calm.touched.any()
+    assert calm.why[5] == Why.DOUBTED
+    assert not (calm.why[:5] == Why.DOUBTED).any()
+
+
+def test_a_spike_of_one_frame_is_no_touch() -> None:
+    bench = Bench()
+    bench.run(6)
+    seen: list[bool] = []
+    for _ in range(20):
+        bench.run(0.02, on(5, load=100), each=lambda calm: seen.append(bool(calm.touched.any())))
+        bench.run(0.3, each=lambda calm: seen.append(bool(calm.touched.any())))
+    assert not any(seen)
+
+
+def test_a_touched_value_at_the_end_of_the_range_may_be_more() -> None:
+    bench = Bench(limits=(0, 40))
+    bench.run(6)
+    assert bench.run(1, on(5)).why[5] == Why.SATURATED
+    assert bench.run(1, on(5, load=15)).why[5] == Why.HELD
+
+
 def test_settings_can_change_while_it_runs() -> None:
     bench = Bench()
     bench.run(6)
@@ -386,7 +468,6 @@ def test_settings_can_change_while_it_runs() -> None:
         ("tau_s", None),
         ("tau_s", "3"),
         ("on_sigma", 2),
-        ("release", 1),
         ("settle_s", -1),
     ):
         with pytest.raises(ConfigurationError, match=name):

@@ -89,7 +89,7 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
             assert np.flatnonzero(frame.physical("pressure")).tolist() == [10]
             assert frame.values[12] == 50
             assert frame.fresh("pressure")[10]
-            assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "lost", "errors", "unknown"]]
+            assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "dropped", "errors", "unknown"]]
             with DriverReader("fake") as source:
                 newest = source.read()
             assert abs(frame.acquired_ns - newest.acquired_ns) < 10e9
@@ -200,9 +200,9 @@ def test_a_state_that_is_no_good_is_left_alone(tmp_path: Path, damage: str, capl
     chain = ChainSettings.calm().chain(structure)
     state = chain.state()
     if damage == "keys":
-        del state.arrays["pressure"]["noise"]
+        del state.arrays["pressure"]["noise2"]
     if damage == "shapes":
-        state.arrays["pressure"]["base"] = np.zeros((640, 2), np.float32)
+        state.arrays["pressure"]["level"] = np.zeros((640, 2), np.float32)
     save_state(path, state)
     whole = path.read_bytes()
     if damage == "empty":

@@ -259,7 +259,7 @@ def test_a_chain_says_what_a_baseline_did(tmp_path: Path) -> None:
         (['stage = "filter"\nframes = 1'], "chain.toml:5: Expected int >= 2"),
         (['stage = "filter"\ntau = 1'], "unknown field tau"),
         (['stage = "curve"'], "missing required field file"),
-        ([BASELINE, 'stage = "baseline"\nrelease = 2'], "chain.toml:5: release = 2"),
+        ([BASELINE, 'stage = "baseline"\non_sigma = 2'], "chain.toml:5: on_sigma = 2"),
     ],
 )
 def test_a_wrong_file_says_where(tmp_path: Path, stages: list[str], words: str) -> None:

@@ -12,7 +12,7 @@ from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, Struc
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.tactile.contacts import BEYOND, COLUMNS, MOST, NO_CONTACT, Contacts, ContactSet
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
-from tests.tactile.skins import PITCH_M, placed, pressed, triangles
+from tests.tactile.skins import AT_ONCE, PITCH_M, placed, pressed, triangles
 
 FLAT = triangles(20, 20)
 
@@ -51,7 +51,7 @@ def equal(one: ContactSet, other: ContactSet) -> bool:
 def test_what_was_published_is_read(namespace: Namespace) -> None:
     value = pressed(FLAT, [[0.02, 0.02, 0], [0.1, 0.08, 0]], 3 * PITCH_M, load=1000.0)
     with (
-        ContactsWriter(structure(), driver="torso", namespace=namespace) as writer,
+        ContactsWriter(structure(), driver="torso", tracking=AT_ONCE, namespace=namespace) as writer,
         ContactsReader(namespace=namespace, timeout_s=10) as contacts,
     ):
         for time_ns in range(10**9, 2 * 10**9, 2 * 10**8):
@@ -70,7 +70,7 @@ def test_what_was_published_is_read(namespace: Namespace) -> None:
 
 
 def test_any_program_sees_columns_of_64_rows(namespace: Namespace) -> None:
-    with ContactsWriter(structure(), namespace=namespace) as writer:
+    with ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer:
         value = np.zeros(400)
         value[::2] = 1.0
         writer.publish(value, value > 0, 1)
@@ -96,8 +96,8 @@ def test_more_contacts_than_rows(namespace: Namespace) -> None:
     single = structure(with_places=False)
     apart = np.full((400, 1), -1)
     apart[0] = 1
-    with ContactsWriter(single, neighbours=apart, namespace=namespace) as writer:
-        writer._contacts = Contacts(400)  # each alone
+    with ContactsWriter(single, neighbours=apart, tracking=AT_ONCE, namespace=namespace) as writer:
+        writer._contacts = Contacts(400, tracking=AT_ONCE)  # each alone
         writer.publish(np.arange(400), np.ones(400, bool), 1)
         with ContactsReader(namespace=namespace) as contacts:
             found = contacts.read(timeout_s=10).contacts
@@ -107,7 +107,7 @@ def test_more_contacts_than_rows(namespace: Namespace) -> None:
 
 def test_without_places_modules_are_blobs(namespace: Namespace) -> None:
     with (
-        ContactsWriter(structure(with_places=False), namespace=namespace) as writer,
+        ContactsWriter(structure(with_places=False), tracking=AT_ONCE, namespace=namespace) as writer,
         ContactsReader(namespace=namespace) as contacts,
     ):
         value = np.zeros(400)
@@ -121,7 +121,7 @@ def test_without_places_modules_are_blobs(namespace: Namespace) -> None:
 
 def test_a_reader_goes_on_with_other_sensors_when_it_says_so(namespace: Namespace) -> None:
     with (
-        ContactsWriter(structure(), namespace=namespace) as writer,
+        ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer,
         ContactsReader(namespace=namespace) as contacts,
     ):
         writer.publish(np.ones(400), np.ones(400, bool), 1)
@@ -146,11 +146,11 @@ def test_a_reader_goes_on_with_other_sensors_when_it_says_so(namespace: Namespac
 
 
 def test_a_new_writer_is_read_without_a_word(namespace: Namespace) -> None:
-    with ContactsWriter(structure(), namespace=namespace) as writer:
+    with ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer:
         writer.publish(np.ones(400), np.ones(400, bool), 1)
         contacts = ContactsReader(namespace=namespace)
         frame = contacts.read(timeout_s=10)
-    with ContactsWriter(structure(), namespace=namespace) as writer, contacts:
+    with ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer, contacts:
         writer.publish(np.ones(400), np.ones(400, bool), 2)
         assert contacts.read(newer_than=frame, timeout_s=10).acquired_ns == 2
 
@@ -166,7 +166,7 @@ def test_what_is_no_service_of_contacts_is_refused(namespace: Namespace) -> None
 
 
 def test_a_second_writer_and_wrong_arrays_are_refused(namespace: Namespace) -> None:
-    with ContactsWriter(structure(), namespace=namespace) as writer:
+    with ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer:
         with pytest.raises(NameInUse):
             ContactsWriter(structure(), namespace=namespace)
         with pytest.raises(ConfigurationError, match="contacts of 400 taxels"):

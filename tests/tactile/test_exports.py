@@ -12,7 +12,7 @@ from skinware.tactile import Contacts
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.exports import IcubPart, icub_contacts, tactile_msgs_contacts
 from skinware.tactile.neighbours import neighbours
-from tests.tactile.skins import placed, triangles
+from tests.tactile.skins import AT_ONCE, placed, triangles
 
 PLACES = placed(triangles(10, 10), normal=(0, 0, 1))
 PART = IcubPart(body_part=3, link=4, skin_part=5)
@@ -21,7 +21,7 @@ PART = IcubPart(body_part=3, link=4, skin_part=5)
 def found(value: dict[int, float], unit: str = "counts") -> ContactSet:
     values = np.zeros(100)
     values[list(value)] = list(value.values())
-    contacts = Contacts(100, neighbours(PLACES), PLACES, unit=unit)
+    contacts = Contacts(100, neighbours(PLACES), PLACES, unit=unit, tracking=AT_ONCE)
     return contacts.update(values, values > 0, 1)
 
 

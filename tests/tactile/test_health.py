@@ -83,7 +83,7 @@ def faulty() -> tuple[npt.NDArray[np.int64], HealthReport]:
     taxels = chosen(1)
     dead, weak, noisy, stuck, clipped = taxels.T
     world.dead(dead)
-    world.gain[weak] = 0.15
+    world.gain[weak] = 0.16
     world.noisy(noisy, 6)
     for plate, taxel in enumerate(stuck.tolist()):
         world.stuck([taxel], 10 + 10 * plate)

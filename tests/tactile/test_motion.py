@@ -13,7 +13,7 @@ from skinware.tactile.motion import MotionSet, motion_of
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import Response, World, grid
-from tests.tactile.skins import PITCH_M, placed
+from tests.tactile.skins import AT_ONCE, PITCH_M, placed
 
 SIDE = 20
 SURFACE = grid(1, SIDE, SIDE, pitch_m=PITCH_M)
@@ -74,7 +74,7 @@ def test_who_rests_has_no_direction() -> None:
 
 
 def test_without_places_there_is_no_motion() -> None:
-    contacts = Contacts(4, None, None, module=np.zeros(4, int))
+    contacts = Contacts(4, None, None, module=np.zeros(4, int), tracking=AT_ONCE)
     value = np.array([0.0, 3, 4, np.nan])
     found = motion_of({"all": slice(0, 4)}, contacts.update(value, value > 0, 0), value)
     assert (found[0].load, found[0].contacts, found[0].frame) == (7, 1, "")

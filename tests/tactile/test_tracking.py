@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.tracking import ContactKind
-from tests.tactile.skins import PITCH_M, placed, pressed, triangles
+from tests.tactile.skins import AT_ONCE, PITCH_M, placed, pressed, triangles
 
 FLAT = triangles(30, 40)
 NEIGHBOURS = neighbours(placed(FLAT))
@@ -26,7 +26,7 @@ class Scene:
 
     def __init__(self, rate_hz: float = 50.0, *, without_places: bool = False) -> None:
         geometry = None if without_places else placed(FLAT)
-        self.contacts = Contacts(len(FLAT), NEIGHBOURS, geometry)
+        self.contacts = Contacts(len(FLAT), NEIGHBOURS, geometry, tracking=AT_ONCE)
         self.period_ns = round(1e9 / rate_hz)
         self.time_ns = 1_000_000_000
 

@@ -17,9 +17,10 @@ import numpy.typing as npt
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.fields import Bits, Byte, Identifier, Match, SequenceNumber
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values
-from skinware_drivers.link import Link, Match
+from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 

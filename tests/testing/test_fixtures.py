@@ -16,7 +16,8 @@ from skinware import PatchState, Status
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.fields import Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.delimited import COBS, Delimited

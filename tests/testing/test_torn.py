@@ -13,7 +13,8 @@ import pytest
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import assemble
-from skinware_drivers.layout import Cycle, Identifier, Layout, SequenceNumber
+from skinware_drivers.fields import Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Layout
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.torn_tests import BURSTS, Bursts, record, try_troubles
 from tests.testing.fingertips import Fingertips

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from skinware.errors import BadRecording
 from skinware.memory import file_layout
 from skinware.memory.ring import Sample
-from skinware.transfer.codec import HEADER, CodedColumn, Encoder, Run, runs
+from skinware.transfer.codec import HEADER, CodedColumn, FrameEncoder, Run, runs
 
 DTYPES = ["u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<u8", "<i8", "<f8", "S7", "V13"]
 
@@ -69,7 +69,7 @@ def test_every_bit_comes_back(columns: list[tuple[str, int]], count: int, step: 
     generator = np.random.default_rng(seed)
     by_column = [changing(generator, np.dtype(code), n, count, step) for code, n in columns]
     frames = [source.frame(number + 1, list(contents)) for number, contents in enumerate(zip(*by_column, strict=True))]
-    encoder, messages = Encoder(source.coded), []
+    encoder, messages = FrameEncoder(source.coded), []
     for number, frame in enumerate(frames):
         if number in keys:
             encoder.next_is_key()
@@ -87,7 +87,7 @@ def some_messages() -> tuple[Source, list[bytes]]:
     source = Source([("<u2", 3000), ("u1", 3000), ("<i8", 200), ("<f4", 5)])
     generator = np.random.default_rng(3)
     by_column = [changing(generator, column.dtype, column.count, 5, 9) for column in source.layout.slot]
-    encoder = Encoder(source.coded)
+    encoder = FrameEncoder(source.coded)
     return source, [encoder.encode(source.frame(n + 1, list(c))) for n, c in enumerate(zip(*by_column, strict=True))]
 
 
@@ -95,7 +95,7 @@ def test_noise_of_a_few_counts_takes_few_bits() -> None:
     source = Source([("<u2", 30_000)])
     generator = np.random.default_rng(1)
     level = generator.integers(0, 60_000, 30_000)
-    encoder = Encoder(source.coded)
+    encoder = FrameEncoder(source.coded)
     sizes = []
     for number in range(3):
         values = (level + np.round(generator.normal(0, 2, 30_000))).astype("<u2")
@@ -108,7 +108,7 @@ def test_noise_of_a_few_counts_takes_few_bits() -> None:
 
 def test_a_frame_without_the_one_before_it_is_left_out() -> None:
     source, messages = some_messages()
-    other = Encoder(source.coded)
+    other = FrameEncoder(source.coded)
     key = other.encode(source.frame(9, [bytes(column.count * column.dtype.itemsize) for column in source.layout.slot]))
     torn = [messages[1], b"short", messages[0], messages[1], messages[3], messages[4], key]
     assert list(runs(torn)) == [(7, slice(2, 4)), (7, slice(6, 7))]

@@ -15,7 +15,7 @@ import pytest
 from skinware import Namespace
 from skinware.views.access import Access
 from skinware.views.following import Follower
-from skinware.views.recording import Recording
+from skinware.views.recording import RecordingProgram
 from skinware.views.robot import Robot
 from skinware.views.server import ViewServer, show
 from skinware_drivers.testing.waiting import wait_until
@@ -53,7 +53,7 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
 
         async def run() -> None:
             stop = asyncio.Event()
-            recording = Recording(program, namespace.name, names, page_folder)
+            recording = RecordingProgram(program, namespace.name, names, page_folder)
             server = ViewServer(follower, Access("127.0.0.1", token), recording, page_folder)
             loop = asyncio.get_running_loop()
             await show(server, "127.0.0.1", 0, lambda port: found.append((port, loop, stop)), stop)

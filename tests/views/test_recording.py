@@ -37,7 +37,7 @@ def test_it_is_begun_and_ended_by_any_viewer(serving: Serve, page_folder: Path) 
         with page_of(url) as other:
             told = pull_state(other, "recording")
             assert isinstance(told, dict)
-            assert told["lost"] == 0
+            assert told["missed"] == 0
             assert told["s"] > 0
             other.say("record", action="stop")
             other.pull_until(lambda _: pull_state(other, "recording") is None)

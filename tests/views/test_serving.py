@@ -286,7 +286,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         page.state = {}
         page.pull_until(lambda _: page.state)
         (driver,) = page.state["drivers"]
-        assert (driver["state"], driver["sensors"], driver["lost"], driver["load"]) == ("live", 96, 2, 0.25)
+        assert (driver["state"], driver["sensors"], driver["dropped"], driver["load"]) == ("live", 96, 2, 0.25)
         assert [bus["name"] for bus in driver["buses"]] == ["can0", "can1"]
         assert [patch["bus"] for patch in driver["patches"]] == ["can0", "can0", "can1", "can1"]
         assert driver["patches"][3]["state"] == "stale"
@@ -297,7 +297,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         assert "1 of 96 sensors never seen" in texts
         stale = next(problem for problem in page.state["problems"] if problem["text"].startswith("board 10 is stale"))
         assert (stale["bus"], stale["patch"]) == ("can1", "board 10")
-        lost = next(problem for problem in page.state["problems"] if "frames lost" in problem["text"])
+        lost = next(problem for problem in page.state["problems"] if "frames dropped" in problem["text"])
         assert set(lost) == {"severity", "driver", "text"}  # of none alone
         assert (page.state["recording"], page.state["replay"]) == (None, None)
         assert json.dumps(page.state)

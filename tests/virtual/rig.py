@@ -6,7 +6,7 @@ from typing import Any
 
 from skinware_drivers.virtual.events import Event, EventName
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import WireSource
 
@@ -23,7 +23,7 @@ class Rig:
     def __init__(self, *, source: WireSource | None = None, **options: Any) -> None:
         self.log: list[Event] = []
         options.setdefault("boards", (7,))
-        self.hardware = EmulatedRoboskin(RoboskinOptions(**options), log=self.log, source=source)
+        self.hardware = EmulatedRoboskin(EmulatedRoboskinOptions(**options), log=self.log, source=source)
         self.now_ns = START_NS
         self.hardware.skip(START_NS)
 

@@ -22,7 +22,7 @@ from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.cli.emulate import command
 from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch, wait_readable
 from skinware_drivers.options import describe_options
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS, START_NS
@@ -107,7 +107,7 @@ class Run:
     def __init__(self, **options: Any) -> None:
         self.bus = HostBus()
         self.script = Script(self.bus)
-        self.options = RoboskinOptions(**{"boards": (7,), **options})
+        self.options = EmulatedRoboskinOptions(**{"boards": (7,), **options})
         self.hardware = EmulatedRoboskin(self.options)
         self.output = io.StringIO()
 
@@ -319,7 +319,7 @@ def host_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[HostBus]]:
 def test_help_shows_every_option_of_the_emulator(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(command, ["--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    for option in describe_options(RoboskinOptions):
+    for option in describe_options(EmulatedRoboskinOptions):
         assert f"--{option.name.replace('_', '-')}" in text
     assert "CAN addresses of the boards, 1-14. [default: 7,8,9,10]" in text
 

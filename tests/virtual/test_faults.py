@@ -11,7 +11,7 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.events import Event, JsonLinesLog, damaged_cycles
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS, START_NS, Rig, cycles, is_data
@@ -329,7 +329,7 @@ def test_broken_taxels_are_logged_and_stay_broken_over_calibrations() -> None:
 def test_events_as_json_lines(tmp_path: Path) -> None:
     path = tmp_path / "faults.jsonl"
     log = JsonLinesLog(path)
-    hardware = EmulatedRoboskin(RoboskinOptions(boards=(7,), streaming=True, lose=0.05), log=log)
+    hardware = EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,), streaming=True, lose=0.05), log=log)
     hardware.skip(START_NS)
     hardware.emit(START_NS + 1000 * MS)
     lines = [msgspec.json.decode(line) for line in path.read_bytes().splitlines()]

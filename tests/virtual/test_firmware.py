@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware_drivers.virtual.roboskin.firmware import Arithmetic, ArrayI, Sample
+from skinware_drivers.virtual.roboskin.firmware import Arithmetic, ArrayI, FirmwareSample
 
 BASE = 0x9000
 
 
 def sample(
     differences: dict[int, int], *, skin_type: int = 2, no_load: int = 240, shift: int = 2, mtb3: bool = False
-) -> Sample:
+) -> FirmwareSample:
     """Triangle 0 with some channels off their baseline."""
     baseline = np.full((16, 12), BASE, np.int64)
     raw = baseline.copy()

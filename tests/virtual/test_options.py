@@ -10,7 +10,7 @@ import pytest
 import skinware_drivers
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options, nearest_name, option_text, options_from_strings
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 
@@ -101,10 +101,10 @@ def test_descriptions() -> None:
 
 
 def test_every_default_of_the_emulator_can_be_written_as_text() -> None:
-    assert EmulatedRoboskin.Options is RoboskinOptions
-    texts = {option.name: option.default for option in describe_options(RoboskinOptions) if option.default}
-    assert options_from_strings(RoboskinOptions, texts) == RoboskinOptions()
-    assert all(option.description for option in describe_options(RoboskinOptions))
+    assert EmulatedRoboskin.Options is EmulatedRoboskinOptions
+    texts = {option.name: option.default for option in describe_options(EmulatedRoboskinOptions) if option.default}
+    assert options_from_strings(EmulatedRoboskinOptions, texts) == EmulatedRoboskinOptions()
+    assert all(option.description for option in describe_options(EmulatedRoboskinOptions))
 
 
 class Lossy(skinware_drivers.Options, frozen=True):
@@ -151,7 +151,7 @@ def test_nearest_name_without_any() -> None:
 )
 def test_bad_options_of_the_emulator(options: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        RoboskinOptions(**options)  # type: ignore[arg-type]
+        EmulatedRoboskinOptions(**options)  # type: ignore[arg-type]
 
 
 def test_hexadecimal_numbers() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from skinware_drivers.virtual import on_a_grid
-from skinware_drivers.virtual.emulator import Press
+from skinware_drivers.virtual.emulator import WanderingPress
 
 
 def test_a_device_is_touched_and_then_rests_for_longer_than_a_baseline_takes() -> None:
-    press = Press(0, 1, on_a_grid(16, 4))
+    press = WanderingPress(0, 1, on_a_grid(16, 4))
     times_s = np.arange(0, 65, 0.1)
     is_touched = np.array([press.strength(time_s).max() > 0 for time_s in times_s])
     ends_s = times_s[1:][np.diff(is_touched.astype(int)) == -1]

@@ -16,7 +16,7 @@ from skinware_drivers.description import assemble
 from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
 from skinware_drivers.virtual.line import virtual_bus
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 from .rig import START_NS, Rig
 from .test_touch import TACTILE
@@ -233,4 +233,4 @@ def test_every_address_of_a_board_has_its_own_place() -> None:
     geometry = Rig(boards=tuple(range(1, 15))).hardware.geometry()
     position = geometry.position_m[geometry.type_name == "pressure"]
     assert len(np.unique(position.round(6), axis=0)) == 14 * 192
-    assert RoboskinOptions().boards == BOARDS
+    assert EmulatedRoboskinOptions().boards == BOARDS

@@ -14,7 +14,7 @@ from skinware.errors import BusError, BusNotAvailable, BusSendError, Configurati
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS
@@ -34,7 +34,7 @@ class Clock:
 
 
 def boards(**options: object) -> EmulatedRoboskin:
-    return EmulatedRoboskin(RoboskinOptions(**options))  # type: ignore[arg-type]
+    return EmulatedRoboskin(EmulatedRoboskinOptions(**options))  # type: ignore[arg-type]
 
 
 MakeBus = Callable[..., VirtualCanBus]
@@ -108,7 +108,7 @@ def test_a_full_batch_leaves_the_rest_and_the_bus_stays_readable(make_bus: MakeB
             break
         small.clear()
     assert got == frames_of(whole)
-    assert bus.counters.lost == 0
+    assert bus.counters.dropped == 0
     assert bus.receive(small, 0) == 0
 
 
@@ -139,7 +139,7 @@ def test_who_never_catches_up_loses_frames_and_memory_stays_bounded(make_bus: Ma
         bus.receive(batch, 0)
         batch.clear()
         assert len(bus._pending) <= 2 * 21 * 32
-    assert bus.counters.lost == bus.hardware.totals()["unheard"] > 10_000
+    assert bus.counters.dropped == bus.hardware.totals()["unheard"] > 10_000
 
 
 def test_a_batch_that_is_full_by_chance_does_not_hide_what_comes_later(make_bus: MakeBus, clock: Clock) -> None:
@@ -237,13 +237,13 @@ def test_what_nobody_fetches_for_a_second_is_lost_and_counted(make_bus: MakeBus,
     batch = FrameBatch(10_000)
     count = bus.receive(batch, 0)
     totals = bus.hardware.totals()
-    assert bus.counters.lost == totals["unheard"]
-    assert bus.counters.lost + count == totals["bursts"] * 32 == 200 * 32
+    assert bus.counters.dropped == totals["unheard"]
+    assert bus.counters.dropped + count == totals["bursts"] * 32 == 200 * 32
     assert batch.time_ns[0] >= clock.now_ns - 1000 * MS
     clock.pass_ms(900)
-    lost = bus.counters.lost
+    lost = bus.counters.dropped
     bus.receive(batch, 0)
-    assert bus.counters.lost == lost
+    assert bus.counters.dropped == lost
 
 
 # Opening and closing
@@ -290,7 +290,7 @@ def test_boards_live_on_while_the_bus_is_closed(make_bus: MakeBus, clock: Clock)
     frames = frames_of(batch)
     assert min(frame.time_ns for frame in frames) > clock.now_ns - 100 * MS
     assert {frame.payload[1] for frame in frames} <= {10, 11, 12, 13}
-    assert bus.counters.lost == 0
+    assert bus.counters.dropped == 0
     assert bus.counters.frames > len(frames)
 
 

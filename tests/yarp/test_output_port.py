@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skinware.yarp.carriers import Carrier, VectorMessage, Word, framed, packed, unpacked
+from skinware.yarp.carriers import Carrier, VectorMessage, YarpWord, framed, packed, unpacked
 from skinware.yarp.names import NameServer
 from skinware.yarp.port import _ADMINISTRATION, _WHICH_YARP, OutputPort
 from skinware_drivers.testing.waiting import wait_until
@@ -276,11 +276,11 @@ def test_one_who_asks_in_binary_can_have_us_call(yarp: Robot, there: There) -> N
         with called(there, Carrier.FAST_TCP.greeting("anon_rpc")) as connection:
             assert hear(connection, b"RP")
             add = ["add", "fast_tcp://gui:i"]
-            connection.sendall(question("a", packed([Word(add[0]), add[1]]).hex()))
+            connection.sendall(question("a", packed([YarpWord(add[0]), add[1]]).hex()))
             told = packed([0, "Added connection from /skinware/hand to /gui:i"])
             assert hear(connection, told[-8:]) == told
             wait_until(lambda: len(there.port.receivers) == 1)
-            connection.sendall(question("a", packed([Word("list"), Word("out"), "/gui:i"]).hex()))
+            connection.sendall(question("a", packed([YarpWord("list"), YarpWord("out"), "/gui:i"]).hex()))
             listed = packed(["push", 1])
             assert unpacked(hear(connection, listed)) == [
                 ["from", OURS],

@@ -37,7 +37,7 @@ def read_all(pipe: Connection, namespace: str) -> None:
         pipe.send("ready")
         answer(pipe, PATIENCE_S)
         reader.read()
-        lost = reader.lost
+        lost = reader.missed
         frames = reader.in_order(timeout_s=0.5)
         while not pipe.poll():
             try:
@@ -50,7 +50,7 @@ def read_all(pipe: Connection, namespace: str) -> None:
                 frames = reader.in_order(timeout_s=0.5)
                 continue
             ages.append(now_ns() - frame.acquired_ns)
-        pipe.send((len(ages), reader.lost - lost, ages))
+        pipe.send((len(ages), reader.missed - lost, ages))
 
 
 def told(what: str, result: tuple[int, int, list[int]], seconds: float, beside: float | None = None) -> None:

@@ -280,11 +280,11 @@ class Witness:
         if number < seen.number:
             seen.wrong.append(f"frame {number} after {seen.number}")
         self._taken += number != seen.number
-        if self._reader.lost + self._taken != number - self._first + 1:
+        if self._reader.missed + self._taken != number - self._first + 1:
             seen.wrong.append(
-                f"lost {self._reader.lost} and took {self._taken} of {number - self._first + 1} frames up to {number}"
+                f"lost {self._reader.missed} and took {self._taken} of {number - self._first + 1} frames up to {number}"
             )
-            self._first += number - self._first + 1 - self._reader.lost - self._taken  # tell each mistake once
+            self._first += number - self._first + 1 - self._reader.missed - self._taken  # tell each mistake once
         seen.number, seen.newest_ns = number, frame.acquired_ns
 
 

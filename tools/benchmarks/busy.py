@@ -54,7 +54,7 @@ def read(pipe: Connection, namespace: Namespace, way: str) -> None:
             if frame.flags == _OVER:
                 break
             ages_ns.append(now_ns() - frame.acquired_ns)
-        pipe.send((len(ages_ns), reader.lost, ages_ns))
+        pipe.send((len(ages_ns), reader.missed, ages_ns))
 
 
 def _compute() -> None:

@@ -129,7 +129,7 @@ def driver(n_buses: int, n_boards: int, latency_ms: float, measured: Measured) -
     with asyncio.Runner(loop_factory=FlowLoop) as loop:
         loop.run(run())
     counters: list[BusCounters] = [bus.counters for bus in buses]
-    measured.report([c.frames for c in counters], sum(c.lost for c in counters))
+    measured.report([c.frames for c in counters], sum(c.dropped for c in counters))
 
 
 def one_by_one(kind: str, measured: Measured) -> None:

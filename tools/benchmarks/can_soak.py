@@ -113,7 +113,7 @@ def look(reader: DriverReader, process: subprocess.Popen[bytes], traffic: Traffi
     memory_kib = next(int(line.split()[1]) for line in status if line.startswith("VmRSS:"))
     files = len(os.listdir(f"/proc/{process.pid}/fd"))
     overflows = shown[0]["stats64"]["rx"]["over_errors"]
-    received, dropped, told = counters["frames"], counters["lost"], counters["overflows"]
+    received, dropped, told = counters["frames"], counters["dropped"], counters["overflows"]
     return Seen(traffic.sent, received, dropped, overflows, told, memory_kib, files)
 
 

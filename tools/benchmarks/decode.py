@@ -130,7 +130,7 @@ class Native(Numpy):
         if not self.bus.hand_over(self.batch, source):
             raise SystemExit("decode: the socket is not read natively")
         self.flow.rest_until_ns = 0
-        self.path.leave_soon()
+        self.path._words.must_leave = True
         self.path.run(self.flow)
         return int(source.frames)
 

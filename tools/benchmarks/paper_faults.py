@@ -169,7 +169,7 @@ def _follow(pipe: Connection, namespace: Namespace, name: str) -> None:
         for _ in reader.frames(timeout_s=30):
             if pipe.poll():
                 pipe.recv()
-                pipe.send(reader.lost)
+                pipe.send(reader.missed)
                 return
 
 

@@ -210,7 +210,7 @@ def _use(
         use_fifo(_READER_PRIORITY if fifo else None)
         frames = reader.frames(rate_hz if mode == "periodic" else None, timeout_s=10)
         found = _attend(((frame,) for frame in frames), *window)
-        found.lost = reader.lost if mode == "asap" else 0  # a periodic reader means to leave some out
+        found.lost = reader.missed if mode == "asap" else 0  # a periodic reader means to leave some out
         return found
 
     if mode == "skin":

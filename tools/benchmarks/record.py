@@ -221,7 +221,7 @@ def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path, *o
             kb = told["bytes"] / frames / 1e3
             print(
                 f"  {sensors:6} sensors, {pattern:<8}  {100 * share:5.1f} % of a core  {kb:6.2f} kB a frame"
-                f"  {frames} frames, {told['lost']} lost  (file grew from {size / 1e6:.1f} MB)",
+                f"  {frames} frames, {told['missed']} lost  (file grew from {size / 1e6:.1f} MB)",
                 flush=True,
             )
             read(file)
@@ -303,7 +303,7 @@ def losses(minutes: float, n_busy: int, slots: int | None, skins: list[int], pat
                     process.send_signal(signal.SIGINT)
                     assert process.stdout is not None
                     stopped = json.loads(process.stdout.read().splitlines()[-1])
-            lost = stopped["lost"]
+            lost = stopped["missed"]
             frames = stopped["messages"]["/skin/large/frame"] + lost
             print(
                 f"  {sensors:6} sensors, {pattern:<8}  {minutes:g} min beside {n_busy} busy programs, load"

@@ -26,7 +26,7 @@ from record import LARGE, RATE_HZ, SMALL, driving
 from skinware import DriverReader
 from skinware.conversion.showing import Showing
 from skinware.realtime import now_ns
-from skinware.ros2 import types
+from skinware.ros2 import messages
 from skinware.ros2.transport import MessageType, NodeIdentity, Qos
 
 PATIENCE_S = 30.0
@@ -100,9 +100,9 @@ def measure(sensors: int, seconds: float) -> None:
     print(f"  {sensors} sensors at {RATE_HZ} Hz, {seconds:g} s, load {os.getloadavg()[0]:.1f}")
     wanted: dict[str, list[tuple[str, MessageType]]] = {
         "nobody listens": [],
-        "points, 20 Hz": [(POINTS, types.POINTS)],
-        "every frame": [(FRAME, types.SKIN_FRAME)],
-        "both": [(POINTS, types.POINTS), (FRAME, types.SKIN_FRAME)],
+        "points, 20 Hz": [(POINTS, messages.POINTS)],
+        "every frame": [(FRAME, messages.SKIN_FRAME)],
+        "both": [(POINTS, messages.POINTS), (FRAME, messages.SKIN_FRAME)],
     }
     for what, topics in wanted.items():
         domain = alone()
@@ -126,7 +126,7 @@ def measure(sensors: int, seconds: float) -> None:
                 ages = answer(pipe, PATIENCE_S)
             events = bridge.end()
         told = next(event for event in reversed(events) if event["event"] == "status")["drivers"]["large"]
-        print(f"    {what:<15} {100 * share:5.1f} % of a core, {told['lost']} lost, {told['left_out']} left out")
+        print(f"    {what:<15} {100 * share:5.1f} % of a core, {told['missed']} lost, {told['left_out']} left out")
         for topic, of_topic in ages.items():
             p50, p99 = (float(np.percentile(of_topic, at)) / 1e6 for at in (50, 99)) if of_topic else (np.nan, np.nan)
             rate = len(of_topic) / seconds
@@ -147,9 +147,9 @@ def ways(sensors: int, writes: int = 20) -> None:
         made_s = _median_s(lambda: list(showing.pictures(frame, 0, wanted=POINTS.__eq__)), writes)
         (cloud,) = showing.pictures(frame, 0, wanted=POINTS.__eq__)
         processes = stack.enter_context(Processes())
-        pipe = processes.start(subscribe, domain, [(POINTS, types.POINTS)])
+        pipe = processes.start(subscribe, domain, [(POINTS, messages.POINTS)])
         node = dds.DdsNode(NodeIdentity("bench", domain=domain))
-        publisher = node.publisher(POINTS, types.POINTS, Qos())
+        publisher = node.publisher(POINTS, messages.POINTS, Qos())
         while not pipe.poll(0.05):
             publisher.publish(cloud.data)
         answer(pipe, PATIENCE_S)

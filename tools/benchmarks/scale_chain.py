@@ -134,7 +134,7 @@ def _recording(namespace: Namespace, seconds: float) -> Iterator[Figure]:
         told = json.loads(done.stdout.splitlines()[-1])
         frames = told["messages"][f"/skin/{SERVICE}/frame"]
         yield Figure("recorded", frames / seconds, "frames/s")
-        yield Figure("lost by the recorder", told["lost"], "frames")
+        yield Figure("lost by the recorder", told["missed"], "frames")
         yield Figure("a recorded frame", told["bytes"] / frames / 1e3, "kB")
         begin_s = time.perf_counter()
         with skinware.recording.open(file) as recording:

@@ -36,7 +36,8 @@ from skinware import Namespace
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch, wire_dtype
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Bits, Frame, Layout, Values
+from skinware_drivers.fields import Bits
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner

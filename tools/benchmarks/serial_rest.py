@@ -120,7 +120,7 @@ def main() -> None:
     print("ready", flush=True)
     with asyncio.Runner(loop_factory=FlowLoop) as loop:
         loop.run(drive(bus, latency_ms, measured))
-    measured.report([bus.counters.frames], bus.counters.lost)
+    measured.report([bus.counters.frames], bus.counters.dropped)
 
 
 if __name__ == "__main__":

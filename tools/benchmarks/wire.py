@@ -84,7 +84,7 @@ def _measure(kind: type[EndOfCable], rate_hz: float, turns: int, duration_s: flo
                 before = bus.counters.frames
                 loads["recorded"].append(_load(driver, duration_s))
                 frames = bus.counters.frames - before
-                lost += bus.tap.lost
+                lost += bus.tap.missed
                 recorder.send_signal(signal.SIGINT)
             size += file.stat().st_size
     cable.close()

@@ -22,7 +22,7 @@ from skinware.conversion import ros_messages
 from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.geometry import Geometry
-from skinware.ros2 import messages, types
+from skinware.ros2 import messages
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 from skinware.sensor_types import PRESSURE
 
@@ -116,9 +116,9 @@ def made(modules: int, count: int) -> list[tuple[str, MessageType, Qos, list[byt
                 topics[picture.topic].append(picture.data)
         sensors = ros_messages.sensors(of, sensor_names(of), frame.generation, time.time_ns())
     return [
-        *((topic, types.OF_SCHEMAS[showing.topics[topic].name], Qos(), sent) for topic, sent in topics.items()),
-        (f"/skin/{name}/frame", types.SKIN_FRAME, Qos(), frames),
-        (f"/skin/{name}/sensors", types.SENSORS, Qos(depth=1, latched=True), [sensors]),
+        *((topic, messages.OF_SCHEMAS[showing.topics[topic].name], Qos(), sent) for topic, sent in topics.items()),
+        (f"/skin/{name}/frame", messages.SKIN_FRAME, Qos(), frames),
+        (f"/skin/{name}/sensors", messages.SENSORS, Qos(depth=1, latched=True), [sensors]),
     ]
 
 
@@ -130,8 +130,8 @@ def check_service(peer: Peer, node: DdsNode) -> tuple[list[str], bool]:
         asked.append(request)
         return messages.trigger_response(True, "done")
 
-    node.service(SERVICE, types.TRIGGER, answer)
-    request, reply = types.TRIGGER.request, types.TRIGGER.response
+    node.service(SERVICE, messages.TRIGGER, answer)
+    request, reply = messages.TRIGGER.request, messages.TRIGGER.response
     ask, told = f"rq{SERVICE}Request", f"rr{SERVICE}Reply"
     peer.listen(told, reply)
     wait_for(lambda: told in peer.data and ask in peer.readers)

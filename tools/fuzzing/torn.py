@@ -31,7 +31,8 @@ from skinware import Namespace
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+from skinware_drivers.fields import Identifier, SequenceNumber
+from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Bursts, FrameLog, find_torn, record

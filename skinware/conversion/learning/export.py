@@ -29,7 +29,7 @@ from skinware.conversion.learning.joined import Joined
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
 from skinware.conversion.learning.wanted import Interval, LearningSet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import RecordedSource, Source, Table, sensor_table
+from skinware.conversion.tables import RecordedSource, Table, TableSource, sensor_table
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -73,7 +73,7 @@ def convert_to_learning_set(
     target = new_target(paths[0], target, LEARNING_FORMATS["lerobot"])
     joined = [Joined(join) for join in wanted.joins]
 
-    def open_one(path: Path) -> Source:
+    def open_one(path: Path) -> TableSource:
         whole = RecordedSource(path, start_s, end_s)
         try:
             return Watched((selection or Selection()).of(whole), is_stopped)
@@ -97,11 +97,11 @@ def convert_to_learning_set(
 class _Recordings:
     """Recordings, of which one is open at a time: what a large skin is made of takes 20 MB in each."""
 
-    def __init__(self, paths: Sequence[Path], open_one: Callable[[Path], Source]) -> None:
+    def __init__(self, paths: Sequence[Path], open_one: Callable[[Path], TableSource]) -> None:
         self.paths, self._open_one = paths, open_one
-        self._opened: tuple[int, Source] | None = None
+        self._opened: tuple[int, TableSource] | None = None
 
-    def source(self, number: int) -> Source:
+    def source(self, number: int) -> TableSource:
         if self._opened is None or self._opened[0] != number:
             self.close()
             self._opened = number, self._open_one(self.paths[number])
@@ -189,7 +189,8 @@ class _Set:
             self._sensors[name] = sensor_table(table)
         self._joined = [JoinedFeature(each) for each in joined]
         self._features: dict[str, Feature] = {}
-        for described in (*(skin.descriptions for skin in self._skins.values()), self._joined_descriptions()):
+        of_joined = {each.name: each.description for each in self._joined}
+        for described in (*(skin.descriptions for skin in self._skins.values()), of_joined):
             for name, feature in described.items():
                 if name in self._features:
                     raise ConfigurationError(f"two features are both {name!r}")
@@ -235,9 +236,6 @@ class _Set:
                 frames = readers[episode.piece.tables[name]].take(numbers)
                 batch |= skin.rows(frames, of_rows.reshape(wanted.shape), episode.times_ns[part])
             yield batch | joined_rows(self._joined, episode.joined, part)
-
-    def _joined_descriptions(self) -> dict[str, Feature]:
-        return {each.name: each.description for each in self._joined}
 
     def _write_beside(self, folder: Path) -> None:
         """Write what LeRobot's format lacks: the places of sensors, and the time of each episode."""

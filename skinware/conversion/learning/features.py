@@ -188,7 +188,7 @@ class JoinedFeature:
 
     def __init__(self, joined: Joined) -> None:
         self._joined, self.name = joined, joined.name
-        if joined.is_of_images:
+        if joined.rows.ndim == 1:
             width, height = _png_size(Path(joined.rows[0]))[1:]
             self.description = Feature(IMAGE, (height, width, 3), ["height", "width", "channels"])
         else:
@@ -297,7 +297,7 @@ class Moments:
         )
 
 
-class Sample:
+class ChosenRows:
     """Evenly chosen rows of those that are added.
 
     Args:
@@ -341,7 +341,7 @@ class Statistics:
     def __init__(
         self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int, per_item: int = 1
     ) -> None:
-        self._sample, self._per_item = Sample(shape, dtype, rows, most_bytes), per_item
+        self._sample, self._per_item = ChosenRows(shape, dtype, rows, most_bytes), per_item
         self._moments: Moments | None = None
 
     def add(self, rows: npt.NDArray[Any], moments: Moments) -> None:

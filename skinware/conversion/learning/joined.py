@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from skinware.conversion._packages import pyarrow
 from skinware.conversion.learning.wanted import Join
-from skinware.conversion.tables import Source
+from skinware.conversion.tables import TableSource
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 
@@ -58,11 +58,7 @@ class Joined:
         if len(backward):
             raise ConfigurationError(f"{self.path}: time goes back after row {backward[0] + 1}")
 
-    @property
-    def is_of_images(self) -> bool:
-        return bool(self.rows.ndim == 1)
-
-    def times_ns(self, source: Source, *, is_only: bool) -> npt.NDArray[np.int64]:
+    def times_ns(self, source: TableSource, *, is_only: bool) -> npt.NDArray[np.int64]:
         """Return the time of each row, (m,) ns since 1970, on the axis of the recording.
 
         Args:
@@ -85,14 +81,14 @@ class Joined:
             since_ns = source.start_ns + np.rint(self._times * NS_PER_S).astype(np.int64)
         return since_ns
 
-    def _ahead_ns(self, source: Source) -> int:
+    def _ahead_ns(self, source: TableSource) -> int:
         """Return the axis of the recording minus CLOCK_MONOTONIC."""
         ahead = [each["log_time_ns"] - each["monotonic_ns"] for each in source.clock if "monotonic_ns" in each]
         if not ahead:
             raise ConfigurationError(f"{source.path}: has no readings of clocks: {self.path} needs time_ns or unix_s")
         return int(ahead[0])
 
-    def _on_axis(self, wall_ns: npt.NDArray[np.int64], source: Source) -> npt.NDArray[np.int64]:
+    def _on_axis(self, wall_ns: npt.NDArray[np.int64], source: TableSource) -> npt.NDArray[np.int64]:
         """Return times of the wall clock on the axis of the recording, (m,)."""
         readings = sorted((each["realtime_ns"], each["log_time_ns"]) for each in source.clock if "realtime_ns" in each)
         if not readings:

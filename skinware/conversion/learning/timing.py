@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from skinware.conversion.learning.joined import Joined, matched
 from skinware.conversion.learning.wanted import Interval, LearningSet
-from skinware.conversion.tables import TIME, Source, Table
+from skinware.conversion.tables import TIME, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -66,7 +66,7 @@ class TimedTable:
 
 
 @dataclass(frozen=True)
-class Piece:
+class Stretch:
     """A time in which all drivers ran, each with one structure.
 
     Attributes:
@@ -94,7 +94,7 @@ class Episode:
     recording: int
     task: str
     times_ns: Times
-    piece: Piece
+    piece: Stretch
     frames: Mapping[str, Times]
     joined: Mapping[str, Times]
 
@@ -119,7 +119,7 @@ class Planner:
     def __init__(
         self,
         number: int,
-        source: Source,
+        source: TableSource,
         wanted: LearningSet,
         joined: Sequence[tuple[Joined, Times]],
         structures: list[Structure],
@@ -162,11 +162,11 @@ class Planner:
 
     # -- pieces ---------------------------------------------------------------------------------------------------
 
-    def _pieces(self) -> Iterator[Piece]:
-        pieces = [Piece(0, 1 << 62, {})]
+    def _pieces(self) -> Iterator[Stretch]:
+        pieces = [Stretch(0, 1 << 62, {})]
         for name, tables in self._drivers.items():
             pieces = [
-                Piece(max(piece.begin_ns, begin_ns), min(piece.end_ns, end_ns), {**piece.tables, name: timed})
+                Stretch(max(piece.begin_ns, begin_ns), min(piece.end_ns, end_ns), {**piece.tables, name: timed})
                 for piece in pieces
                 for timed in tables
                 for begin_ns, end_ns in self._spans(timed)
@@ -181,7 +181,7 @@ class Planner:
             if first + more < end:
                 yield int(timed.times_ns[first + more]), int(timed.times_ns[end - 1])
 
-    def _check_whole(self, pieces: Sequence[Piece], where: str) -> None:
+    def _check_whole(self, pieces: Sequence[Stretch], where: str) -> None:
         """Refuse a change of structure unless several sets are wanted."""
         changed = [piece for before, piece in pairwise(pieces) if piece.structures != before.structures]
         if changed and not self._wanted.each_structure:
@@ -193,7 +193,7 @@ class Planner:
 
     # -- episodes -------------------------------------------------------------------------------------------------
 
-    def _in_interval(self, pieces: Sequence[Piece], interval: Interval, task: str) -> list[Episode]:
+    def _in_interval(self, pieces: Sequence[Stretch], interval: Interval, task: str) -> list[Episode]:
         begin_ns, end_ns = self._moment(interval.start_s), self._moment(interval.end_s) - 1
         inside = [piece for piece in pieces if piece.begin_ns <= end_ns and piece.end_ns >= begin_ns]
         self._check_whole(inside, f"the episode {interval}")
@@ -214,7 +214,7 @@ class Planner:
             )
         return episodes
 
-    def _episode(self, piece: Piece, begin_ns: int, end_ns: int, task: str) -> Episode | None:
+    def _episode(self, piece: Stretch, begin_ns: int, end_ns: int, task: str) -> Episode | None:
         limit_ns = round(self._wanted.limit_s * NS_PER_S)
         for _, times_ns in self._joined:
             begin_ns, end_ns = max(begin_ns, int(times_ns[0])), min(end_ns, int(times_ns[-1]) + limit_ns)

@@ -23,7 +23,7 @@ export class Bar {
       setText(chip.firstChild, driver.name);
       const state = driver.isCut ? "no connection" : badness(figures.state) ? figures.state : null;
       const fresh = figures.fresh === undefined ? null : `${count(figures.fresh)}/${count(figures.sensors)} fresh`;
-      const parts = [state, rate(figures.rate_hz), age(figures.age_ms), fresh, `lost ${count(figures.lost)}`];
+      const parts = [state, rate(figures.rate_hz), age(figures.age_ms), fresh, `dropped ${count(figures.dropped)}`];
       if (figures.load !== undefined && figures.load !== null) parts.push(`load ${percent(figures.load)}`);
       setText(chip.lastChild, parts.filter(Boolean).join(" · "));
     }

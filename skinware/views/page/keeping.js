@@ -16,7 +16,7 @@ export function savePicture(stage, overlay) {
 /** Show on its button how far a recording has come; null: none is made. */
 export function showRecording(button, recording) {
   setPressed(button, Boolean(recording));
-  const lost = recording?.lost ? `, ${recording.lost} lost` : "";
-  setText(button.lastElementChild, recording ? `${clock(recording.s)} · ${bytes(recording.bytes)}${lost}` : "Record");
+  const missed = recording?.missed ? `, ${recording.missed} missed` : "";
+  setText(button.lastElementChild, recording ? `${clock(recording.s)} · ${bytes(recording.bytes)}${missed}` : "Record");
   button.title = recording ? `${recording.file} (r ends it)` : "Record (r)";
 }

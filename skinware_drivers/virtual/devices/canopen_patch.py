@@ -18,9 +18,8 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from skinware_drivers.virtual.emulator_options import Seconds
+from skinware_drivers.virtual.device import Actor, Seconds
 from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.stage import Actor
 
 _HEARTBEAT = "heartbeat"
 _BOOT_UP, _STOPPED, _OPERATIONAL, _PRE_OPERATIONAL = 0, 4, 5, 127

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
+from skinware_drivers.virtual.device import DATA as BURSTS
+from skinware_drivers.virtual.device import Device
 from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.roboskin.converters import Converters, TriangleFaults, TriangleState
 from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 from skinware_drivers.virtual.roboskin.inertial import InertialSensors, Units
 from skinware_drivers.virtual.roboskin.touch import Touch
-from skinware_drivers.virtual.stage import DATA as BURSTS
-from skinware_drivers.virtual.stage import Device
 from skinware_drivers.virtual.wire import Transmission, Transmitter
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _NO_ACKS_TO_RECALIBRATE = 5
 _INERTIAL = "inertial"  # the timer of the inertial sensors
 
 
-class Board(Device):
+class EmulatedBoard(Device):
     """One board.
 
     Defaults: icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp, ``setdefault`` and

@@ -17,10 +17,10 @@ from skinware_drivers.virtual.roboskin.firmware import (
     TRIANGLES,
     Arithmetic,
     ArrayI,
-    Sample,
+    FirmwareSample,
     triangle_payloads,
 )
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD, DEFAULT_SHIFT = 0, 245, 2
@@ -48,7 +48,7 @@ class TriangleFaults:
         version: another number after each :meth:`set_triangle`.
     """
 
-    def __init__(self, options: RoboskinOptions, address: int) -> None:
+    def __init__(self, options: EmulatedRoboskinOptions, address: int) -> None:
         self.disconnected: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
         self.not_acknowledging: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
         self.version: int = 0
@@ -178,7 +178,7 @@ class Converters:
     def _acquisitions(self, times_ns: ArrayI, cycles: ArrayI, values: Mapping[int, Sequence[int]]) -> list[Acquisition]:
         raw = self._read(times_ns, cycles)
         self._faults.break_taxels(raw, self._baseline, self._arithmetic.bottom)
-        sample: Sample = self._arithmetic.sample(raw, self._baseline)
+        sample: FirmwareSample = self._arithmetic.sample(raw, self._baseline)
         for triangle, twelve in values.items():
             sample.values[:, triangle] = twelve
         payloads = triangle_payloads(sample, short_tail=self._short_tail)

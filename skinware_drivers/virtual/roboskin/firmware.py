@@ -39,7 +39,7 @@ _OUT_OF_RANGE_BITS = np.int64(16) << np.arange(CHANNELS)
 
 
 @dataclass(frozen=True)
-class Sample:
+class FirmwareSample:
     """Acquisitions of a board as its firmware sees them.
 
     Attributes:
@@ -71,7 +71,7 @@ class Arithmetic:
     shift: tuple[int, ...]
     mtb3: bool
 
-    def sample(self, raw: ArrayI, baseline: ArrayI) -> Sample:
+    def sample(self, raw: ArrayI, baseline: ArrayI) -> FirmwareSample:
         """Return values and flags of all triangles.
 
         Args:
@@ -80,7 +80,7 @@ class Arithmetic:
         """
         if self.skin_type == RAW_TEST:
             nothing = np.zeros(raw.shape[:2], np.int64)
-            return Sample((raw & 0xFF).astype(np.uint8), nothing, nothing.astype(np.bool_))
+            return FirmwareSample((raw & 0xFF).astype(np.uint8), nothing, nothing.astype(np.bool_))
         value = self._int(raw - baseline - self._drift(raw, baseline))
         values = self.no_load - (value >> self._shifts)
         values[value >= self.bottom] = 0
@@ -91,7 +91,7 @@ class Arithmetic:
         diagnostics = out_of_range @ _OUT_OF_RANGE_BITS
         diagnostics |= no_ack
         diagnostics |= not_connected.all(axis=2) * np.int64(2)
-        return Sample(values.astype(np.uint8), diagnostics, no_ack)
+        return FirmwareSample(values.astype(np.uint8), diagnostics, no_ack)
 
     @cached_property
     def bottom(self) -> ArrayI:
@@ -143,7 +143,7 @@ class Arithmetic:
         return (number + 0x8000 & 0xFFFF) - 0x8000 if self.mtb3 else number
 
 
-def triangle_payloads(sample: Sample, *, short_tail: bool) -> list[list[bytes]]:
+def triangle_payloads(sample: FirmwareSample, *, short_tail: bool) -> list[list[bytes]]:
     """Return HEAD, TAIL, HEAD ... of all 16 triangles, for each acquisition.
 
     HEAD is 0x40 and taxels 0-6; TAIL is 0xC0, taxels 7-11 and the diagnostics, high byte first.

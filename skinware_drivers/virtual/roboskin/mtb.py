@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
+from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, Board
+from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
 from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, MTB4_UNITS, Units
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET
-from skinware_drivers.virtual.stage import DATA as BURSTS
 
 _MTB3_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}
 _MTB4_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x33: 8, 0x35: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}
@@ -31,7 +31,7 @@ _OWN_TIMER = 3
 _TIMER_TICK_NS = 3200
 
 
-class Mtb3(Board):
+class Mtb3(EmulatedBoard):
     """A board that hears broadcasts only in the bootloader's class, and is silenced by such a command.
 
     It sends the old class 3 until one of the newer commands 0x4D, 0x50 and 0x07 00 comes. Command 0x50 does not stop
@@ -143,7 +143,7 @@ class Mtb3(Board):
         return False
 
 
-class Mtb4(Board):
+class Mtb4(EmulatedBoard):
     """A board that hears its own address and the broadcast in both classes; command 0x50 stops its stream."""
 
     is_mtb3: ClassVar[bool] = False

@@ -8,13 +8,13 @@ from typing import Annotated
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.emulator_options import Count, EmulatorOptions, Probability, Seconds
+from skinware_drivers.virtual.device import Count, EmulatorOptions, Probability, Seconds
 
 _PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
 _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
 
 
-class RoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The boards, their touch and their faults.
 
     Raises:

@@ -14,16 +14,17 @@ import numpy as np
 
 from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.virtual.device import DATA as BURSTS
+from skinware_drivers.virtual.device import Actor, Device
 from skinware_drivers.virtual.events import Event, FrameDamage, Half
 from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
-from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, Board
+from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import TriangleState
 from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import PressedSkin, WireSource, cycle_pattern
-from skinware_drivers.virtual.stage import DATA as BURSTS
-from skinware_drivers.virtual.stage import Actor, Device, Stage
+from skinware_drivers.virtual.stage import Stage
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))
 """Set-up by a host: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""
@@ -31,7 +32,7 @@ _WRONG_LENGTHS = (0, 1, 2, 3, 4, 5, 7)
 """Neither 8 nor the 6 of old firmware."""
 
 
-class EmulatedRoboskin(Stage[RoboskinOptions]):
+class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
@@ -50,7 +51,7 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
     frame_faults: ClassVar[Mapping[str, FrameDamage]] = {**Stage.frame_faults, "wrong_length": "wrong_length"}
 
     def __init__(
-        self, options: RoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
+        self, options: EmulatedRoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
     ) -> None:
         super().__init__(options, log=log)
         self.source = cycle_pattern if source is None and options.pattern == "cycle" else source
@@ -110,7 +111,7 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
 
     # The stage's hooks
 
-    def make_device(self, number: int, now_ns: int) -> Board:
+    def make_device(self, number: int, now_ns: int) -> EmulatedBoard:
         kind = Mtb3 if number in self.options.mtb3 else Mtb4
         return kind(number, self, self.wire.attach(), now_ns, self._phases[self.options.boards.index(number)])
 
@@ -190,5 +191,5 @@ class EmulatedRoboskin(Stage[RoboskinOptions]):
         ] + [EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in boards]
 
 
-def _board(device: Device) -> Board:
-    return cast("Board", device)
+def _board(device: Device) -> EmulatedBoard:
+    return cast("EmulatedBoard", device)

@@ -17,7 +17,7 @@ from skinware.realtime import NS_PER_S
 from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, read_stage
 from skinware_drivers.virtual.hardware import Point, Pressing
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
-from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values on the wire, 0-255, instead of felt ones."""
@@ -60,7 +60,7 @@ class PressedSkin:
         version: changes when the touch from now on does, other than with time.
     """
 
-    def __init__(self, options: RoboskinOptions) -> None:
+    def __init__(self, options: EmulatedRoboskinOptions) -> None:
         self.version: int = 0
         self._options = options
         numbers = [address - _FIRST_BOARD for address in options.boards]

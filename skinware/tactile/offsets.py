@@ -1,0 +1,284 @@
+"""Predict what each taxel reads at rest, and how uncertain that is: a Kalman filter per taxel, one common mode a patch.
+
+A value is ``offset + noise + load``. Between two frames the offset of a taxel moves by its gain times the move of the
+common mode of its patch, and by a drift of its own. Offset and gain are estimated together while nothing touches the
+taxel; meanwhile their uncertainty shrinks. While something touches it the offset is predicted, and its uncertainty
+grows by what the gain may be wrong, and by the drift that was measured at rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.tactile.rule import (
+    DRIFT_SIGMA,
+    FEW_TAXELS,
+    GAIN_LASTS_S,
+    GAIN_SPREAD,
+    LEAST_GAIN,
+    MATCH_S,
+    MOST_GAIN,
+    NOISE_S,
+    RATE_S,
+    SLOW_S,
+    TICK_S,
+)
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
+Doubles = npt.NDArray[np.float64]
+
+_MEDIAN = 0.455
+"""Median of the square of a standard normal deviate."""
+_GAIN_PER_S = GAIN_SPREAD**2 / GAIN_LASTS_S
+
+
+class Groups:
+    """Sums n values by group.
+
+    Args:
+        group: (n,) int, the group of each value, 0 or more.
+    """
+
+    def __init__(self, group: Rows) -> None:
+        self.group = group
+        self.n = int(group.max(initial=-1)) + 1
+        sizes = np.bincount(group, minlength=self.n)
+        self._starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.intp)
+        in_order = bool((np.diff(group) >= 0).all()) and bool((sizes > 0).all())
+        self._in_order = in_order and len(group) > 0
+
+    def sum(self, values: npt.NDArray[np.generic]) -> Doubles:
+        """Return (n_groups,) the sums of (n,) values."""
+        if self._in_order:
+            sums: Doubles = np.add.reduceat(values, self._starts, dtype=np.float64)
+        else:
+            sums = np.bincount(self.group, values, self.n).astype(np.float64)
+        return sums
+
+    def median(self, values: Floats, counts: Flags) -> Floats:
+        """Return (n_groups,) the medians of those of (n,) values that count; 0 where none does."""
+        rows = np.flatnonzero(counts)
+        group = self.group[rows]
+        ordered = values[rows][np.lexsort((values[rows], group))]
+        number = np.bincount(group, minlength=self.n)
+        last = np.cumsum(number) - 1
+        first = last - number + 1
+        if not len(ordered):
+            return np.zeros(self.n, np.float32)
+        low, high = (np.maximum(at, 0) for at in (first + (number - 1) // 2, first + number // 2))
+        middle = (ordered[np.minimum(low, len(ordered) - 1)] + ordered[np.minimum(high, len(ordered) - 1)]) / 2
+        return np.where(number > 0, middle, np.float32(0))
+
+    def spread(self, of_group: npt.NDArray[np.generic]) -> Floats:
+        """Return (n,) the value of each one's group."""
+        return of_group.astype(np.float32)[self.group] if self.n > 1 else of_group.astype(np.float32)
+
+
+class CommonMode:
+    """Follows the common mode of each of p patches: one number, of which every taxel shows its gain.
+
+    Its agility, the variance that it gains in a second, is learned: so large that the moves of the mode are as likely
+    as they are frequent. So noise is not followed, slow drift is, and a hum is as it comes.
+
+    Attributes:
+        variance: (p,) of the mode.
+        agility: (p,) variance a second.
+        rate: (p,) average speed, a second.
+        rate2: (p,) its mean square.
+        unknown_s: (p,) for how long too few taxels have been free to say how it moves.
+    """
+
+    def __init__(self, n_patches: int) -> None:
+        self.variance, self.agility, self.rate, self.rate2, self.unknown_s = (np.zeros(n_patches) for _ in range(5))
+        self.known_s = np.zeros(n_patches)
+
+    def step(self, found: Doubles, precision: Doubles, free: Doubles, passed_s: float) -> tuple[Doubles, Doubles]:
+        """Return (p,) by how much the mode moves, and how much of that is sure enough to learn gains from.
+
+        Args:
+            found: (p,) how far the free taxels say that it moved.
+            precision: (p,) one by the variance of that.
+            free: (p,) number of free taxels.
+            passed_s: since the last step.
+        """
+        known = free > FEW_TAXELS
+        ahead = self.rate * (known * passed_s)
+        found = found - ahead
+        trust = np.where(known, 1 - FEW_TAXELS / np.maximum(free, 1), 0)
+        self.variance += self.agility * passed_s
+        unknown = ~known
+        if unknown.any():
+            self.variance[unknown] += self.rate2[unknown] * (2 * self.unknown_s[unknown] + passed_s) * passed_s
+            self.unknown_s[unknown] += passed_s
+        self.unknown_s[known] = 0
+        total = self.variance + 1 / np.maximum(precision, 1e-30)
+        most = DRIFT_SIGMA * np.sqrt(total)
+        share = trust * self.variance / total
+        news = share * np.minimum(np.maximum(found, -most), most)
+        move = ahead + news
+        self.variance *= 1 - share
+        towards = np.sign(found * found - _MEDIAN * total) * known
+        self.agility *= np.exp(min(passed_s / MATCH_S, 1.0) * towards)
+        least = 1e-5 / np.maximum(precision, 1e-30)
+        np.maximum(self.agility, np.where(known, least, 0), out=self.agility)
+        if passed_s > 0:
+            self.known_s += passed_s * known
+            slow = -math.expm1(-passed_s / RATE_S)
+            self.rate += (move / passed_s - self.rate) * (slow * known)
+            self.rate2 += (self.rate**2 - self.rate2) * (known * passed_s / np.clip(self.known_s, RATE_S, 10 * RATE_S))
+        return move, ahead + share * news
+
+
+class Offsets:
+    """Predicts the offsets of n taxels.
+
+    Args:
+        patch: (n,) int, the patch of each taxel: its taxels drift together.
+
+    Attributes:
+        level: (n,) float32, the offset; NaN before it is known.
+        gain: (n,) float32, how strongly each taxel follows the common mode of its patch.
+        variance: (n,) float32, of the offset.
+        cross: (n,) float32, covariance of offset and gain.
+        gain_variance: (n,) float32.
+        noise2: (n,) float32, variance from frame to frame.
+        slow: (n,) float32, the deviation of each at rest, over some seconds.
+        common: the common modes.
+        agility: (n_patches,) variance that the offset of a taxel gains in a second by a drift of its own.
+    """
+
+    def __init__(self, patch: Rows) -> None:
+        n = len(patch)
+        self.level: Floats = np.full(n, np.nan, np.float32)
+        self.gain: Floats = np.ones(n, np.float32)
+        self.variance, self.cross, self.slow = (np.zeros(n, np.float32) for _ in range(3))
+        self.gain_variance: Floats = np.full(n, GAIN_SPREAD**2, np.float32)
+        self.noise2: Floats = np.full(n, np.nan, np.float32)
+        self.patches = Groups(patch)
+        self.common = CommonMode(self.patches.n)
+        self.agility = np.zeros(self.patches.n)
+        self._gain_before: Floats = self.gain.copy()
+        self._tick_s = 0.0
+
+    def total(self) -> Floats:
+        """Return (n,) the variance of a deviation at rest: of noise, offset and common mode."""
+        common = self.patches.spread(self.common.variance)
+        total: Floats = self.noise2 + self.variance + self.gain * self.gain * common
+        return total
+
+    def uncertainty(self) -> Floats:
+        """Return (n,) the standard deviation of the offset."""
+        common = self.patches.spread(self.common.variance)
+        deviation: Floats = np.sqrt(self.variance + self.gain * self.gain * common)
+        return deviation
+
+    def follow_common(self, deviation: Floats, free: Flags, passed_s: float) -> None:
+        """Move the offsets by the common mode, and take that off the deviations.
+
+        Args:
+            deviation: (n,) of the values from the offsets, changed in place; 0 where unknown.
+            free: (n,) which taxels are at rest.
+            passed_s: since the last frame.
+        """
+        if passed_s <= 0:
+            return
+        total = self.total()
+        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance), np.float32(0))
+        limit = np.float32(2) * np.sqrt(total)
+        clipped = np.minimum(np.maximum(deviation, -limit), limit)
+        np.copyto(clipped, 0, where=~free)
+        reach = self.patches.sum(weight * self.gain)
+        precision = reach * reach / np.maximum(self.patches.sum(weight), 1e-30)
+        found = self.patches.sum(clipped * weight) / np.maximum(reach, 1e-30)
+        move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
+        moved = self.patches.spread(move)
+        change = self.gain * moved
+        self.level += change
+        deviation -= change
+        moved = self.patches.spread(sure)
+        doubt = moved * self.gain_variance
+        self.variance += moved * (np.float32(2) * self.cross + doubt)
+        self.cross += doubt
+
+    def learn(self, deviation: Floats, taxels: Flags, calm: Flags, floor: Floats, passed_s: float) -> None:
+        """Correct offsets and gains by the deviations of taxels at rest; let the others become less certain.
+
+        Args:
+            deviation: (n,) of the values from the offsets.
+            taxels: (n,) which are measured.
+            calm: (n,) those of them that are far from a touch: only they say something of gains and noise.
+            floor: least share of a deviation that the offset follows where it drifts by itself.
+            passed_s: since the last frame.
+        """
+        if passed_s <= 0:
+            return
+        self.variance += self.patches.spread(self.agility * passed_s)
+        total = self.variance + self.noise2
+        limit = np.float32(DRIFT_SIGMA) * np.sqrt(total)
+        innovation = np.minimum(np.maximum(deviation, -limit), limit)
+        np.copyto(innovation, 0, where=~taxels)
+        slowly = -math.expm1(-passed_s / SLOW_S)
+        expected = self.noise2 * np.float32(slowly / (2 - slowly)) + self.variance
+        unlike = self.slow * self.slow / expected
+        drifts = unlike > np.float32(DRIFT_SIGMA**2)
+        share = self.variance / total
+        share = np.where(taxels, np.where(drifts, np.maximum(share, floor), share), np.float32(0))
+        of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
+        self.level += share * innovation
+        self.gain += of_gain * innovation
+        self.gain_variance -= of_gain * self.cross
+        keep = np.float32(1) - share
+        self.cross *= keep
+        self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
+        self.slow += (innovation - self.slow) * (np.float32(slowly) * taxels)
+        quick = innovation - self.slow
+        self.noise2 += (quick * quick - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
+        self._tick_s += passed_s
+        if self._tick_s >= TICK_S:
+            self._tick(taxels, passed_s)
+            self._tick_s = 0.0
+
+    def _tick(self, taxels: Flags, passed_s: float) -> None:
+        """Adjust what changes slowly: the agility of own drift, and the typical gain of a patch, which is 1."""
+        number = np.maximum(self.patches.sum(taxels), 1)
+        share = -math.expm1(-passed_s / SLOW_S)
+        expected = np.float32(1.5 * _MEDIAN) * (self.noise2 * np.float32(share / (2 - share)) + self.uncertainty() ** 2)
+        beyond = self.patches.sum(taxels & (self.slow * self.slow > expected)) / number
+        self.agility *= np.exp(self._tick_s / 10 * (2 * beyond - 1))
+        typical = self.patches.sum(np.where(taxels, self.noise2, np.float32(0))) / number
+        np.clip(self.agility, 1e-9 * typical, 1e-1 * typical, out=self.agility)
+        forgets = np.where(taxels, np.float32(-math.expm1(-self._tick_s / GAIN_LASTS_S)), np.float32(0))
+        self.gain += (1 - self.gain) * forgets
+        self.gain_variance += (np.float32(GAIN_SPREAD**2) - self.gain_variance) * (2 * forgets)
+        before, now = (
+            self.patches.sum(np.where(taxels, gain, np.float32(0))) for gain in (self._gain_before, self.gain)
+        )
+        ratio = self.patches.spread(np.where(now > 0, before / np.maximum(now, 1e-9), 1))
+        self.gain *= np.where(taxels, ratio, np.float32(1))  # they and the mode must not float apart
+        np.clip(self.gain, LEAST_GAIN, MOST_GAIN, out=self.gain)
+        self._gain_before = self.gain.copy()
+
+    def begin(self, taxels: Rows, level: Floats, noise2: Floats, gain: Floats, gain_variance: Floats) -> None:
+        """Give k taxels what was measured of them: levels, noise and gains (k,)."""
+        self.level[taxels], self.noise2[taxels] = level, noise2
+        self.gain[taxels], self.gain_variance[taxels] = gain, gain_variance
+        self._gain_before[taxels] = gain
+        self.variance[taxels], self.cross[taxels], self.slow[taxels] = noise2 / 20, 0, 0
+
+    def lose_common(self) -> None:
+        """Forget where the common modes are, after a time without data: the next frames find them again."""
+        noise2 = np.where(np.isfinite(self.noise2), self.noise2, np.float32(0))
+        number = np.maximum(self.patches.sum(noise2 > 0), 1)
+        self.common.variance[:] = self.patches.sum(noise2) / number
+
+    def put(self, taxels: Rows, level: Floats) -> None:
+        """Put the offsets of k taxels at (k,) levels, as certain as one value is."""
+        self.level[taxels] = level
+        self.variance[taxels] = self.noise2[taxels]
+        self.cross[taxels] = 0
+        self.slow[taxels] = 0

@@ -1,0 +1,24 @@
+"""Baselines in the trials that fit into a test; ``tools/bench tactile`` runs all of them, with more seeds and rates."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.tactile.trials import TRIALS, run
+
+SHORT = [trial for trial in TRIALS if trial.until_s <= 450 and not trial.alone]
+
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(400)]
+
+
+def test_short_trials_hold() -> None:
+    """Hums and waves, spikes, losses, covers, small presses, bent responses."""
+    results = run(SHORT, seeds=4, rate_hz=20)
+    missed = {trial.name: result.misses(trial) for trial, result in zip(SHORT, results, strict=True)}
+    assert {name: of for name, of in missed.items() if of} == {}
+
+
+@pytest.mark.parametrize("name", ["binary", "three levels"])
+def test_few_levels_are_enough(name: str) -> None:
+    trial = next(trial for trial in TRIALS if trial.name == name)
+    assert run([trial], seeds=4, rate_hz=20)[0].misses(trial) == {}

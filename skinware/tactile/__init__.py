@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from skinware.tactile.health_service import HealthReader
     from skinware.tactile.motion import MotionSet, motion_of
     from skinware.tactile.motion_service import MotionReader
+    from skinware.tactile.onsets import ContactEvent, EventKind
     from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions
     from skinware.tactile.rule import BaselineSettings
     from skinware.tactile.tracking import ContactKind, TrackingSettings
@@ -40,10 +41,12 @@ __all__ = [
     "Calm",
     "ChainSettings",
     "Contact",
+    "ContactEvent",
     "ContactKind",
     "ContactSet",
     "Contacts",
     "ContactsReader",
+    "EventKind",
     "Health",
     "HealthKind",
     "HealthReader",
@@ -74,6 +77,7 @@ _MODULES = (
     "contacts_service",
     "health_service",
     "motion_service",
+    "onsets",
 )
 """The modules that have these names, those that import little first."""
 

@@ -22,12 +22,20 @@ from skinware.geometry import Geometry
 from skinware.structure import Structure
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
-from skinware.tactile.tracking import Blobs, ContactKind, Tracker, TrackingSettings
+from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
+from skinware.tactile.tracks import TouchedBlobs
 
 MOST = 64
 """Most contacts of one frame; of more, those with the largest loads are kept."""
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
+
+_CLEARLY = 1.5
+"""A contact must have so many times the load of one that is in the list to take its place."""
+_LEAST_SHARE = 0.1
+"""Share of the newest frame in the value of a taxel that is just touched."""
+_LEAST_SEEN, _MOST_CUT = 0.5, 0.6
+"""Least share of a load that must be above the threshold, and largest share of clipped taxels, for an estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +55,11 @@ class Contact:
         frame: name of the coordinate frame, empty if it is not known.
         velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
+        provisional: only its last frames speak for it; the baseline has not confirmed it, and its load is 0.
+        clipped: number of its taxels that are at the end of their range: load and force are too small.
+        load_whole: estimate of the load with what threshold and clipping cut off, taking it for a bell; NaN if most
+            of it is cut off.
+        uncertainty: how much of the load could be noise or drift, in its unit; NaN if it is not known.
         taxels: (n,) int64, positions among the n taxels, ascending.
     """
 
@@ -62,6 +75,10 @@ class Contact:
     frame: str
     velocity_m_s: npt.NDArray[np.float32]
     kind: ContactKind
+    provisional: bool
+    clipped: int
+    load_whole: float
+    uncertainty: float
     taxels: npt.NDArray[np.int64]
 
 
@@ -71,11 +88,12 @@ class ContactSet:
 
     Attributes:
         id: (m,) uint32.
-        age_s, load, peak, area_m2, force_n: (m,) float32.
-        n: (m,) uint32.
+        age_s, load, peak, area_m2, force_n, load_whole, uncertainty: (m,) float32.
+        n, clipped: (m,) uint32.
         cop_m, normal, velocity_m_s: (m, 3) float32.
         frame: (m,) int16, index into ``frames``; -1 if it is not known.
         kind: (m,) uint8, :class:`skinware.tactile.tracking.ContactKind`.
+        provisional: (m,) uint8, 0 or 1.
         contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one without a row.
         beyond: number of contacts without a row.
         frames: names of the coordinate frames.
@@ -93,6 +111,10 @@ class ContactSet:
     frame: npt.NDArray[np.int16]
     velocity_m_s: npt.NDArray[np.float32]
     kind: npt.NDArray[np.uint8]
+    provisional: npt.NDArray[np.uint8]
+    clipped: npt.NDArray[np.uint32]
+    load_whole: npt.NDArray[np.float32]
+    uncertainty: npt.NDArray[np.float32]
     contact_of: npt.NDArray[np.int16]
     beyond: int
     frames: tuple[str, ...]
@@ -106,8 +128,9 @@ class ContactSet:
         return Contact(
             frame=self.frames[frame] if frame >= 0 else "",
             kind=ContactKind(self.kind[row]),
+            provisional=bool(self.provisional[row]),
             taxels=np.flatnonzero(self.contact_of == row),
-            **{name: getattr(self, name)[row].item() for name in ("id", "n", *_SCALARS)},
+            **{name: getattr(self, name)[row].item() for name in ("id", *_COUNTS, *_SCALARS)},
             **{name: getattr(self, name)[row] for name in _VECTORS},
         )
 
@@ -115,15 +138,17 @@ class ContactSet:
         return (self[row] for row in range(len(self)))
 
 
-_SCALARS = ("age_s", "load", "peak", "area_m2", "force_n")
+_SCALARS = ("age_s", "load", "peak", "area_m2", "force_n", "load_whole", "uncertainty")
+_COUNTS = ("n", "clipped")
 _VECTORS = ("cop_m", "normal", "velocity_m_s")
 COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "id": ("<u4", ()),
     **dict.fromkeys(_SCALARS, ("<f4", ())),
-    "n": ("<u4", ()),
+    **dict.fromkeys(_COUNTS, ("<u4", ())),
     **dict.fromkeys(_VECTORS, ("<f4", (3,))),
     "frame": ("<i2", ()),
     "kind": ("u1", ()),
+    "provisional": ("u1", ()),
 }
 """Dtype and shape, per contact, of each array of a :class:`ContactSet`."""
 
@@ -162,6 +187,7 @@ class Contacts:
         self._position_m, self._normal = np.nan_to_num(geometry.position_m), np.nan_to_num(geometry.normal)
         self._area_m2 = area_m2(geometry)
         self._is_pressure = unit == "Pa"
+        self._least = 0.0  # value of a taxel that is just touched; 0: none was seen yet
         known = np.isfinite(geometry.position_m).all(axis=1)
         names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
         self.frames: tuple[str, ...] = tuple(names.tolist())
@@ -198,13 +224,25 @@ class Contacts:
         unit = structure.type(type_name).unit
         return cls(len(module), neighbours, geometry, module=module, unit=unit, tracking=tracking)
 
-    def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
+    def update(
+        self,
+        value: npt.NDArray[Any],
+        touched: npt.NDArray[np.bool_],
+        time_ns: int,
+        *,
+        onset: npt.NDArray[np.bool_] | None = None,
+        clipped: npt.NDArray[np.bool_] | None = None,
+        uncertainty: npt.NDArray[Any] | None = None,
+    ) -> ContactSet:
         """Return the contacts of the next frame.
 
         Args:
             value: (n,) calmed values: 0 = no touch. Values below 0 or not finite count as 0.
             touched: (n,) bool, which taxels are touched.
             time_ns: when the frame was acquired, CLOCK_MONOTONIC ns.
+            onset: (n,) bool, which taxels :class:`.Onsets` finds: contacts of these alone are provisional.
+            clipped: (n,) bool, which values are at the end of their range.
+            uncertainty: (n,) how much of each value could be noise or drift.
 
         Raises:
             ConfigurationError: not of n taxels.
@@ -212,7 +250,7 @@ class Contacts:
         if np.shape(value) != (self._n,) or np.shape(touched) != (self._n,):
             shapes = f"values of {np.shape(value)}, touched of {np.shape(touched)}"
             raise ConfigurationError(f"contacts of {self._n} taxels: {shapes}")
-        taxels = np.flatnonzero(touched)
+        taxels = np.flatnonzero(touched if onset is None else touched | onset)
         contact, count = self._components.of(taxels)
         load = value[taxels].astype(np.float64)
         load = np.where(np.isfinite(load) & (load > 0), load, 0.0)
@@ -220,10 +258,22 @@ class Contacts:
         beyond = max(0, count - MOST)
         if beyond:
             contact_of[taxels] = BEYOND
-            taxels, contact, load = _largest(taxels, contact, load, count)
+            listed = self._tracker.track_of[taxels] >= 0
+            taxels, contact, load = _largest(taxels, contact, load, count, listed)
             count = MOST
         found = self._measure(taxels, contact, load, count)
-        blobs = Blobs(taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"])
+        is_sure, frames = np.ones(count, bool), np.ones(count, np.int64)
+        if onset is not None:
+            is_sure = np.bincount(contact, touched[taxels], count) > 0
+            frames += np.bincount(contact, onset[taxels], count) > 0
+        blobs = TouchedBlobs(
+            taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"], is_sure, frames
+        )
+        cut = np.zeros(count)
+        if clipped is not None:
+            cut += np.bincount(contact, clipped[taxels], count)
+        unsure = np.full(count, np.nan) if uncertainty is None else np.bincount(contact, uncertainty[taxels], count)
+        found |= {"clipped": cut, "uncertainty": unsure, "load_whole": self._whole(found, cut, load)}
         found |= self._tracker.follow(blobs, time_ns)._asdict()
         order = np.lexsort([found["id"], -found["age_s"]])
         order = order[found["id"][order] > 0]
@@ -264,6 +314,23 @@ class Contacts:
             "frame": frame,
         }
 
+    def _whole(
+        self, found: dict[str, npt.NDArray[Any]], cut: npt.NDArray[np.float64], load: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """(count,) the loads of bells of which only what is above the threshold, and below the clipping, was seen."""
+        if len(load) and (load > 0).any():
+            least = float(load[load > 0].min())
+            self._least = least if not self._least else self._least + _LEAST_SHARE * (least - self._least)
+        peak, share = np.maximum(found["peak"], self._least), cut / found["n"]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            seen = 1 - self._least / peak
+            whole = np.where(seen >= _LEAST_SEEN, found["load"] / seen, np.nan)
+            if not cut.any():
+                return whole
+            top = (peak / self._least**share) ** (1 / (1 - share))
+            of_cut = found["n"] * top / np.log(top / self._least)
+        return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)
+
     def _frame_of(
         self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
     ) -> npt.NDArray[np.int64]:
@@ -279,9 +346,15 @@ class Contacts:
 
 
 def _largest(
-    taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
+    taxels: npt.NDArray[np.int64],
+    contact: npt.NDArray[np.int64],
+    load: npt.NDArray[np.float64],
+    count: int,
+    listed: npt.NDArray[np.bool_],
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Those of the largest contacts; one that was listed stays unless another is clearly larger."""
     loads = np.bincount(contact, load, count)
+    loads *= np.where(np.bincount(contact, listed, count) > 0, _CLEARLY, 1.0)
     kept = np.sort(np.argsort(-loads, kind="stable")[:MOST])
     number = np.full(count, -1)
     number[kept] = np.arange(MOST)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self, Unpack
+from typing import Any, Self, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ import numpy.typing as npt
 from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
+from skinware.tactile.onsets import ContactEvent, Events
 from skinware.tactile.source_service import (
     ServiceOptions,
     SourceReader,
@@ -50,6 +51,10 @@ _TEXTS = {
     "velocity_m_s": ("m/s", "of its centre"),
     "frame": ("", "row of frame_name; -1: not known"),
     "kind": ("", "0: a touch, 1: a hold, 2: sliding"),
+    "provisional": ("", "1: only its last frames speak for it, and its load is 0"),
+    "clipped": ("", "number of its taxels that are at the end of their range"),
+    "load_whole": ("", "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
+    "uncertainty": ("", "how much of the load could be noise or drift; NaN: not known"),
     "count": ("", "number of rows that are filled"),
     "beyond": ("", "contacts for which there was no row"),
     "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),
@@ -79,7 +84,8 @@ class ContactsSource(ValueSource):
         """See :class:`Source`."""
         forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
         forms |= {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
-        units = {name: unit for name, (unit, _) in _TEXTS.items()} | {"load": self.unit, "peak": self.unit}
+        units = {name: unit for name, (unit, _) in _TEXTS.items()}
+        units |= dict.fromkeys(("load", "peak", "load_whole", "uncertainty"), self.unit)
         return {
             name: Column(np.dtype(dtype), shape, units[name], _TEXTS[name][1]) for name, (dtype, shape) in forms.items()
         }
@@ -124,6 +130,24 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
     source_class = ContactsSource
     frame_class = ContactsSample
 
+    def events(self, *, timeout_s: float | None = None) -> Iterator[ContactEvent]:
+        """Iterate over onsets, confirmations, withdrawals and ends of contacts, as they come.
+
+        Args:
+            timeout_s: as for :meth:`skinware.service.ServiceReader.in_order`, which also lists the errors.
+        """
+        events = Events()
+        for sample in self.in_order(timeout_s=timeout_s):
+            yield from events.of(sample.contacts, sample.acquired_ns)
+
+
+class More(TypedDict, total=False):
+    """Arguments of :meth:`.Contacts.update` that may be left out."""
+
+    onset: npt.NDArray[np.bool_] | None
+    clipped: npt.NDArray[np.bool_] | None
+    uncertainty: npt.NDArray[Any] | None
+
 
 class ContactsWriter(SourceWriter[ContactsSource]):
     """Finds the contacts in a driver's values, and publishes them.
@@ -162,19 +186,22 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         source = _source(structure, type_name, driver, self._contacts)
         super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
 
-    def publish(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int) -> ContactSet:
+    def publish(
+        self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int, **more: Unpack[More]
+    ) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 
         Args:
             value: (n,) calmed values of the n sensors; 0 = no touch.
             touched: (n,) bool.
             acquired_ns: of the frame, CLOCK_MONOTONIC ns.
+            more: onset, clipped and uncertainty, as for :meth:`.Contacts.update`.
 
         Raises:
             ConfigurationError: not of these sensors.
             Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
         """
-        found = self._contacts.update(value, touched, acquired_ns)
+        found = self._contacts.update(value, touched, acquired_ns, **more)
         columns = self._service.begin()
         for name in COLUMNS:
             column = columns[name]

@@ -22,9 +22,10 @@ from skinware.status import Status
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
 from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.contacts import ContactSet
-from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, HealthWriter
 from skinware.tactile.motion_service import NAME, MotionWriter
+from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
 from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
 from skinware.tactile.source_service import ServiceOptions, SourceWriter
@@ -121,6 +122,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         self._type_name = ""
         self._chain: Chain | None = None
         self._stage: BaselineStage | None = None
+        self._onsets = Onsets(0)
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         """See :class:`DerivedService`."""
@@ -133,6 +135,8 @@ class CalmContacts(DerivedService[ContactsWriter]):
         stages = {name: stage for name, stage in chain.baseline_stages.items() if not name.startswith(SIGNED_TYPES)}
         before, type_name = self._type_name, "pressure" if "pressure" in stages else next(iter(stages), "")
         self._chain, self._stage, self._type_name, self.count = chain, stages.get(type_name), type_name, 0
+        if self._stage is not None:
+            self._onsets = Onsets(len(self._stage.before), self._stage.before.resolution)
         if self._writer is not None and type_name == before:
             self._writer.restructure(chain.structure)
             return
@@ -156,13 +160,25 @@ class CalmContacts(DerivedService[ContactsWriter]):
         index = self._chain.structure.index(self._type_name)
         usable = (status[index] & UNUSABLE) == 0
         try:
-            found = self._writer.publish(values[index], self._stage.touched & usable, acquired_ns)
+            found = self._writer.publish(
+                values[index], self._stage.touched & usable, acquired_ns, **self._more(self._stage, usable)
+            )
         except NameInUse as error:
             self._give_up(error)
             return
         self.count = len(found)
         if self.motion is not None:
             self.motion.publish(found, values[index], acquired_ns)
+
+    def _more(self, stage: BaselineStage, usable: npt.NDArray[np.bool_]) -> More:
+        """Return onsets, clipped taxels and uncertainties, as far as they are known."""
+        calm = stage.calm
+        if calm is None:
+            return {}
+        onset = self._onsets.update(stage.given - calm.baseline, calm.noise, usable & calm.usable)
+        same_unit = self._writer is not None and self._writer.source.unit == stage.before.type.unit
+        clipped = stage.given >= stage.before.type.maximum
+        return {"onset": onset, "clipped": clipped, "uncertainty": calm.noise if same_unit else None}
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""

@@ -1,18 +1,17 @@
-"""Tell the contacts of one blob apart, and decide which is which after they were too near each other for that."""
+"""Separate the contacts of one blob, and decide which is which after they were too near each other for that."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-
-Floats = npt.NDArray[np.float64]
-Tracks = npt.NDArray[np.void]
+from skinware.tactile.assignment import assign
+from skinware.tactile.tracks import LONGEST_GUESS_S, Floats, Tracks
 
 _STEPS = 4
+_SMALL = 1e-9
 _LOG_PEAK = 0.3
 """Spread of the logarithm of a peak from frame to frame."""
 _MISFIT = 0.1
@@ -31,7 +30,9 @@ _MOST_OF_LOAD = 2.0
 """The most that a comparison of loads counts, as a log of odds."""
 _MOST_PAIRS = 16
 """Pairs that meet in a frame; more of them are noise."""
-EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
+_SETS_OFF_M_S, _FROM_PITCHES = 0.2, 1.5
+"""m/s, and pitches: a new contact at least so fast that comes from so near where one has just gone is the same."""
+_EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
 """Fields that belong to an identity, and not to a place."""
 
 
@@ -63,10 +64,10 @@ def fit_bells(
         width: (k,) m, standard deviation of each bell.
     """
     k = len(place)
-    log_peak = np.log(peak)
+    log_peak = np.log(np.maximum(peak, _SMALL))
     unknown = expected = np.column_stack([place, log_peak])
     prior = np.column_stack([np.tile(1 / variance_m2[:, None], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
-    precision = (_MISFIT * value.max()) ** -2
+    precision = (_MISFIT * max(value.max(), _SMALL)) ** -2
     most = np.column_stack([np.tile(width[:, None], 3), np.ones(k)])
     for _ in range(_STEPS):
         away = position[None] - unknown[:, None, :3]
@@ -160,7 +161,7 @@ class Meetings:
             2 * close_m / max(size, 1e-3),
             float(one["spread"][0] + other["spread"][0]),
             drift,
-            float(np.log(one["peak"] / other["peak"])),
+            float(np.log(max(one["peak"], _SMALL) / max(other["peak"], _SMALL))),
             np.array([one["pace"], other["pace"]]),
         )
 
@@ -182,7 +183,7 @@ class Meetings:
                 continue
             del self._open[pair]
             if self._turned(meeting, apart, tracks[[one, other]], time_ns):
-                for name in EXCHANGED:
+                for name in _EXCHANGED:
                     tracks[name][[one, other]] = tracks[name][[other, one]]
                 tracks["pace"][[one, other]] = meeting.pace  # as if they had exchanged their velocities
 
@@ -196,6 +197,30 @@ class Meetings:
         if meeting.way.any():
             odds += 2 * float(across @ meeting.apart) / variance_m2
         narrow = np.clip(self._pitch_m / pair["width"].min(), 1, 3)
-        ratio = float(np.log(pair["height"][0] / pair["height"][1]))
+        ratio = float(np.log(max(pair["height"][0], _SMALL) / max(pair["height"][1], _SMALL)))
         of_load = 2 * meeting.log_ratio * ratio / (_LOG_RATIO * narrow) ** 2
         return odds + float(np.clip(of_load, -_MOST_OF_LOAD, _MOST_OF_LOAD)) < 0
+
+
+def resume(tracks: Tracks, frames: int, pitch_m: float) -> None:
+    """Give a contact that begins at speed the identity of one that has just gone where it comes from.
+
+    Args:
+        tracks: after the frame; changed in place.
+        frames: in how many a contact must be seen.
+        pitch_m: of the taxels, m.
+    """
+    new = np.flatnonzero((tracks["home"] >= 0) & (tracks["id"] == 0) & (tracks["frames"] == frames))
+    gone = np.flatnonzero((tracks["home"] < 0) & (tracks["id"] > 0))
+    if not 0 < len(new) * len(gone) <= _MOST_PAIRS:
+        return
+    pace, away = tracks["pace"][new][:, None], tracks["found"][new][:, None] - tracks["found"][gone]
+    speed = (pace**2).sum(axis=2)
+    since_s = np.clip((away * pace).sum(axis=2) / np.maximum(speed, 1e-12), 0, LONGEST_GUESS_S)
+    miss_m = np.linalg.norm(away - since_s[..., None] * pace, axis=2)
+    close_m = _FROM_PITCHES * pitch_m
+    could = (speed > _SETS_OFF_M_S**2) & (tracks["frame"][new][:, None] == tracks["frame"][gone])
+    one, other = assign(np.where(could, close_m - miss_m, 0.0))
+    for name in _EXCHANGED:
+        tracks[name][new[one]] = tracks[name][gone[other]]
+    tracks["id"][gone[other]] = 0

@@ -7,79 +7,22 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.meetings import EXCHANGED, Meetings, Tracks, fit_bells
-
-Gains = npt.NDArray[np.float64]
-
-
-def assign(gain: Gains) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Assign rows to columns, each at most once, so that the sum of gains is the largest.
-
-    Args:
-        gain: (r, c) gain of each pair; 0 or less: the pair is impossible.
-
-    Returns:
-        (p,) int64 rows, in ascending order, and (p,) int64, the column of each.
-    """
-    possible = gain > 0
-    column_of = np.full(len(gain), -1, np.int64)
-    is_clear = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)
-    row, column = np.nonzero(is_clear)
-    column_of[row] = column
-    rows = np.flatnonzero(possible.any(axis=1) & (column_of < 0))
-    columns = np.flatnonzero((possible & ~is_clear).any(axis=0))
-    if len(rows):
-        cost = -np.maximum(gain[np.ix_(rows, columns)], 0.0)
-        if len(rows) <= len(columns):
-            column_of[rows] = columns[_cheapest(cost)]
-        else:
-            column_of[rows[_cheapest(cost.T)]] = columns
-    row = np.flatnonzero(column_of >= 0)
-    row = row[possible[row, column_of[row]]]
-    return row, column_of[row]
-
-
-def _cheapest(cost: Gains) -> npt.NDArray[np.int64]:
-    """(r,) int64: a column for each of r rows (at most as many as columns), for the smallest sum.
-
-    By shortest augmenting paths: each row joins along the path of exchanges that costs least. ``of_row`` and
-    ``of_column`` are the dual prices, ``row_at`` is the row of each column; column 0 stands for the row that joins.
-    """
-    rows, columns = cost.shape
-    of_row, of_column = np.zeros(rows + 1), np.zeros(columns + 1)
-    row_at = np.zeros(columns + 1, np.int64)
-    for new in range(1, rows + 1):
-        row_at[0] = new
-        column = 0
-        distance = np.full(columns + 1, np.inf)
-        before = np.zeros(columns + 1, np.int64)
-        is_open = np.ones(columns + 1, bool)
-        while column == 0 or row_at[column]:
-            is_open[column] = False
-            row = row_at[column]
-            reached = cost[row - 1] - of_row[row] - of_column[1:]
-            shorter = is_open[1:] & (reached < distance[1:])
-            distance[1:][shorter] = reached[shorter]
-            before[1:][shorter] = column
-            column = int(np.where(is_open, distance, np.inf)[1:].argmin()) + 1
-            step = distance[column]
-            of_row[row_at[~is_open]] += step
-            of_column[~is_open] -= step
-            distance[is_open] -= step
-        while column:
-            row_at[column], column = row_at[before[column]], int(before[column])
-    found = np.zeros(rows, np.int64)
-    taken = np.flatnonzero(row_at[1:])
-    found[row_at[1:][taken] - 1] = taken
-    return found
-
-
-Floats = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from skinware.tactile.assignment import Gains, assign
+from skinware.tactile.meetings import Meetings, fit_bells, resume
+from skinware.tactile.tracks import (
+    TRACK,
+    Flags,
+    Floats,
+    TouchedBlobs,
+    Tracks,
+    Whole,
+    correct,
+    expected_at,
+    is_shared,
+    without_nan,
+)
 
 _STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
 """Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
@@ -96,17 +39,12 @@ _NEARNESS, _PRESENCE = 0.4, 0.2
 taxels are shared, or the contact is so fast that shared taxels mean nothing."""
 _DOUBT = 0.5
 """Share of its expected way by which a contact may miss the expected place."""
-_LONGEST_GUESS_S = 0.1
-"""Seconds for which a velocity is extrapolated."""
 _CALM = 3.0
 """Time constant of the motion that is judged as sliding, in multiples of ``velocity_s``."""
 _NOISE_PITCHES = 0.3
 """Pitches: standard deviation of the centre of a contact of one taxel."""
 _NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
-"""m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is so
-fast."""
-_ACCELERATION_M_S2, _MANOEUVRE_S = 0.5, 0.1
-"""m/s2: spread of the acceleration of a slow contact. That of a fast one changes its velocity in this time, s."""
+"""m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is fast."""
 _MOST_WITHIN, _MOST_TAXELS = 4, 400
 """Tracks that a blob carries at most, and taxels of the largest blob that carries more than one."""
 _FAINT = 0.25
@@ -116,11 +54,6 @@ _PITCH_M = 0.0065
 _REACH_PITCHES, _GATE = 2.3, 2.5
 """Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
 a bit more than the second ring of neighbours."""
-_SETS_OFF_M_S, _FROM_PITCHES = 0.2, 1.5
-"""m/s, and pitches: a new contact at least so fast that comes from so near where one has just gone is the same."""
-_SURPRISE = 3.0
-"""Standard deviations of a miss that is a change of the velocity."""
-_SHORTEST_S = 1e-3
 _NARROWEST_PITCHES = 0.35
 """Pitches: width of a contact that only one taxel feels."""
 _LAST_ID = (1 << 32) - 1
@@ -161,59 +94,6 @@ class TrackingSettings:
     steady: float = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Blobs:
-    """The m blobs of touched taxels of a frame.
-
-    Attributes:
-        taxels: (a,) int64, the taxels of all of them.
-        blob: (a,) int64, the blob of each.
-        value: (a,) the value of each.
-        load, peak: (m,) sum and maximum of the values of each blob.
-        frame: (m,) int64, number of its coordinate frame, -1 for none.
-        cop_m: (m, 3) m, its centre; NaN if it is not known.
-    """
-
-    taxels: Whole
-    blob: Whole
-    value: Floats
-    load: Floats
-    peak: Floats
-    frame: Whole
-    cop_m: Floats
-
-
-_TRACK = np.dtype(
-    [
-        ("key", "i8"),  # never given to another track
-        ("id", "i8"),  # 0: no contact yet
-        ("born_ns", "i8"),
-        ("gone_ns", "i8"),  # when it went; 0 while it is there
-        ("seen_ns", "i8"),
-        ("frames", "i8"),  # in which it was seen
-        ("steps", "i8"),  # number of moves in the velocity
-        ("size", "i8"),
-        ("frame", "i8"),
-        ("home", "i8"),  # its blob; -1 if it has gone
-        ("kind", "i8"),
-        ("place", "f8", 3),  # and velocity, filtered, to expect the next one
-        ("pace", "f8", 3),
-        ("spread", "f8", 3),  # variances of place, of place and velocity, of velocity
-        ("found", "f8", 3),  # where it was in this frame
-        ("velocity", "f8", 3),  # as published
-        ("motion", "f8", 3),  # the same, smoothed once more, so that noise does not look like sliding
-        ("now", "f8"),  # load of this frame
-        ("height", "f8"),  # peak of this frame
-        ("load", "f8"),  # smoothed
-        ("peak", "f8"),  # smoothed
-        ("width", "f8"),  # smoothed
-        ("shared", "?"),  # its blob has other tracks, too
-        ("jumps", "?"),  # its centre may have moved because contacts merged or split
-        ("noise", "f8"),  # variance of the place that was found
-    ]
-)
-
-
 class Tracked(NamedTuple):
     """The history of the m blobs of a frame.
 
@@ -222,15 +102,17 @@ class Tracked(NamedTuple):
         age_s: (m,) s.
         velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
         kind: (m,) int64, :class:`ContactKind`.
+        provisional: (m,) bool, whether it was never touched for sure.
     """
 
     id: Whole
     age_s: Floats
     velocity_m_s: Floats
     kind: Whole
+    provisional: Flags
 
 
-_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, bool))
 
 
 class Tracker:
@@ -248,7 +130,7 @@ class Tracker:
         self._settings = settings = settings or TrackingSettings()
         self._position_m = position_m
         self._pitch_m = settings.pitch_m or (pitch_m if pitch_m > 0 else _PITCH_M)
-        self._tracks: Tracks = np.zeros(0, _TRACK)
+        self._tracks: Tracks = np.zeros(0, TRACK)
         self._track_of = np.full(len(position_m), -1, np.int64)
         self._taxels = np.zeros(0, np.int64)  # that have a track
         self._meetings = Meetings(self._pitch_m)
@@ -260,30 +142,27 @@ class Tracker:
         """(n,) the track that each taxel was last in; -1: none."""
         return self._track_of
 
-    def follow(self, blobs: Blobs, time_ns: int) -> Tracked:
+    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Tracked:
         """Return the identities of the blobs of the next frame, and how they move."""
         self._forget(time_ns)
         before, size = self._tracks, np.bincount(blobs.blob, minlength=len(blobs.load))
         if not len(before) and not len(size):
             return _NOTHING
-        expected = _expected(before, time_ns)
+        expected = expected_at(before, time_ns)
         overlap = self._overlap(blobs, size)
-        home = np.full(len(before), -1)
-        known, found = assign(self._gains(overlap, expected, blobs))
-        home[known] = found
-        self._join(home, overlap, expected, blobs, size)
+        home = self._homes(overlap, expected, blobs, size)
         self._meetings.begin(before, expected["place"], time_ns)
         is_joined = overlap >= 0.5
         expected["jumps"] = is_joined.sum(axis=1) > 1
         expected["jumps"][home >= 0] |= is_joined.sum(axis=0)[home[home >= 0]] > 1
         expected["home"] = home
         tracks = self._with_new(expected, blobs, time_ns)
-        tracks["shared"] = _is_shared(tracks["home"])
+        tracks["shared"] = is_shared(tracks["home"])
         self._find(tracks, blobs, size, time_ns)
         self._move(tracks, before)
         self._judge(tracks, before, time_ns)
         self._meetings.end(tracks, time_ns)
-        self._resume(tracks)
+        resume(tracks, self._settings.frames, self._pitch_m)
         self._keep(tracks, blobs, time_ns)
         return self._tracked(tracks, time_ns)
 
@@ -300,7 +179,7 @@ class Tracker:
             self._tracks = tracks[keep]
             self._track_of[self._taxels] = number[self._track_of[self._taxels]]
 
-    def _overlap(self, blobs: Blobs, size: Whole) -> Floats:
+    def _overlap(self, blobs: TouchedBlobs, size: Whole) -> Floats:
         """(tracks, m): shared taxels of each pair, as a share of the smaller one."""
         tracks, track = self._tracks, self._track_of[blobs.taxels]
         is_known = track >= 0
@@ -309,18 +188,30 @@ class Tracker:
         overlap: Floats = shared / np.maximum(np.minimum(tracks["size"][:, None], size), 1)
         return overlap
 
-    def _gains(self, overlap: Floats, expected: Tracks, blobs: Blobs) -> Gains:
+    def _homes(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
+        """(tracks,) the blob of each; -1: it has gone."""
+        tracks, touching = self._tracks, overlap > 0
+        way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
+        by_place = (way_m > self._pitch_m) | tracks["shared"]
+        if not by_place.any() and (touching.sum(axis=1) == 1).all() and (touching.sum(axis=0) == 1).all():
+            only: Whole = touching.argmax(axis=1)
+            return only  # nothing begins, ends or merges
+        home = np.full(len(tracks), -1)
+        known, found = assign(self._gains(overlap, expected, blobs, way_m, by_place))
+        home[known] = found
+        self._join(home, overlap, expected, blobs, size)
+        return home
+
+    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Gains:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m
         squares = np.einsum("ijk,ijk->ij", away, away)
-        way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
-        reach_m = _DOUBT * _known(way_m) + _REACH_PITCHES * self._pitch_m
+        reach_m = _DOUBT * without_nan(way_m) + _REACH_PITCHES * self._pitch_m
         if len(tracks) <= _MOST_FAST:
             reach_m = np.fmax(reach_m, _DOUBT * way_m + _GATE * np.sqrt(expected["spread"][:, 0]))
         misses = squares / (reach_m**2)[:, None]
         is_near = (misses <= 1) & (tracks["frame"][:, None] == blobs.frame)
-        by_place = (way_m > self._pitch_m) | tracks["shared"]
         is_sharing = (overlap > 0) & ~(by_place & is_near.any(axis=1))[:, None]
         is_rest = blobs.load < _REST * tracks["load"][:, None]
         sharing = np.where(is_rest, _LEFT, np.where(overlap >= 0.5, _STRONG, _WEAK)) + _CLOSENESS * overlap
@@ -328,7 +219,7 @@ class Tracker:
         near = _NEAR + _NEARNESS * (1 - misses) + _PRESENCE * (tracks["gone_ns"] == 0)[:, None]
         return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
 
-    def _join(self, home: Whole, overlap: Floats, expected: Tracks, blobs: Blobs, size: Whole) -> None:
+    def _join(self, home: Whole, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> None:
         """Put tracks that found no blob of their own into that of another."""
         lost = np.flatnonzero((home < 0) & (expected["frames"] > 1) & np.isfinite(expected["place"][:, 0]))
         if not len(lost) or not len(size) or len(lost) > _MOST_NEW:
@@ -351,14 +242,14 @@ class Tracker:
                 home[track] = blob
                 within[blob] += 1
 
-    def _with_new(self, tracks: Tracks, blobs: Blobs, time_ns: int) -> Tracks:
+    def _with_new(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> Tracks:
         """The tracks, and new ones of the blobs that have none."""
         has_track = np.zeros(len(blobs.load), bool)
         has_track[tracks["home"][tracks["home"] >= 0]] = True
         if has_track.all():
             return tracks
         new = np.flatnonzero(~has_track)
-        begun = np.zeros(len(new), _TRACK)
+        begun = np.zeros(len(new), TRACK)
         begun["key"] = self._last_key + 1 + np.arange(len(new))
         self._last_key += len(new)
         begun["home"], begun["born_ns"], begun["frame"] = new, time_ns, blobs.frame[new]
@@ -367,7 +258,7 @@ class Tracker:
         begun["spread"] = np.inf, 0.0, (_NEW_M_S if len(new) <= _MOST_NEW else 0.0) ** 2
         return np.concatenate([tracks, begun])
 
-    def _find(self, tracks: Tracks, blobs: Blobs, size: Whole, time_ns: int) -> None:
+    def _find(self, tracks: Tracks, blobs: TouchedBlobs, size: Whole, time_ns: int) -> None:
         """Measure where each track is in this frame, and correct what was expected of it."""
         pitch_m, home = self._pitch_m, tracks["home"]
         alone = np.flatnonzero((home >= 0) & ~tracks["shared"])
@@ -379,14 +270,15 @@ class Tracker:
         tracks["frame"][alone], tracks["size"][alone] = blobs.frame[blob], size[blob]
         jumping = alone[tracks["jumps"][alone]]
         tracks["place"][jumping] = tracks["found"][jumping]
-        _correct(tracks, alone, time_ns)
+        correct(tracks, alone, time_ns)
         for one in set(home[tracks["shared"]].tolist()):
             self._tell_apart(tracks, np.flatnonzero(home == one), blobs, time_ns)
         here = np.flatnonzero(tracks["home"] >= 0)
         tracks["seen_ns"][here], tracks["gone_ns"][here] = time_ns, 0
-        tracks["frames"][here] += 1
+        tracks["frames"][here] += blobs.frames[tracks["home"][here]]
+        tracks["sure"][here] |= blobs.is_sure[tracks["home"][here]]
 
-    def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: Blobs, time_ns: int) -> None:
+    def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
         within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
         fitted = fit_bells(
@@ -403,7 +295,7 @@ class Tracker:
         tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
         tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
         tracks["jumps"][rows] = False
-        _correct(tracks, rows, time_ns)
+        correct(tracks, rows, time_ns)
         is_faint = fitted.peak < _FAINT * tracks["peak"][rows]
         is_faint[fitted.peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
@@ -418,18 +310,18 @@ class Tracker:
         velocity = (tracks["found"][known] - before["found"][known]) / passed_s[:, None]
         tracks["steps"][known] += 1
         weight = np.maximum(-np.expm1(-passed_s / self._settings.velocity_s), 1 / tracks["steps"][known])[:, None]
-        was = _known(tracks["velocity"][known])
+        was = without_nan(tracks["velocity"][known])
         tracks["velocity"][known] = was + weight * (velocity - was)
 
     def _judge(self, tracks: Tracks, before: Tracks, time_ns: int) -> None:
         """Update what is smoothed, and the kinds."""
         settings, pitch_m = self._settings, self._pitch_m
         here = np.flatnonzero(tracks["home"] >= 0)
-        now = tracks[here]
+        now = tracks if len(here) == len(tracks) else tracks[here]
         passed_s = np.zeros(len(here))
         known = here < len(before)
         passed_s[known] = np.maximum(time_ns - before["seen_ns"][here[known]], 0) / NS_PER_S
-        is_new = now["frames"] == 1
+        is_new = ~known
         weight = np.where(is_new, 1.0, -np.expm1(-passed_s / settings.velocity_s))
         now["load"] += weight * (now["now"] - now["load"])
         alone = np.maximum(weight, 1 / now["frames"]) * ~now["shared"]
@@ -437,33 +329,16 @@ class Tracker:
         width = pitch_m * np.sqrt(now["now"] / (2 * np.pi * np.maximum(now["height"], 1e-9)))
         now["width"] += alone * (np.maximum(width, _NARROWEST_PITCHES * pitch_m) - now["width"])
         calm = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
-        now["motion"] += calm * (_known(now["velocity"]) - now["motion"])
+        now["motion"] += calm * (without_nan(now["velocity"]) - now["motion"])
         is_steady = abs(now["now"] - now["load"]) <= settings.steady * now["load"]
         slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
         is_sliding = is_steady & (np.linalg.norm(now["motion"], axis=1) >= slowest)
         is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
         now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
-        tracks[here] = now
+        if now is not tracks:
+            tracks[here] = now
 
-    def _resume(self, tracks: Tracks) -> None:
-        """Give a contact that begins at speed the identity of one that has just gone where it comes from."""
-        enough = self._settings.frames
-        new = np.flatnonzero((tracks["home"] >= 0) & (tracks["id"] == 0) & (tracks["frames"] == max(enough, 2)))
-        gone = np.flatnonzero((tracks["home"] < 0) & (tracks["id"] > 0))
-        if not 0 < len(new) * len(gone) <= _MOST_NEW**2:
-            return
-        pace, away = tracks["pace"][new][:, None], tracks["found"][new][:, None] - tracks["found"][gone]
-        speed = (pace**2).sum(axis=2)
-        since_s = np.clip((away * pace).sum(axis=2) / np.maximum(speed, 1e-12), 0, _LONGEST_GUESS_S)
-        miss_m = np.linalg.norm(away - since_s[..., None] * pace, axis=2)
-        close_m = _FROM_PITCHES * self._pitch_m
-        could = (speed > _SETS_OFF_M_S**2) & (tracks["frame"][new][:, None] == tracks["frame"][gone])
-        one, other = assign(np.where(could, close_m - miss_m, 0.0))
-        for name in EXCHANGED:
-            tracks[name][new[one]] = tracks[name][gone[other]]
-        tracks["id"][gone[other]] = 0
-
-    def _keep(self, tracks: Tracks, blobs: Blobs, time_ns: int) -> None:
+    def _keep(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> None:
         """Remember this frame, and the tracks whose contacts are gone."""
         is_gone = tracks["home"] < 0
         tracks["gone_ns"][is_gone & (tracks["gone_ns"] == 0)] = time_ns
@@ -487,7 +362,7 @@ class Tracker:
         self._tracks = tracks
 
     def _tracked(self, tracks: Tracks, time_ns: int) -> Tracked:
-        """What is published: the identity of the oldest track of each blob, and the mean of their velocities."""
+        """Return the identity of the oldest track of each blob, and the mean of their velocities."""
         here = np.flatnonzero(tracks["home"] >= 0)
         here = here[np.lexsort([tracks["key"][here], tracks["born_ns"][here], tracks["home"][here]])]
         home = tracks["home"][here]
@@ -499,56 +374,8 @@ class Tracker:
         for blob in set(home[1:][np.diff(home) == 0].tolist()):
             rows = here[home == blob]
             velocity[blob] = np.average(tracks["velocity"][rows], axis=0, weights=np.maximum(tracks["now"][rows], 1e-9))
-        return Tracked(
-            tracks["id"][first], (time_ns - tracks["born_ns"][first]) / NS_PER_S, velocity, tracks["kind"][first]
-        )
-
-
-def _is_shared(home: Whole) -> Flags:
-    """(tracks,) which of them share their blob with others."""
-    count = np.bincount(home + 1, minlength=1)
-    count[0] = 0
-    shared: Flags = count[home + 1] > 1
-    return shared
-
-
-def _expected(tracks: Tracks, time_ns: int) -> Tracks:
-    """The tracks as they are expected at a time: places and spreads go on with the velocities."""
-    expected = tracks.copy()
-    passed_s = np.clip((time_ns - tracks["seen_ns"]) / NS_PER_S, 0, _LONGEST_GUESS_S)
-    pace = tracks["pace"]
-    expected["place"] += passed_s[:, None] * pace
-    change = (_ACCELERATION_M_S2 + np.sqrt((pace**2).sum(axis=1)) / _MANOEUVRE_S) * passed_s
-    _, both, variance = tracks["spread"].T
-    expected["spread"][:, 0] += passed_s * (2 * both + passed_s * (variance + change**2 / 4))
-    expected["spread"][:, 1] += passed_s * (variance + change**2 / 2)
-    expected["spread"][:, 2] += change**2
-    return expected
-
-
-def _known(numbers: Floats) -> Floats:
-    """The numbers, 0 in place of NaN."""
-    return np.where(np.isnan(numbers), 0.0, numbers)
-
-
-def _correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
-    """Take in where tracks were found, instead of where they were expected."""
-    now = tracks[rows]
-    passed_s = np.maximum((time_ns - now["seen_ns"]) / NS_PER_S, _SHORTEST_S)
-    miss = now["found"] - now["place"]
-    variance, both, pace = now["spread"].T
-    is_new = np.isinf(variance)
-    variance = np.where(is_new, 1.0, variance)  # m2: nothing is known
-    squares = (miss**2).sum(axis=1)
-    surprise = np.where((squares > _SURPRISE**2 * (variance + now["noise"])) & ~now["jumps"], squares, 0.0)
-    variance, both, pace = variance + surprise, both + surprise / passed_s, pace + surprise / passed_s**2
-    gain = variance / (variance + now["noise"])
-    pull = np.where(now["jumps"], 0.0, both / (variance + now["noise"]))
-    now["place"] += gain[:, None] * miss
-    now["pace"] += pull[:, None] * _known(miss)
-    pace += surprise / passed_s**2 - pull * both  # what changed once changes again
-    now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
-    tracks[rows] = now
+        age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
+        return Tracked(tracks["id"][first], age_s, velocity, tracks["kind"][first], ~tracks["sure"][first])
 
 
 def _rank(numbers: Floats | Whole) -> Floats:

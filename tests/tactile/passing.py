@@ -31,7 +31,7 @@ WIDTHS_APART, FINGER_M = 3.0, 0.01
 
 
 @dataclass(frozen=True)
-class Pass:
+class FingerPass:
     """Two fingers that come from opposite sides.
 
     Attributes:
@@ -86,14 +86,14 @@ class Pass:
 
 
 @dataclass(frozen=True)
-class Told:
+class Verdict:
     """What contacts made of a pass: what became of both identities, and how many there were."""
 
     outcome: Outcome
     identities: int
 
 
-def told(one: Pass, contacts: Contacts | None = None) -> Told:
+def told(one: FingerPass, contacts: Contacts | None = None) -> Verdict:
     """Take a pass through contacts."""
     contacts = contacts or Contacts(len(FLAT), NEIGHBOURS, GEOMETRY)
     seen: set[int] = set()
@@ -104,7 +104,7 @@ def told(one: Pass, contacts: Contacts | None = None) -> Told:
         now = _identities(found, at_m, one.sigma_m)
         if 0 not in now and now[0] != now[1]:
             first, last = first if first[0] else now, now
-    return Told(_moved(first, last), len(seen))
+    return Verdict(_moved(first, last), len(seen))
 
 
 def _moved(first: tuple[int, int], last: tuple[int, int]) -> Outcome:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skinware.tactile.tracking import Gains, assign
+from skinware.tactile.assignment import Gains, assign
 
 gains = hnp.arrays(
     np.float64,

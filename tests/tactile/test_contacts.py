@@ -156,3 +156,43 @@ def test_a_row_is_a_contact() -> None:
     assert [contact.taxels.tolist() for contact in found] == [[0], [2], [4]]
     with pytest.raises(IndexError):
         found[3]
+
+
+def test_a_contact_in_the_list_stays_unless_another_is_clearly_larger() -> None:
+    n = MOST + 5
+    contacts, value = Contacts(n, tracking=AT_ONCE), np.full(n, 10.0)
+    first = contacts.update(value, np.arange(n) < MOST, 0)
+    value[MOST:] = 14.0
+    kept = contacts.update(value, np.ones(n, bool), 20_000_000)
+    assert kept.id.tolist() == first.id.tolist()
+    assert (kept.contact_of[MOST:] == BEYOND).all()
+    value[MOST] = 16.0
+    assert contacts.update(value, np.ones(n, bool), 40_000_000).contact_of[MOST] >= 0
+
+
+def test_a_spike_of_one_frame_is_no_contact() -> None:
+    contacts, value = Contacts(3), np.array([0.0, 200, 0])
+    assert len(contacts.update(value, value > 0, 0)) == 0
+    assert len(contacts.update(0 * value, value > 200, 20_000_000)) == 0
+    assert [len(contacts.update(value, value > 0, time_ns)) for time_ns in (200_000_000, 220_000_000)] == [0, 1]
+
+
+@pytest.mark.parametrize(("peak", "most"), [(20.0, np.inf), (60.0, np.inf), (60.0, 40.0), (60.0, 25.0)])
+def test_what_threshold_and_clipping_cut_off_is_estimated(peak: float, most: float) -> None:
+    squares = ((FLAT - FLAT[30 * 60 + 30] - [0.001, 0.002, 0]) ** 2).sum(axis=1)
+    whole = peak * np.exp(-squares / (2 * (2 * PITCH_M) ** 2))
+    value = np.where(whole > 4, np.minimum(whole, most), 0.0)
+    (contact,) = on_flat().update(value, value > 0, 0, clipped=value >= most, uncertainty=np.full(len(FLAT), 0.5))
+    assert contact.clipped == np.count_nonzero(value >= most)
+    assert contact.uncertainty == contact.n / 2
+    assert contact.load < 0.95 * whole.sum()
+    assert contact.load_whole == pytest.approx(whole.sum(), rel=0.1)
+
+
+def test_what_is_mostly_cut_off_is_not_estimated() -> None:
+    value = np.array([4.0, 4.5, 4.0])
+    chain = neighbours_of_pairs([(0, 1), (1, 2)], 3)
+    (contact,) = Contacts(3, chain, tracking=AT_ONCE).update(value, value > 0, 0)
+    assert np.isnan(contact.load_whole)
+    (contact,) = Contacts(3, chain, tracking=AT_ONCE).update(value, value > 0, 0, clipped=value > 0)
+    assert np.isnan(contact.load_whole)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +20,7 @@ from tests.core.test_c_how_to import lines_of
 from tests.tactile.skins import AT_ONCE, triangles
 from tests.tactile.test_contacts_service import structure
 
-SOURCE = Path(__file__).parents[2] / "examples" / "contacts.c"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.mark.thorough
@@ -23,7 +28,7 @@ SOURCE = Path(__file__).parents[2] / "examples" / "contacts.c"
 def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
     language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    program = compiled(SOURCE, language, tmp_path_factory)
+    program = compiled(EXAMPLES / "contacts.c", language, tmp_path_factory)
 
     def publish(writer: ContactsWriter, n: int, **loads: float) -> None:
         value = [loads.get(f"t{taxel}", 0.0) for taxel in range(n)]
@@ -45,3 +50,39 @@ def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
             writer.restructure(structure(rows=3))
             publish(writer, 60, t7=4.0)
             assert [next(lines), next(lines)] == ["1 contacts\n", f"  1: load 4 at {at(7)}\n"]
+
+
+@pytest.mark.parametrize("language", ["c99", "c++11"])
+def test_a_reflex_in_c_acts_on_an_onset(
+    language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    program = compiled(EXAMPLES / "reflex.c", language, tmp_path_factory)
+    with onset(namespace), lines_of(program, namespace.name) as lines:
+        check(next(lines))
+
+
+def test_a_reflex_in_python_acts_on_an_onset(namespace: Namespace) -> None:
+    words = [sys.executable, str(EXAMPLES / "reflex.py"), namespace.name]
+    with (
+        onset(namespace),
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            check(process.stdout.readline())
+        finally:
+            process.send_signal(signal.SIGINT)
+
+
+@contextmanager
+def onset(namespace: Namespace) -> Iterator[None]:
+    """A service with a provisional contact."""
+    with ContactsWriter(structure(), namespace=namespace, rate_hz=0.1) as writer:
+        writer.publish(np.zeros(400), np.zeros(400, bool), now_ns(), onset=np.arange(400) == 45)
+        yield
+
+
+def check(line: str) -> None:
+    words = line.split()
+    assert words[:2] == ["onset", "1"]
+    assert words[3] == "us"

@@ -6,17 +6,17 @@ from collections import Counter
 
 import pytest
 
-from tests.tactile.passing import Pass, Way, told
+from tests.tactile.passing import FingerPass, Way, told
 
 SPEEDS_M_S, SIGMAS_M = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), (0.002, 0.004, 0.006, 0.008)
 WAYS: tuple[Way, ...] = ("cross", "bounce", "meet")
 MOST_SWAPPED, MOST_NEW = 0.02, 0.05
 
 
-def passes(way: Way, speeds_m_s: tuple[float, ...], sigmas_m: tuple[float, ...]) -> list[Pass]:
+def passes(way: Way, speeds_m_s: tuple[float, ...], sigmas_m: tuple[float, ...]) -> list[FingerPass]:
     """In each lane; two alike that bounce in one lane look like two that cross."""
     lanes = range(1 if way == "bounce" else 0, 6)
-    return [Pass(way, speed, lane, sigma, seed=0) for speed in speeds_m_s for lane in lanes for sigma in sigmas_m]
+    return [FingerPass(way, speed, lane, sigma, seed=0) for speed in speeds_m_s for lane in lanes for sigma in sigmas_m]
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -38,4 +38,4 @@ def test_identities_are_kept_at_all_speeds_and_widths() -> None:
 
 @pytest.mark.parametrize("sigma_m", [0.004, 0.008])
 def test_a_finger_at_2_m_s_is_one_contact(sigma_m: float) -> None:
-    assert told(Pass("cross", 2.0, 5, sigma_m, seed=1)).identities == 2
+    assert told(FingerPass("cross", 2.0, 5, sigma_m, seed=1)).identities == 2

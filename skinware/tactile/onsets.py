@@ -1,0 +1,119 @@
+"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events.
+
+::
+
+    with ContactsReader(namespace="calm", timeout_s=10) as contacts:
+        for event in contacts.events():
+            if event.kind is EventKind.ONSET:
+                ...                             # a reflex: 2 frames after the touch, and sometimes for nothing
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import NS_PER_S
+
+if TYPE_CHECKING:
+    from skinware.tactile.contacts import Contact, ContactSet
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+_ABOVE_SIGMA = 5.0
+"""Standard deviations of its noise by which a taxel must be above its baseline."""
+_ENOUGH, _FRAMES = 2, 3
+"""In how many of the last frames."""
+_GONE_S = 0.08
+"""Seconds after which a contact that is missing has ended: longer than its identity is kept."""
+
+
+class Onsets:
+    """Finds which of n taxels have risen beyond their own noise in two of the last three frames.
+
+    Nothing is smoothed: a spike of one frame is none, and a touch is found in its second frame, at any rate.
+
+    Args:
+        n: number of taxels.
+        resolution: step of the values, in the unit of the noise; 0 if they have none.
+    """
+
+    def __init__(self, n: int, resolution: float = 0.0) -> None:
+        self._least = _ENOUGH * resolution
+        self._were: list[Flags] = [np.zeros(n, bool) for _ in range(_FRAMES - 1)]
+
+    def update(self, above: Floats, noise: Floats, usable: Flags) -> Flags:
+        """Return (n,) bool, which taxels are touched, as far as the newest frames say.
+
+        Args:
+            above: (n,) how far each value is above its baseline, not smoothed.
+            noise: (n,) standard deviation of each from frame to frame; NaN: not known, so that nothing is found.
+            usable: (n,) bool, which values are of this frame.
+        """
+        is_above = usable & (above > np.maximum(_ABOVE_SIGMA * noise, self._least))
+        count = np.sum([is_above, *self._were], axis=0, dtype=np.int8)
+        self._were = [*self._were[1:], is_above]
+        onset: Flags = is_above & (count >= _ENOUGH)
+        return onset
+
+
+class EventKind(enum.IntEnum):
+    """A moment in the life of a contact."""
+
+    ONSET = 0
+    """It has begun, provisionally: nothing but the last frames speak for it."""
+    CONFIRMED = 1
+    """It is a contact: the baseline agrees. Where it does so at once, this is the first event."""
+    WITHDRAWN = 2
+    """It was none: it went before it was confirmed."""
+    ENDED = 3
+    """It is over."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactEvent:
+    """An event.
+
+    Attributes:
+        kind: what has happened.
+        contact: the contact; at the end, as it was last seen.
+        acquired_ns: of the frame in which that was seen, CLOCK_MONOTONIC ns.
+    """
+
+    kind: EventKind
+    contact: Contact
+    acquired_ns: int
+
+
+class Events:
+    """Turns the contacts of frames into events."""
+
+    def __init__(self) -> None:
+        self._seen: dict[int, tuple[Contact, int]] = {}
+
+    def of(self, contacts: ContactSet, acquired_ns: int) -> list[ContactEvent]:
+        """Return what has happened since the last frame.
+
+        Args:
+            contacts: of the newest frame.
+            acquired_ns: of this frame.
+        """
+        found = []
+        for contact in contacts:
+            before = self._seen.get(contact.id)
+            if contact.provisional and before is None:
+                found.append(ContactEvent(EventKind.ONSET, contact, acquired_ns))
+            elif not contact.provisional and (before is None or before[0].provisional):
+                found.append(ContactEvent(EventKind.CONFIRMED, contact, acquired_ns))
+            self._seen[contact.id] = contact, acquired_ns
+        for identity, (contact, seen_ns) in list(self._seen.items()):
+            if acquired_ns - seen_ns > _GONE_S * NS_PER_S:
+                del self._seen[identity]
+                kind = EventKind.WITHDRAWN if contact.provisional else EventKind.ENDED
+                found.append(ContactEvent(kind, contact, acquired_ns))
+        return found

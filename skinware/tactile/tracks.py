@@ -1,0 +1,128 @@
+"""Hold the tracks of contacts, expect where they go, and correct that by what is found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import NS_PER_S
+
+Floats = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+Tracks = npt.NDArray[np.void]
+
+LONGEST_GUESS_S = 0.1
+"""Seconds for which a velocity is extrapolated."""
+_ACCELERATION_M_S2, _MANOEUVRE_S = 0.5, 0.1
+"""m/s2: spread of the acceleration of a slow contact. That of a fast one changes its velocity in this time, s."""
+_SURPRISE = 3.0
+"""Standard deviations of a miss that is a change of the velocity."""
+_SHORTEST_S = 1e-3
+
+TRACK = np.dtype(
+    [
+        ("key", "i8"),  # never given to another track
+        ("id", "i8"),  # 0: no contact yet
+        ("born_ns", "i8"),
+        ("gone_ns", "i8"),  # when it went; 0 while it is there
+        ("seen_ns", "i8"),
+        ("frames", "i8"),  # in which it was seen
+        ("steps", "i8"),  # number of moves in the velocity
+        ("size", "i8"),
+        ("frame", "i8"),
+        ("home", "i8"),  # its blob; -1 if it has gone
+        ("kind", "i8"),
+        ("place", "f8", 3),  # and velocity, filtered, to expect the next one
+        ("pace", "f8", 3),
+        ("spread", "f8", 3),  # variances of place, of place and velocity, of velocity
+        ("found", "f8", 3),  # where it was in this frame
+        ("velocity", "f8", 3),  # as published
+        ("motion", "f8", 3),  # the same, smoothed once more, so that noise does not look like sliding
+        ("now", "f8"),  # load of this frame
+        ("height", "f8"),  # peak of this frame
+        ("load", "f8"),  # smoothed
+        ("peak", "f8"),  # smoothed
+        ("width", "f8"),  # smoothed
+        ("sure", "?"),  # it was touched for sure
+        ("shared", "?"),  # its blob has other tracks, too
+        ("jumps", "?"),  # its centre may have moved because contacts merged or split
+        ("noise", "f8"),  # variance of the place that was found
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TouchedBlobs:
+    """The m blobs of touched taxels of a frame.
+
+    Attributes:
+        taxels: (a,) int64, the taxels of all of them.
+        blob: (a,) int64, the blob of each.
+        value: (a,) the value of each.
+        load, peak: (m,) sum and maximum of the values of each blob.
+        frame: (m,) int64, number of its coordinate frame, -1 for none.
+        cop_m: (m, 3) m, its centre; NaN if it is not known.
+        is_sure: (m,) bool, whether any of its taxels is touched for sure.
+        frames: (m,) int64, how many frames speak for it: 2 where :class:`.Onsets` found a taxel.
+    """
+
+    taxels: Whole
+    blob: Whole
+    value: Floats
+    load: Floats
+    peak: Floats
+    frame: Whole
+    cop_m: Floats
+    is_sure: Flags
+    frames: Whole
+
+
+def is_shared(home: Whole) -> Flags:
+    """(tracks,) which of them share their blob with others."""
+    count = np.bincount(home + 1, minlength=1)
+    count[0] = 0
+    shared: Flags = count[home + 1] > 1
+    return shared
+
+
+def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
+    """The tracks as they are expected at a time: places and spreads go on with the velocities."""
+    expected = tracks.copy()
+    passed_s = np.clip((time_ns - tracks["seen_ns"]) / NS_PER_S, 0, LONGEST_GUESS_S)
+    pace = tracks["pace"]
+    expected["place"] += passed_s[:, None] * pace
+    change = (_ACCELERATION_M_S2 + np.sqrt((pace**2).sum(axis=1)) / _MANOEUVRE_S) * passed_s
+    _, both, variance = tracks["spread"].T
+    expected["spread"][:, 0] += passed_s * (2 * both + passed_s * (variance + change**2 / 4))
+    expected["spread"][:, 1] += passed_s * (variance + change**2 / 2)
+    expected["spread"][:, 2] += change**2
+    return expected
+
+
+def without_nan(numbers: Floats) -> Floats:
+    """The numbers, 0 in place of NaN."""
+    return np.where(np.isnan(numbers), 0.0, numbers)
+
+
+def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
+    """Take in where tracks were found, instead of where they were expected."""
+    now = tracks if len(rows) == len(tracks) else tracks[rows]
+    passed_s = np.maximum((time_ns - now["seen_ns"]) / NS_PER_S, _SHORTEST_S)
+    miss = now["found"] - now["place"]
+    variance, both, pace = now["spread"].T
+    is_new = np.isinf(variance)
+    variance = np.where(is_new, 1.0, variance)  # m2: nothing is known
+    squares = (miss**2).sum(axis=1)
+    surprise = np.where((squares > _SURPRISE**2 * (variance + now["noise"])) & ~now["jumps"], squares, 0.0)
+    variance, both, pace = variance + surprise, both + surprise / passed_s, pace + surprise / passed_s**2
+    gain = variance / (variance + now["noise"])
+    pull = np.where(now["jumps"], 0.0, both / (variance + now["noise"]))
+    now["place"] += gain[:, None] * miss
+    now["pace"] += pull[:, None] * without_nan(miss)
+    pace += surprise / passed_s**2 - pull * both  # what changed once changes again
+    now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
+    if now is not tracks:
+        tracks[rows] = now

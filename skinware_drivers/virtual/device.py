@@ -12,7 +12,7 @@ from skinware_drivers.options import Options
 from skinware_drivers.virtual.wire import Transmitter
 
 if TYPE_CHECKING:
-    from skinware_drivers.virtual.stage import Stage
+    from skinware_drivers.virtual import stage as emulation
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Seconds = Annotated[float, Meta(ge=0)]
@@ -90,7 +90,7 @@ class Device:
         random: source of the faults of its frames.
     """
 
-    def __init__(self, number: int, stage: Stage[Any], transmitter: Transmitter, now_ns: int) -> None:
+    def __init__(self, number: int, stage: emulation.Stage[Any], transmitter: Transmitter, now_ns: int) -> None:
         self.number = number
         self.stage = stage
         self.transmitter = transmitter

@@ -45,7 +45,7 @@ from skinware.tactile.rule import (
     Why,
     resolution_of,
 )
-from skinware.tactile.surroundings import Surroundings
+from skinware.tactile.surroundings import Falls, Surroundings
 from skinware.tactile.touches import Touches
 
 Floats = npt.NDArray[np.float32]
@@ -165,6 +165,7 @@ class Baseline:
         self._rest = Rest(self._offsets.patches)
         self._touches = Touches(module, patch, signed=signed)
         self._surroundings = Surroundings(module, patch, neighbours)
+        self._falls = Falls(self._surroundings)
         self._all_held = False
         self._forced: Flags = np.zeros(n, bool)
         self._suspect: Flags | None = None
@@ -303,12 +304,12 @@ class Baseline:
         if not self._ready.all():
             self._measure(time_ns, usable, passed_s)
         live = usable & self._ready
-        deviation = np.where(live, intake.last - offsets.level - touches.remains, np.float32(0))
-        free = live & ~touches.touched & touches.has_settled
+        deviation = np.where(live, intake.last - offsets.level - touches.remainders.left, np.float32(0))
+        free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
         spread = np.sqrt(offsets.noise2)
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
-            free &= ~self._surroundings.sagging & ~(self._surroundings.below & low)
+            free &= ~self._falls.sagging & ~(self._falls.below & low)
         offsets.follow_common(deviation, free, passed_s)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
         off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
@@ -317,19 +318,21 @@ class Baseline:
         over = touches.judge(deviation, live, on, off, offsets, passed_s, most_s)
         if not self._all_held:
             self._let_go(over, live, on, off, deviation, passed_s)
-        surroundings = self._surroundings
-        held = surroundings.hold(touches, live, passed_s, settings.settle_s)
+        held = self._surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
-            surroundings.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
+            self._falls.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
-            floor = np.where(touches.used > 0, np.float32(passed_s / RESETTLE_S), np.float32(passed_s / settings.tau_s))
-            learns = live & ~touches.touched & ~surroundings.sagging & touches.has_settled
-            learns &= touches.load(deviation) < on  # a touch that begins is no drift
+            floor = np.float32(passed_s) / np.where(
+                touches.remainders.used > 0, np.float32(RESETTLE_S), np.float32(settings.tau_s)
+            )
+            learns = live & ~touches.touched & ~self._falls.sagging & touches.remainders.has_settled
+            learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
             calm = learns & (np.abs(touches.smooth) < np.float32(0.5) * off)
             offsets.learn(deviation, learns, calm, np.minimum(floor, np.float32(0.5)), passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
-        touches.remember(deviation, on, passed_s)
+        if not touches.signed:
+            touches.remainders.follow(deviation, touches.smooth, touches.touched, on, passed_s)
         return self._calm(deviation, live, held, low, off)
 
     @property
@@ -338,6 +341,15 @@ class Baseline:
         if given is not None:
             return given
         return self._resolution * (0.5 if self._intake.few_levels else STEPS_OF_A_TOUCH)
+
+    def _at_end(self) -> Flags | np.bool_:
+        """Return (n,) which taxels are at an end of their range: they show no drift and no more load."""
+        least, most = self._limits
+        if not math.isfinite(most - least):
+            return np.False_
+        last = self._intake.last
+        at_end: Flags = (last >= most) | (last <= least)
+        return at_end
 
     def _least_noise2(self, level: Floats) -> Floats:
         rounding = self._resolution * (0.05 if self._intake.few_levels else 1 / math.sqrt(12))
@@ -375,7 +387,7 @@ class Baseline:
             touches.end(over)
             if too_long.any():
                 self._put(over[too_long], left[too_long], deviation)
-        back = self._surroundings.back(touches, on, passed_s)
+        back = self._falls.back(touches, on, passed_s)
         if len(back):
             self._put(back, touches.smooth[back], deviation)
             touches.end(back)
@@ -390,7 +402,7 @@ class Baseline:
         if touches.signed:
             return np.zeros_like(live)
         low = live & (touches.smooth < -on)
-        due = self._surroundings.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
+        due = self._falls.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
         if len(due) and not self._all_held:
             self._put(due, touches.smooth[due], deviation)
         return low
@@ -404,21 +416,19 @@ class Baseline:
         self._forced[taxels] = True
 
     def _calm(self, deviation: Floats, live: Flags, held: Flags, low: Flags, off: Floats) -> Calm:
-        offsets, touches, last = self._offsets, self._touches, self._intake.last
+        offsets, touches = self._offsets, self._touches
         known = np.where(live, deviation, touches.smooth)
         touched = touches.shown(known, off)
         value = np.where(touched, known if touches.signed else np.maximum(known, 0), np.float32(0))
         why = np.where(touched, np.uint8(Why.HELD), np.uint8(Why.REST))
         why[~self._ready | (offsets.variance > offsets.noise2) & ~touches.touched] = Why.RELEARNING
         why[low] = Why.COVERED
-        why[self._surroundings.returned > 0] = Why.DOUBTED
-        least, most = self._limits
-        if math.isfinite(least) and math.isfinite(most):
-            why[live & ((last >= most) | (last <= least)) & touches.touched] = Why.SATURATED
+        why[self._falls.returned > 0] = Why.DOUBTED
+        why[touches.touched & self._at_end()] = Why.SATURATED
         if self._intake.few_levels:
             why[live] = Why.NO_RESOLUTION
         forced, self._forced = self._forced, np.zeros(len(live), bool)
-        baseline = offsets.level + touches.remains
+        baseline = offsets.level + touches.remainders.left
         held = np.ones_like(held) if self._all_held else held
         return Calm(
             value,
@@ -468,5 +478,6 @@ class Baseline:
         offsets, touches = self._offsets, self._touches
         of_offsets = {name: getattr(offsets, name) for name in ("level", "gain", "variance", "cross", "noise2")}
         of_offsets["gain_variance"] = offsets.gain_variance
-        of_touches = {name: getattr(touches, name) for name in ("touched", "smooth", "peak", "used", "contact_s")}
+        of_touches = {name: getattr(touches, name) for name in ("touched", "smooth", "peak", "contact_s")}
+        of_touches["used"] = touches.remainders.used
         return {"ready": self._ready} | of_offsets | of_touches

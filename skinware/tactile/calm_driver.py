@@ -79,7 +79,7 @@ class DriverSource:
 
 
 SENSOR_COLUMNS = {"uncertainty": "<f4", "why": "u1"}
-"""What a calmed driver publishes of each sensor beside values and status: dtypes by name, see :class:`.Calm`."""
+"""Dtypes, by name, of the columns of a calmed driver with an entry per sensor, beside values and status."""
 
 
 class CalmedDriver:

@@ -37,7 +37,7 @@ _MEDIAN = 0.455
 _GAIN_PER_S = GAIN_SPREAD**2 / GAIN_LASTS_S
 
 
-class Groups:
+class Grouping:
     """Sums n values by group.
 
     Args:
@@ -159,7 +159,7 @@ class Offsets:
         self.variance, self.cross, self.slow = (np.zeros(n, np.float32) for _ in range(3))
         self.gain_variance: Floats = np.full(n, GAIN_SPREAD**2, np.float32)
         self.noise2: Floats = np.full(n, np.nan, np.float32)
-        self.patches = Groups(patch)
+        self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
         self.agility = np.zeros(self.patches.n)
         self._gain_before: Floats = self.gain.copy()

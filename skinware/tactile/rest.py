@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.offsets import Groups
+from skinware.tactile.offsets import Grouping
 from skinware.tactile.rule import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD, MOVED_SHARE, BaselineSettings
 
 Floats = npt.NDArray[np.float32]
@@ -52,7 +52,7 @@ class Rest:
         moves2: (n_patches,) by how much the common modes move from frame to frame, squared.
     """
 
-    def __init__(self, patches: Groups) -> None:
+    def __init__(self, patches: Grouping) -> None:
         self.refused_share = 0.0
         self.moves2 = np.zeros(patches.n)
         self._patches = patches
@@ -64,7 +64,7 @@ class Rest:
         self._begun_ns: int | None = None
         self._frames = 0
         self._sums = np.zeros((6, n), np.float32)
-        """Of frames, deviations d from the first value, common modes c, d * d, d * c and c * c."""
+        """Sums of frames, deviations d from the first value, common modes c, d * d, d * c and c * c."""
         self._blocks: deque[Floats] = deque(maxlen=BLOCKS)
         self._common: Floats = np.zeros(self._patches.n, np.float32)
 

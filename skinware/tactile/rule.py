@@ -51,7 +51,7 @@ MOVED_SHARE = 0.05
 FORGET_AFTER_S = 600.0
 """Seconds without data after which a baseline is measured again: a skin that warms up drifts farther than a touch."""
 
-# What is learned of drift
+# Drift, as it is learned
 
 GAIN_SPREAD = 0.3
 """Standard deviation of the gains of taxels to the common mode, around 1, before anything is known."""
@@ -65,7 +65,6 @@ MATCH_S = 2.0
 """Seconds in which the agility of the common mode changes e-fold, until it explains how the mode moves."""
 RATE_S = 30.0
 """Seconds: the speed of the common drift is averaged over this, so that what comes and goes does not count."""
-"""Fluctuations slower than this are drift of the taxel, not its noise."""
 SLOW_S = 5.0
 """Seconds: deviations that last longer are drift of the taxel, quicker ones are its noise."""
 NOISE_S = 60.0

@@ -1,11 +1,11 @@
-"""Follow what contacts do to the taxels around them: they are held, they sag, and some were covered at the start."""
+"""Follow what contacts do to the taxels around them: they are held, they sag, and some were covered before."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.offsets import Groups
+from skinware.tactile.offsets import Grouping
 from skinware.tactile.rule import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
 from skinware.tactile.touches import Touches
 
@@ -15,7 +15,7 @@ Rows = npt.NDArray[np.intp]
 
 
 class Surroundings:
-    """Follows what is near contacts of n taxels, and which taxels are far below their offsets.
+    """Follows what is near contacts of n taxels.
 
     Args:
         module: (n,) int, the module of each taxel.
@@ -23,33 +23,20 @@ class Surroundings:
         neighbours: (n, k) int, the taxels near each, filled with -1, in place of its module.
 
     Attributes:
+        module, patch: as given.
+        n_modules: number of modules.
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
-        returned: (n,) uint8, how often each returned to where it had fallen from: touches may lower it.
-        below: (n,) bool, it is below its offset, and most of its patch is not.
-        sagging: (n,) bool, it has sunk there: it comes back, and says nothing of drift.
+        largest: (n_patches,) the largest load of each patch.
     """
 
     def __init__(self, module: Rows, patch: Rows, neighbours: npt.NDArray[np.integer] | None) -> None:
-        n = len(module)
-        self._module, self._patch, self._neighbours = module, patch, neighbours
-        self._n_modules = int(module.max(initial=-1)) + 1
-        self._largest = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
-        """The largest load of each patch."""
-        self._since_s = np.full(len(self._largest), np.inf)
-        self._settling_s: Floats = np.zeros(n, np.float32)
-        self._below_s: Floats = np.zeros(n, np.float32)
-        self._old_s = np.full(self._n_modules, np.inf)
-        """How long ago each module was touched by what is no new touch."""
-        self._sunk: Floats = np.zeros(n, np.float32)
-        """How far each has sagged since something touches its patch."""
-        self._dip: Floats = np.zeros(n, np.float32)
-        """How far each fell when it got its newest offset, for a while."""
-        self._dip_s: Floats = np.zeros(n, np.float32)
-        self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
+        self.module, self.patch, self._neighbours = module, patch, neighbours
+        self.n_modules = int(module.max(initial=-1)) + 1
+        self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
+        self.busy: Flags = np.zeros(len(module), bool)
+        self._since_s = np.full(len(self.largest), np.inf)
+        self._settling_s: Floats = np.zeros(len(module), np.float32)
         self._n_held = 0
-        self.busy: Flags = np.zeros(n, bool)
-        self.below: Flags = np.zeros(n, bool)
-        self.sagging: Flags = np.zeros(n, bool)
 
     def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> Flags:
         """Return (n,) the taxels that are near a contact, or were in the last ``settle_s``."""
@@ -59,41 +46,77 @@ class Surroundings:
         np.maximum(self._settling_s - np.float32(passed_s), 0, out=self._settling_s)
         self._since_s += passed_s
         over = self._since_s > max(settle_s, 1e-9)
-        self._largest[over] = 0
+        self.largest[over] = 0
         if len(active):
-            patch = self._patch[active]
+            patch = self.patch[active]
             self._since_s[patch] = 0
-            np.maximum.at(self._largest, patch, touches.smooth[active])
+            np.maximum.at(self.largest, patch, touches.smooth[active])
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
-        self.busy = (self._since_s <= settle_s)[self._patch]
+        self.busy = (self._since_s <= settle_s)[self.patch]
         held: Flags = self._settling_s > 0
         self._n_held = int(np.count_nonzero(self.busy)) + int(np.count_nonzero(held))
         return held
 
-    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Groups) -> None:
+    def _near(self, active: Rows) -> Flags:
+        if self._neighbours is None:
+            touched_modules = np.zeros(self.n_modules, bool)
+            touched_modules[self.module[active]] = True
+            return touched_modules[self.module]
+        around = self._neighbours[active].ravel()
+        near = np.zeros(len(self.module), bool)
+        near[around[around >= 0]] = True
+        near[active] = True
+        return near
+
+    def forget(self, taxels: Flags) -> None:
+        """Drop what is known of some taxels."""
+        self._settling_s[taxels] = 0
+
+
+class Falls:
+    """Follows n taxels that are below their offsets: they sag, were covered before, or a touch lowers them.
+
+    Args:
+        surroundings: what is near contacts.
+
+    Attributes:
+        below: (n,) bool, it is below its offset, and most of its patch is not.
+        sagging: (n,) bool, it has sunk since something touches its patch: it comes back, and says nothing of drift.
+        returned: (n,) uint8, how often each returned to where it had fallen from: touches may lower it.
+    """
+
+    def __init__(self, surroundings: Surroundings) -> None:
+        n = len(surroundings.module)
+        self._around = surroundings
+        self._below_s: Floats = np.zeros(n, np.float32)
+        self._old_s = np.full(surroundings.n_modules, np.inf)
+        """How long ago each module was touched by what is no new touch."""
+        self._sunk: Floats = np.zeros(n, np.float32)
+        """How far each has sagged since something touches its patch."""
+        self._dip: Floats = np.zeros(n, np.float32)
+        """How far each fell when it got its newest offset, for a while."""
+        self._dip_s: Floats = np.zeros(n, np.float32)
+        self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
+        self._before: Flags = np.zeros(n, bool)
+        """Which were below before anything touched their patch."""
+        self.below: Flags = np.zeros(n, bool)
+        self.sagging: Flags = np.zeros(n, bool)
+
+    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Grouping) -> None:
         """Find the taxels at rest that are below their offsets, unless most of their patch is: that is common."""
         below = rests & (smooth < np.where(self.below, np.float32(0), np.float32(-0.5) * off))
         if below.any():
             common = patches.sum(below) > 0.5 * patches.sum(rests)
             if common.any():
-                below &= ~common[self._patch]
+                below &= ~common[self._around.patch]
         self.below = below
-        if self.busy.any():
-            self.sagging = below & self.busy
-            self._sunk = np.where(self.busy, np.maximum(self._sunk, -smooth * self.sagging), np.float32(0))
+        self._before = np.where(self._around.busy, self._before, below)
+        if self._around.busy.any():
+            self._before &= below | ~self._around.busy
+            self.sagging = below & self._around.busy & ~self._before
+            self._sunk = np.where(self._around.busy, np.maximum(self._sunk, -smooth * self.sagging), np.float32(0))
         elif self.sagging.any():
             self.sagging = np.zeros_like(below)
-
-    def _near(self, active: Rows) -> Flags:
-        if self._neighbours is None:
-            touched_modules = np.zeros(self._n_modules, bool)
-            touched_modules[self._module[active]] = True
-            return touched_modules[self._module]
-        around = self._neighbours[active].ravel()
-        near = np.zeros(len(self._module), bool)
-        near[around[around >= 0]] = True
-        near[active] = True
-        return near
 
     def recovered(self, low: Flags, smooth: Floats, passed_s: float, after_s: float) -> Rows:
         """Return the taxels that have been far below their offsets for ``after_s``, and do not sag."""
@@ -102,8 +125,8 @@ class Surroundings:
             return np.zeros(0, np.intp)
         self._below_s = np.where(low, self._below_s + np.float32(passed_s), np.float32(0))
         due = self._below_s >= max(after_s, 1e-9)
-        if self._largest.any():
-            due &= -smooth > SAG_SHARE * self._largest[self._patch]
+        if self._around.largest.any():
+            due &= -smooth > SAG_SHARE * self._around.largest[self._around.patch]
         self._below_s[due] = 0
         self._dip[due], self._dip_s[due] = -smooth[due], 0
         return np.flatnonzero(due)
@@ -112,7 +135,7 @@ class Surroundings:
         """Return the new touches that are none: the taxels return to where they fell from, or sagged from."""
         self._old_s += passed_s
         looked, old = touches.looked(passed_s)
-        self._old_s[self._module[old]] = 0
+        self._old_s[self._around.module[old]] = 0
         if self._dip.any():
             self._dip_s += np.float32(passed_s)
             self._dip[self._dip_s > DIP_S] = 0
@@ -123,13 +146,8 @@ class Surroundings:
         dipped = rows[returns]
         self.returned[dipped] = np.minimum(self.returned[dipped], 254) + 1
         self._dip[dipped] = 0
-        old_s, sunk = self._old_s[self._module[rows]], self._sunk[rows]
+        old_s, sunk = self._old_s[self._around.module[rows]], self._sunk[rows]
         returns |= (old_s > 0) & (old_s < SAG_RETURNS_S) & (sunk > 0)
         returns &= (self._sunk[rows] == 0) | (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
         none: Rows = rows[returns]
         return none
-
-    def forget(self, taxels: Flags) -> None:
-        """Drop what is known of some taxels."""
-        self._settling_s[taxels] = 0
-        self._below_s[taxels] = 0

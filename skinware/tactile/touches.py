@@ -7,27 +7,23 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.offsets import Groups, Offsets
+from skinware.tactile.offsets import Grouping, Offsets
+from skinware.tactile.remainders import Remainders
 from skinware.tactile.rule import (
     ALIKE,
     DRIFT_SIGMA,
-    FADED,
     FALLEN,
     LOOK_AT_S,
     MOST_ALIKE,
-    MOST_REMAINDER,
     OFF_TO_ON,
     PEAK_S,
     STEP_OVER_ON,
-    USED_S,
 )
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 
-_LEFT_AT_S = 3.0
-"""Seconds after a sudden fall at which it is noted what is left."""
 _QUICK_S = 0.12
 """Seconds: with frames more apart, one high value is a touch; with more frames it takes two."""
 
@@ -44,9 +40,8 @@ class Touches:
         touched: (n,) bool.
         smooth: (n,) float32, deviation from the offset, smoothed.
         peak: (n,) float32, the highest load of the touch, slowly followed.
-        used: (n,) float32, the load that the material is used to.
         contact_s: (n,) float32, how long each has been touched.
-        remainder: (n_patches,) share of the load that a cover keeps for a while after it.
+        remainders: what covers keep of loads.
     """
 
     def __init__(self, module: Rows, patch: Rows, *, signed: bool) -> None:
@@ -54,20 +49,9 @@ class Touches:
         self.signed = signed
         self.touched: Flags = np.zeros(n, bool)
         self._high: Flags = np.zeros(n, bool)
-        self.smooth, self.peak, self.used, self.contact_s = (np.zeros(n, np.float32) for _ in range(4))
-        self._steady: Floats = np.zeros(n, np.float32)
-        self._since_fall_s: Floats = np.full(n, np.inf, np.float32)
-        self._left: Floats = np.full(n, np.nan, np.float32)
-        self._used_then: Floats = np.zeros(n, np.float32)
-        self._modules, self._patch = Groups(module), patch
-        self.remainder: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
-        self._since_end_s: Floats = np.full(n, np.inf, np.float32)
-        self._remains: Floats = np.zeros(n, np.float32)
-
-    @property
-    def remains(self) -> Floats:
-        """(n,) what is left of loads that are over, by what the material is used to."""
-        return self._remains
+        self.smooth, self.peak, self.contact_s = (np.zeros(n, np.float32) for _ in range(3))
+        self._modules, self._patch = Grouping(module), patch
+        self.remainders = Remainders(self._modules, patch)
 
     def load(self, deviation: Floats) -> Floats:
         return np.abs(deviation) if self.signed else deviation
@@ -106,10 +90,8 @@ class Touches:
         if len(begun):
             self.touched[begun] = True
             self.peak[begun] = smooth[begun]
-            self._steady[begun] = smooth[begun]
+            self.remainders.begin(begun, smooth[begun])
             self.contact_s[begun] = 0
-            self._since_fall_s[begun] = np.inf
-            self._left[begun] = np.nan
         active = np.flatnonzero(self.touched & live)
         if not len(active):
             return active
@@ -117,11 +99,11 @@ class Touches:
         self.contact_s[active] += np.float32(passed_s)
         peak = self.peak[active]
         self.peak[active] = peak + np.maximum(load - peak, 0) * np.float32(-math.expm1(-passed_s / PEAK_S))
-        variance = offsets.variance[active] + offsets.noise2[active] + (0.3 * self._remains[active]) ** 2
+        variance = offsets.variance[active] + offsets.noise2[active] + (0.3 * self.remainders.left[active]) ** 2
         variance += offsets.gain[active] ** 2 * offsets.common.variance[self._patch[active]].astype(np.float32)
         is_over = load < off[active]
         is_over |= (load < FALLEN * self.peak[active]) & (load * load < DRIFT_SIGMA**2 * variance)
-        fades = self._fades(active, load, off[active], passed_s)
+        fades = self.remainders.fade(active, load, off[active], passed_s)
         is_over |= fades
         is_over |= self.contact_s[active] > most_s
         return active[is_over]
@@ -130,53 +112,6 @@ class Touches:
         """Return (n,) the touched taxels, without those whose present load is gone while the smoothed one is not."""
         shown: Flags = self.touched & (self.load(deviation) >= np.minimum(off, FALLEN * self.load(self.smooth)))
         return shown
-
-    def _fades(self, active: Rows, load: Floats, off: Floats, passed_s: float) -> Flags:
-        """Return (k,) where what was left after a sudden fall faded by itself, and learn how much remains."""
-        steady = self._steady[active]
-        fell = (load < FALLEN * steady) & (steady > 2 * off)
-        moved = fell | (np.abs(load - steady) > off)
-        steady = np.where(fell, load, steady + (load - steady) * np.float32(-math.expm1(-passed_s)))
-        left = np.where(moved, np.nan, self._left[active])
-        since = np.where(fell, 0, np.where(moved & np.isfinite(self._left[active]), np.inf, self._since_fall_s[active]))
-        since = since + np.float32(passed_s)
-        notes = np.isnan(left) & (since >= _LEFT_AT_S) & (since < 2 * _LEFT_AT_S)
-        left = np.where(notes, steady, left)
-        then = np.where(notes, self.used[active], self._used_then[active])
-        self._steady[active], self._left[active] = steady, left
-        self._since_fall_s[active], self._used_then[active] = since, then
-        faded: Flags = (steady < np.minimum(FADED * left, left - 0.5 * off)) & (left < MOST_REMAINDER * then)
-        faded &= since < 2 * USED_S
-        if faded.any():
-            self._learn_remainder(active[faded], left[faded], then[faded], 1.0)
-        return faded
-
-    def _learn_remainder(self, taxels: Rows, left: Floats, used: Floats, weight: float) -> None:
-        patch = self._patch[taxels]
-        power = np.bincount(patch, used * used, len(self.remainder))
-        found = np.bincount(patch, left * used, len(self.remainder)) / np.maximum(power, 1e-12)
-        change = np.float32(weight) * (found.astype(np.float32) - self.remainder)
-        self.remainder += np.where(power > 0, change, 0)
-        np.clip(self.remainder, 0, MOST_REMAINDER, out=self.remainder)
-
-    def remember(self, deviation: Floats, on: Floats, passed_s: float) -> None:
-        """Follow what the material is used to, and predict what remains of it."""
-        rows = np.flatnonzero(self.touched | (self.used > 0) | (self._since_end_s < 1))
-        if not len(rows):
-            return
-        load = np.where(self.touched[rows], np.maximum(self.load(deviation[rows]), 0), np.float32(0))
-        used = self.used[rows]
-        used += (load - used) * np.float32(-math.expm1(-passed_s / USED_S))
-        used[(used < 0.5 * on[rows]) & ~self.touched[rows]] = 0
-        self.used[rows] = used
-        after = self._since_end_s[rows]
-        self._since_end_s += np.float32(passed_s)
-        due = (after < 1) & (after + passed_s >= 1) & ~self.touched[rows] & (used > 5 * on[rows])
-        if due.any():
-            due &= self._modules.sum(self.touched)[self._modules.group[rows]] == 0  # else a weaker grip may be left
-            taxels = rows[due]
-            self._learn_remainder(taxels, self.load(self.smooth[taxels]) + self._remains[taxels], used[due], 0.5)
-        self._remains[rows] = self.remainder[self._patch[rows]] * np.maximum(used - load, 0)
 
     def looked(self, passed_s: float) -> tuple[Flags, Flags]:
         """Return (n,) the touches that are looked at again in this frame, and (n,) those that were."""
@@ -203,22 +138,16 @@ class Touches:
         stepped = np.flatnonzero(here & alike[modules.group])
         return stepped, median[modules.group[stepped]]
 
-    @property
-    def has_settled(self) -> Flags:
-        """(n,) which taxels' last touch has been over for a second: what is left of it is known now."""
-        settled: Flags = self._since_end_s >= 1
-        return settled
-
     def forget(self, taxels: Rows) -> None:
         """Drop what is known of some taxels."""
         self.end(taxels)
-        for array in (self.smooth, self.used, self._remains):
-            array[taxels] = 0
-        self._since_end_s[taxels] = np.inf
+        self.smooth[taxels] = 0
+        self.remainders.forget(taxels)
 
     def end(self, taxels: Rows) -> None:
         """Drop the touches of some taxels."""
         self.touched[taxels] = False
-        self._since_end_s[taxels] = 0
+        if not self.signed:
+            self.remainders.since_end_s[taxels] = 0
         for of_contact in (self.peak, self.contact_s):
             of_contact[taxels] = 0

@@ -265,7 +265,10 @@ def check(evidence: Evidence) -> Iterator[Note]:
                 if bus.load is not None and bus.load > HIGH_LOAD:
                     waiting = f"load {100 * bus.load:.0f} %: frames with high identifiers wait, or never come"
                     yield FULL_WIRE.found(where, waiting, _ERROR if bus.load > FULL else None, **names)
+            late = bus.counted.grown.get("polls_late", 0)
             for name, rule in LOSSES.items():
+                if name == "polls_unanswered" and 0 < bus.counted.grown.get(name, 0) <= late:
+                    continue  # the answers came after all: the devices are slow, not silent
                 loss = loss_in_words(bus.counted, name, rule.unit, evidence)
                 if loss is not None:
                     of = f" of {plural(bus.counted.grown.get('frames', 0), 'frame')}" if loss.is_going_on else ""

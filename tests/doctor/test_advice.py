@@ -68,7 +68,9 @@ def patch(name: str, bus: str, state: str, **changes: object) -> PatchSeen:
 
 
 def bus(name: str, state: str = "live", reason: str = "") -> BusSeen:
-    return BusSeen(name, state, reason, 3.0, 0.97, counted(buses.LOSSES), ("unknown: 7FF",), (Change(0.0, state),))
+    losses = counted(buses.LOSSES)
+    losses = dataclasses.replace(losses, grown={**losses.grown, "polls_late": 900})
+    return BusSeen(name, state, reason, 3.0, 0.97, losses, ("unknown: 7FF",), (Change(0.0, state),))
 
 
 def ill(driver: DriverSeen, name: str, kind: str) -> Iterator[DriverSeen]:
@@ -248,6 +250,18 @@ def test_operations_are_advised_of_drivers_that_have_them(everything: list[Exami
         skin.status[:5] = Status.SUSPECT
         doubtful = found_until(of("taxels", "doubtful"), seconds=0.1)
     assert doubtful.commands == ("skin-info torso",)
+
+
+@pytest.mark.parametrize(("late", "is_silent"), [(999, True), (1000, False)])
+def test_late_answers_are_not_called_missing(late: int, is_silent: bool) -> None:
+    with publishing(FakeSkin("torso")):
+        seen = looked(0.0)
+    counts = {"frames": 1000, "polls_unanswered": 1000, "polls_late": late}
+    slow = dataclasses.replace(bus("/dev/ttyUSB0"), counted=Counted(counts, counts))
+    evidence = dataclasses.replace(seen, drivers=(dataclasses.replace(seen.drivers[0], buses=(slow,)),))
+    faults = [finding.what for finding in examine(evidence).findings]
+    assert "answers of devices came after their timeout" in faults
+    assert ("devices did not answer" in faults) == is_silent
 
 
 def test_advice_reaches_the_namespace_that_was_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:

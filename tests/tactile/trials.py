@@ -322,7 +322,7 @@ def _sine(counts: float, period_s: float) -> Trial:
         _wave(counts, period_s),
         held=(("hold", 12 + _CENTRE, 31, 329),),
         over_s=335 if counts < 20 else None,
-        how={"drift_per_min": 0.5},
+        how={"drift_per_min": 0.5, "idle": 40.0},
     )
 
 

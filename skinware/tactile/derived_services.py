@@ -175,10 +175,11 @@ class CalmContacts(DerivedService[ContactsWriter]):
         calm = stage.calm
         if calm is None:
             return {}
-        onset = self._onsets.update(stage.given - calm.baseline, calm.noise, usable & calm.usable)
+        doubt = np.hypot(calm.noise, calm.uncertainty)
+        onset = self._onsets.update(stage.given - calm.baseline, doubt, usable & calm.usable)
         same_unit = self._writer is not None and self._writer.source.unit == stage.before.type.unit
         clipped = stage.given >= stage.before.type.maximum
-        return {"onset": onset, "clipped": clipped, "uncertainty": calm.noise if same_unit else None}
+        return {"onset": onset, "clipped": clipped, "uncertainty": doubt if same_unit else None}
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""

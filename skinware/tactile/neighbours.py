@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +53,29 @@ def neighbours(geometry: Geometry, radius_m: float | None = None) -> Table:
     rows, frame = _placed(geometry)
     one, other = _pairs_within_1(frame, geometry.position_m[rows] / radius[rows, None])
     return _table(*_on_one_side(geometry.normal, rows[one], rows[other]), n)
+
+
+def posed(geometry: Geometry, poses: Mapping[str, npt.ArrayLike], frame: str = "common") -> Geometry:
+    """Return a geometry with the places of several frames in one, so that contacts across their border are found.
+
+    Args:
+        geometry: places of n taxels. Those in frames without a pose stay.
+        poses: by name of a frame, (4, 4) its pose in the common one.
+        frame: name of the common one.
+
+    Raises:
+        ConfigurationError: a pose that is not (4, 4) finite numbers.
+    """
+    position, normal, frames = geometry.position_m.copy(), geometry.normal.copy(), geometry.frame.astype(object)
+    for name, given in poses.items():
+        pose = np.asarray(given, np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ConfigurationError(f"pose of frame {name!r}: give (4, 4) finite numbers")
+        rows = geometry.frame == name
+        position[rows] = position[rows] @ pose[:3, :3].T + pose[:3, 3]
+        normal[rows] = normal[rows] @ pose[:3, :3].T
+        frames[rows] = frame
+    return replace(geometry, position_m=position, normal=normal, frame=frames.astype(str))
 
 
 def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:

@@ -52,7 +52,7 @@ class Onsets:
 
         Args:
             above: (n,) how far each value is above its baseline, not smoothed.
-            noise: (n,) standard deviation of each from frame to frame; NaN: not known, so that nothing is found.
+            noise: (n,) standard deviation of that, noise and baseline; NaN: not known, so that nothing is found.
             usable: (n,) bool, which values are of this frame.
         """
         is_above = usable & (above > np.maximum(_ABOVE_SIGMA * noise, self._least))

@@ -44,7 +44,7 @@ def _in_table(end: tuple[str, int]) -> str:
     return "".join(f"{word:08X}" for word in words) + f":{end[1]:04X}"
 
 
-class RequestRefused(Exception):
+class AccessRefused(Exception):
     """A request is refused.
 
     Attributes:
@@ -79,17 +79,17 @@ class Access:
         host = _only(headers, "Host")
         name = urlsplit(f"http://{host}").hostname
         if not host or (self._hosts is not None and name not in self._hosts):
-            raise RequestRefused(
+            raise AccessRefused(
                 HTTPStatus.FORBIDDEN, "this server has another name: open the address that skin-view printed"
             )
         origin = _only(headers, "Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
-            raise RequestRefused(HTTPStatus.FORBIDDEN, "pages of other sites may not see this skin")
+            raise AccessRefused(HTTPStatus.FORBIDDEN, "pages of other sites may not see this skin")
         if self.token is not None and not (
             self.has_token(target)
             or hmac.compare_digest(_cookie(headers, self._cookie_name).encode(), self.token.encode())
         ):
-            raise RequestRefused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
+            raise AccessRefused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
 
     def check_account(self, peer: tuple[str, int], here: tuple[str, int]) -> None:
         """Check that the account at the other end of a connection may look.
@@ -101,7 +101,7 @@ class Access:
             Refused: it may not look.
         """
         if self.token is None and account_of(peer, here) not in (os.geteuid(), 0):
-            raise RequestRefused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
+            raise AccessRefused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
 
     def has_token(self, target: str) -> bool:
         given = parse_qs(urlsplit(target).query).get("token", [""])[0]
@@ -128,7 +128,7 @@ def _only(headers: Mapping[str, str], name: str) -> str | None:
     try:
         return headers.get(name)
     except LookupError:
-        raise RequestRefused(HTTPStatus.BAD_REQUEST, f"more than one {name}") from None
+        raise AccessRefused(HTTPStatus.BAD_REQUEST, f"more than one {name}") from None
 
 
 def _cookie(headers: Mapping[str, str], name: str) -> str:

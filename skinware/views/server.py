@@ -19,7 +19,7 @@ from websockets.http11 import Request, Response
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.views import operations
-from skinware.views.access import Access, RequestRefused
+from skinware.views.access import Access, AccessRefused
 from skinware.views.following import Follower
 from skinware.views.recording import RecordingProgram, ReplayControl
 from skinware.views.tree import problem_of_all
@@ -110,7 +110,7 @@ class ViewServer:
             if path == "/live":
                 return None
             return self._file(path, request)
-        except RequestRefused as refused:
+        except AccessRefused as refused:
             return _response(refused.status, f"{refused}\n".encode(), "text/plain")
         except ValueError:  # the path cannot be an address
             return _response(HTTPStatus.BAD_REQUEST, b"", "text/plain")
@@ -125,7 +125,7 @@ class ViewServer:
         files |= {f"/mesh/{number}": mesh.file for number, mesh in enumerate(self._follower.robot.meshes)}
         file = files.get("/index.html" if path == "/" else path)
         if file is None or not file.is_file():
-            raise RequestRefused(HTTPStatus.NOT_FOUND, "there is no such file")
+            raise AccessRefused(HTTPStatus.NOT_FOUND, "there is no such file")
         return _response(HTTPStatus.OK, file.read_bytes(), _type_of(file))
 
     async def _attend(self, connection: ServerConnection) -> None:

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.tactile.neighbours import NONE, area_m2, checked, neighbours, neighbours_of_pairs, pitch_m
-from tests.tactile.skins import PITCH_M, placed, triangles
+from skinware.tactile.contacts import Contacts
+from skinware.tactile.neighbours import NONE, area_m2, checked, neighbours, neighbours_of_pairs, pitch_m, posed
+from tests.tactile.skins import AT_ONCE, PITCH_M, placed, triangles
 
 
 def as_sets(table: npt.NDArray[np.int32]) -> list[set[int]]:
@@ -151,3 +152,22 @@ def test_a_table_is_made_symmetric_or_refused() -> None:
         checked(np.zeros((3, 2), np.int32), 4)
     with pytest.raises(ConfigurationError, match="only 2 taxels"):
         checked(np.array([[7], [-1]]), 2)
+
+
+def test_a_contact_across_the_border_of_posed_frames_is_one() -> None:
+    side = np.where(np.arange(32) % 8 < 4, "left", "right")
+    here = placed(triangles(4, 8), side, normal=[0, 0, 1])
+    turn = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1.0]])
+    rows = here.frame == "right"
+    apart = placed(here.position_m, here.frame, here.normal)
+    apart.position_m[rows] = (apart.position_m[rows] - turn[:3, 3]) @ turn[:3, :3]
+    together = posed(apart, {"left": np.eye(4), "right": turn})
+    assert np.allclose(together.position_m, here.position_m)
+    assert set(together.frame) == {"common"}
+    value = np.ones(32)
+    for geometry in (apart, together):
+        contacts = Contacts(32, neighbours(together), geometry, tracking=AT_ONCE)
+        (contact,) = contacts.update(value, value > 0, 0)
+        assert contact.n == 32
+    with pytest.raises(ConfigurationError, match="pose of frame 'left'"):
+        posed(apart, {"left": np.eye(3)})

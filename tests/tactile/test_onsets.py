@@ -60,7 +60,7 @@ class TouchedSkin:
         pressed[PRESSED] += load
         values: npt.NDArray[np.float32] = np.round(pressed).astype(np.float32)
         calm = self._baseline.update(self._time_ns, values)
-        onset = self._onsets.update(values - calm.baseline, calm.noise, calm.usable)
+        onset = self._onsets.update(values - calm.baseline, np.hypot(calm.noise, calm.uncertainty), calm.usable)
         found = self._contacts.update(calm.value, calm.touched, self._time_ns, onset=onset)
         return self._events.of(found, self._time_ns)
 

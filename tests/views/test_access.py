@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.exceptions import InvalidStatus
 
-from skinware.views.access import Access, RequestRefused, account_of, is_loopback
+from skinware.views.access import Access, AccessRefused, account_of, is_loopback
 from skinware_drivers.testing.waiting import PATIENCE_S
 from tests.views.client import page_of
 from tests.views.conftest import INDEX, Serve
@@ -124,7 +124,7 @@ def test_any_request_is_judged(headers: dict[str, str], target: str) -> None:
     for access in (Access("127.0.0.1"), Access("127.0.0.1", TOKEN), Access("0.0.0.0", TOKEN)):
         try:
             access.check(target, headers)
-        except (RequestRefused, ValueError):
+        except (AccessRefused, ValueError):
             continue
         assert access.token is None
         assert headers["Host"].lower().strip("[]:0123456789.") in ("", "localhost") or "@" in headers["Host"]

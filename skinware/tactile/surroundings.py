@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.tactile.offsets import Grouping
-from skinware.tactile.rule import DIP_S, OFF_TO_ON, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
+from skinware.tactile.rule import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
 from skinware.tactile.touches import Touches
 
 Floats = npt.NDArray[np.float32]
@@ -152,7 +152,8 @@ class Falls:
         self.returned[dipped] = np.minimum(self.returned[dipped], 254) + 1
         self._dip[dipped] = 0
         old_s, sunk = self._old_s[self._around.module[rows]], self._sunk[rows]
-        comes_back = (sunk > OFF_TO_ON * on[rows]) & (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
+        comes_back = (sunk > 0) & (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
+        comes_back &= touches.remainders.since_end_s[rows] > 2 * SAG_RETURNS_S  # else its own touch flickers
         returns |= (old_s > 0) & (old_s < SAG_RETURNS_S) & comes_back
         none: Rows = rows[returns]
         return none

@@ -323,13 +323,14 @@ class Baseline:
             self._falls.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
-            floor = np.float32(passed_s) / np.where(
-                touches.remainders.used > 0, np.float32(RESETTLE_S), np.float32(settings.tau_s)
-            )
+            floor: Floats | np.float32 = np.float32(min(passed_s / settings.tau_s, 0.5))
+            if touches.remainders.any_used:
+                quick = np.float32(min(passed_s / RESETTLE_S, 0.5))
+                floor = np.where(touches.remainders.used > 0, quick, floor)
             learns = live & ~touches.touched & ~self._falls.sagging & touches.remainders.has_settled
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
             calm = learns & (np.abs(touches.smooth) < np.float32(0.5) * off)
-            offsets.learn(deviation, learns, calm, np.minimum(floor, np.float32(0.5)), passed_s)
+            offsets.learn(deviation, learns, calm, floor, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
         if not touches.signed:
             touches.remainders.follow(deviation, touches.smooth, touches.touched, on, passed_s)
@@ -351,8 +352,10 @@ class Baseline:
         at_end: Flags = (last >= most) | (last <= least)
         return at_end
 
-    def _least_noise2(self, level: Floats) -> Floats:
+    def _least_noise2(self, level: Floats) -> Floats | np.float32:
         rounding = self._resolution * (0.05 if self._intake.few_levels else 1 / math.sqrt(12))
+        if rounding:
+            return np.float32(rounding**2)
         least: Floats = np.fmax(np.float32(rounding), EPSILON * np.abs(level) + TINY) ** 2
         return least
 

@@ -163,6 +163,8 @@ class Offsets:
         self.common = CommonMode(self.patches.n)
         self.agility = np.zeros(self.patches.n)
         self._gain_before: Floats = self.gain.copy()
+        self._grows: Floats = np.zeros(n, np.float32)
+        """Variance that each offset gains in a second by a drift of its own."""
         self._tick_s = 0.0
 
     def total(self) -> Floats:
@@ -205,7 +207,7 @@ class Offsets:
         self.variance += moved * (np.float32(2) * self.cross + doubt)
         self.cross += doubt
 
-    def learn(self, deviation: Floats, taxels: Flags, calm: Flags, floor: Floats, passed_s: float) -> None:
+    def learn(self, deviation: Floats, taxels: Flags, calm: Flags, floor: Floats | np.float32, passed_s: float) -> None:
         """Correct offsets and gains by the deviations of taxels at rest; let the others become less certain.
 
         Args:
@@ -217,7 +219,7 @@ class Offsets:
         """
         if passed_s <= 0:
             return
-        self.variance += self.patches.spread(self.agility * passed_s)
+        self.variance += self._grows * np.float32(passed_s)
         total = self.variance + self.noise2
         limit = np.float32(DRIFT_SIGMA) * np.sqrt(total)
         innovation = np.minimum(np.maximum(deviation, -limit), limit)
@@ -252,6 +254,7 @@ class Offsets:
         self.agility *= np.exp(self._tick_s / 10 * (2 * beyond - 1))
         typical = self.patches.sum(np.where(taxels, self.noise2, np.float32(0))) / number
         np.clip(self.agility, 1e-9 * typical, 1e-1 * typical, out=self.agility)
+        self._grows[:] = self.patches.spread(self.agility)
         forgets = np.where(taxels, np.float32(-math.expm1(-self._tick_s / GAIN_LASTS_S)), np.float32(0))
         self.gain += (1 - self.gain) * forgets
         self.gain_variance += (np.float32(GAIN_SPREAD**2) - self.gain_variance) * (2 * forgets)

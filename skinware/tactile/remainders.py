@@ -29,6 +29,7 @@ class Remainders:
 
     Attributes:
         used: (n,) float32, the load that the material is used to.
+        any_used: whether it is used to any.
         left: (n,) float32, what is left of loads that are over.
         share: (n_patches,) float32, share of a load that a cover keeps.
         since_end_s: (n,) float32, how long each has been free of touches.
@@ -42,6 +43,7 @@ class Remainders:
         self._noted: Floats = np.full(n, np.nan, np.float32)
         """How much was left some seconds after a fall."""
         self.since_end_s: Floats = np.full(n, np.inf, np.float32)
+        self.any_used = False
         self.share: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
 
     @property
@@ -100,6 +102,7 @@ class Remainders:
             on: (n,) threshold of touch.
             passed_s: since the last frame.
         """
+        self.any_used = bool(self.used.any())
         rows = np.flatnonzero(touched | (self.used > 0) | (self.since_end_s < _SETTLED_S))
         if not len(rows):
             return
@@ -115,4 +118,5 @@ class Remainders:
             due &= self._modules.sum(touched)[self._modules.group[rows]] == 0  # else a weaker grip may be left
             taxels = rows[due]
             self._learn(taxels, smooth[taxels] + self.left[taxels], used[due], 0.5)
+        self.any_used |= bool(used.any())
         self.left[rows] = self.share[self._patch[rows]] * np.maximum(used - now, 0)

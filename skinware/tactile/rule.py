@@ -90,7 +90,7 @@ STEP_OVER_ON = 3.0
 """Thresholds: a module whose taxels all rise alike by less moved its own baseline."""
 ALIKE = 0.3
 """Share of the median: taxels that are nearer to it moved alike."""
-MOST_ALIKE = 0.6
+MOST_ALIKE = 0.5
 """Share of the taxels of a module that have to."""
 SAG_RETURNS_S = 0.6
 """Seconds from the end of a contact in which the cover around it comes back, until that is looked at."""

@@ -93,6 +93,8 @@ class Falls:
         """How long ago each module was touched by what is no new touch."""
         self._sunk: Floats = np.zeros(n, np.float32)
         """How far each has sagged since something touches its patch."""
+        self._felt: Flags = np.zeros(n, bool)
+        """Which have ever risen under a touch: their polarity is right."""
         self._dip: Floats = np.zeros(n, np.float32)
         """How far each fell when it got its newest offset, for a while."""
         self._dip_s: Floats = np.zeros(n, np.float32)
@@ -136,18 +138,22 @@ class Falls:
         self._old_s += passed_s
         looked, old = touches.looked(passed_s)
         self._old_s[self._around.module[old]] = 0
+        self._felt |= old
         if self._dip.any():
             self._dip_s += np.float32(passed_s)
             self._dip[self._dip_s > DIP_S] = 0
         if not looked.any():
             return np.zeros(0, np.intp)
         rows = np.flatnonzero(looked)
-        returns = (self._dip[rows] > 0) & (np.abs(touches.smooth[rows] - self._dip[rows]) < on[rows])
+        returns = (
+            ~self._felt[rows] & (self._dip[rows] > 0) & (np.abs(touches.smooth[rows] - self._dip[rows]) < on[rows])
+        )
         dipped = rows[returns]
         self.returned[dipped] = np.minimum(self.returned[dipped], 254) + 1
         self._dip[dipped] = 0
         old_s, sunk = self._old_s[self._around.module[rows]], self._sunk[rows]
-        returns |= (old_s > 0) & (old_s < SAG_RETURNS_S) & (sunk > 0)
-        returns &= (self._sunk[rows] == 0) | (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
+        comes_back = (sunk > 0) & (touches.smooth[rows] < SAG_RETURNS_BY * sunk + on[rows])
+        comes_back &= touches.remainders.since_end_s[rows] > 2 * SAG_RETURNS_S  # else its own touch flickers
+        returns |= (old_s > 0) & (old_s < SAG_RETURNS_S) & comes_back
         none: Rows = rows[returns]
         return none

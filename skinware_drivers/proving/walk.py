@@ -94,7 +94,6 @@ class _Walk:
     def __init__(self, reader: DriverReader, person: Person, manner: Manner, proof: Proof) -> None:
         self._reader, self._person, self._manner, self._proof = reader, person, manner, proof
         structure = self._structure = reader.structure
-        self._names = structure.module_names
         names = [one.name for one in structure.types]
         chosen = manner.type_name or next((name for name in _FIRST_CHOICE if name in names), names[0])
         self._type = structure.type(chosen)
@@ -102,10 +101,12 @@ class _Walk:
         self._modules = [
             int(number)
             for number in np.unique(module)
-            if any(word.lower() in self._names[int(number)].lower() for word in manner.only or [""])
+            if any(word.lower() in self._structure.module_names[int(number)].lower() for word in manner.only or [""])
         ]
         if not self._modules:
-            raise StructureError(f"no module of {reader.name} has such a name; its modules: {', '.join(self._names)}")
+            raise StructureError(
+                f"no module of {reader.name} has such a name; its modules: {', '.join(self._structure.module_names)}"
+            )
         self._taxels = {int(number): np.flatnonzero(module == number) for number in np.unique(module)}
         self._rest: Values = np.zeros(0)
         self._low: Values = np.full(len(module), np.inf)
@@ -126,7 +127,7 @@ class _Walk:
             self._check_losses()
 
     def _check(self, module: int) -> None:
-        name = self._names[module]
+        name = self._structure.module_names[module]
         try:
             self._press(module)
             matrix = Matrix.of_kind(bytes(self._structure.module_kind[module]).decode(), len(self._taxels[module]))
@@ -193,11 +194,15 @@ class _Walk:
         for module in self._taxels:
             rate_hz = frames_hz * float(np.mean(np.diff(stamps[:, module]) != 0))
             if not last.period_ns:
-                self._proof.add("rate", self._names[module], Verdict.UNKNOWN, f"{rate_hz:.1f} a second")
+                self._proof.add(
+                    "rate", self._structure.module_names[module], Verdict.UNKNOWN, f"{rate_hz:.1f} a second"
+                )
                 continue
             nominal_hz = NS_PER_S / last.period_ns
             is_right = rate_hz >= _LEAST_RATE * nominal_hz
-            self._proof.add("rate", self._names[module], is_right, f"{rate_hz:.1f} of {nominal_hz:.1f} a second")
+            self._proof.add(
+                "rate", self._structure.module_names[module], is_right, f"{rate_hz:.1f} of {nominal_hz:.1f} a second"
+            )
 
     def _check_losses(self) -> None:
         if self._first is None or self._last is None:
@@ -211,7 +216,7 @@ class _Walk:
     # -- touched --------------------------------------------------------------------------------------------------
 
     def _press(self, module: int) -> None:
-        name, taxels = self._names[module], self._taxels[module]
+        name, taxels = self._structure.module_names[module], self._taxels[module]
         self._person.ask(Step("press", name, f"press {name}, and hold"))
         held: deque[int] = deque(maxlen=_HELD_FRAMES)
         most, signed, values, frame = 0, 0.0, self._rest, None
@@ -247,7 +252,7 @@ class _Walk:
             self._proof.add("saturation", name, True, "none at the end of the range")
 
     def _stroke(self, module: int, matrix: Matrix) -> None:
-        name, taxels = self._names[module], self._taxels[module]
+        name, taxels = self._structure.module_names[module], self._taxels[module]
         down = self._stroked(module, "stroke down", f"{name}: stroke slowly from the fingertip down, then lift")
         across = self._stroked(
             module, "stroke across", f"{name}: stroke slowly from left to right (fingers up, palm to you), then lift"
@@ -273,7 +278,7 @@ class _Walk:
 
     def _stroked(self, module: int, wanted: Wanted, text: str) -> Values:
         """Return (frames, n): distances of a module's taxels from their rest, from the first touch until the lift."""
-        self._person.ask(Step(wanted, self._names[module], text))
+        self._person.ask(Step(wanted, self._structure.module_names[module], text))
         taxels = self._taxels[module]
         found: list[Values] = []
         lifted_ns: int | None = None

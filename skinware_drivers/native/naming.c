@@ -112,7 +112,7 @@ static void count_wrong(struct path *path, const int64_t *rows, int64_t n, int64
 {
     const struct plan *plan = path->plan;
     const struct batch *batch = path->batch;
-    int64_t n_long = 0, n_odd = 0, *odd = path->found, why = 0;
+    int64_t n_wrong = 0, n_odd = 0, *odd = path->found, why = 0;
     for (int64_t i = 0; i < n; i++) {
         int64_t row = rows[i];
         path->is_wrong[row] = is_wrong(path, row, &why);
@@ -120,11 +120,11 @@ static void count_wrong(struct path *path, const int64_t *rows, int64_t n, int64
             continue;
         plan->bus_counters[batch->bus[row] * N_DECODER_COUNTERS + why]++;
         if (why == BAD_LENGTH)
-            path->rows[n_long++] = row;
+            path->rows[n_wrong++] = row;
         else
             odd[n_odd++] = row;
     }
-    keep_samples(path, SAMPLE_BAD_LENGTH, path->rows, n_long, time_ns);
+    keep_samples(path, SAMPLE_BAD_LENGTH, path->rows, n_wrong, time_ns);
     keep_samples(path, SAMPLE_BAD_CONTENT, odd, n_odd, time_ns);
 }
 

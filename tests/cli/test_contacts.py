@@ -27,7 +27,7 @@ from skinware.views.live import live_contacts, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until
-from tests.tactile.skins import triangles
+from tests.tactile.skins import AT_ONCE, triangles
 
 
 def placed_structure() -> Structure:
@@ -49,7 +49,10 @@ def pressed(*taxels: int) -> npt.NDArray[np.float64]:
 def touched_skin(*taxels: int, driver: str = "a") -> Iterator[ContactsWriter]:
     """Driver ``a`` that has published a frame, and contacts of ``driver`` on some taxels; default: two contacts."""
     value = pressed(*(taxels or (22, 23, 33, 78)))
-    with FakeSkin("a", placed_structure()) as skin, ContactsWriter(skin.structure, driver=driver) as contacts:
+    with (
+        FakeSkin("a", placed_structure()) as skin,
+        ContactsWriter(skin.structure, driver=driver, tracking=AT_ONCE) as contacts,
+    ):
         skin.publish(2)
         contacts.publish(value, value > 0, now_ns())
         yield contacts
@@ -100,7 +103,7 @@ def test_contacts_of_other_sensors_than_the_driver_has_are_not_told() -> None:
 
 def test_where_nobody_knows_places_a_contact_is_on_its_first_module() -> None:
     structure = fake_structure(2, 4)
-    with ContactsWriter(structure, driver="a") as writer, ContactsReader(writer.name) as reader:
+    with ContactsWriter(structure, driver="a", tracking=AT_ONCE) as writer, ContactsReader(writer.name) as reader:
         value = pressed(11, 14)
         writer.publish(value, value > 0, now_ns())
         (place,) = places_of(reader.read(timeout_s=10), structure)
@@ -181,9 +184,11 @@ def test_the_view_follows_a_contact() -> None:
             with publishing(skin):
                 await until(pilot, lambda: bool(line(app, "marks")))
                 assert not app.query_one("#contacts", Static).display
-                with ContactsWriter(skin.structure, driver="a") as writer:
-                    for taxel, module in ((29, "board 7, triangle 2"), (30, "board 7, triangle 3")):
-                        writer.publish(pressed(taxel), pressed(taxel) > 0, now_ns())
+                with ContactsWriter(skin.structure, driver="a", tracking=AT_ONCE) as writer:
+                    begin_ns = now_ns()
+                    moves = ((0, 29, "board 7, triangle 2"), (20_000_000, 30, "board 7, triangle 3"))
+                    for after_ns, taxel, module in moves:
+                        writer.publish(pressed(taxel), pressed(taxel) > 0, begin_ns + after_ns)
                         sensor = int(np.flatnonzero(skin.structure.sensor_type == PRESSURE.id)[taxel])
                         wanted = [(f"{taxel - 28}", sensor)]
                         await until(pilot, lambda wanted=wanted: marked(app) == wanted)  # type: ignore[misc]
@@ -191,7 +196,7 @@ def test_the_view_follows_a_contact() -> None:
                         assert titles == TITLES
                         assert contact.split()[0] == f"{taxel - 28}"
                         assert module in contact
-                    writer.publish(pressed(), pressed() > 0, now_ns())
+                    writer.publish(pressed(), pressed() > 0, begin_ns + 200_000_000)
                     await until(pilot, lambda: line(app, "contacts") == TITLES and not marked(app))
                     heat_map, panel = app.query_one(HeatMap), app.query_one("#contacts", Static)
                     assert app.screen.region.contains_region(panel.region)

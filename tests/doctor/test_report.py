@@ -111,7 +111,7 @@ def test_it_is_markdown_that_tells_all(namespace: Namespace) -> None:
         assert f"* evidence: {finding.evidence}" in text
     for looked_at in found.looked:
         assert f"| {looked_at.area} | {looked_at.what} |" in text
-    assert "bus can0: frames 5156 (+0), lost 2 (+0), unknown 7 (+0)" in text
+    assert "bus can0: frames 5156 (+0), dropped 2 (+0), unknown 7 (+0)" in text
     assert text.count("```") % 2 == 0
 
 

@@ -17,7 +17,7 @@ from skinware.views.robot import Robot
 from skinware.views.turns import PROTOCOL
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
-from tests.tactile.skins import triangles
+from tests.tactile.skins import AT_ONCE, triangles
 from tests.views.client import Page, page_of
 from tests.views.conftest import Serve
 from tests.views.test_scene import structure_of
@@ -220,7 +220,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
     with (
         publishing(raw),
         publishing(calm),
-        ContactsWriter(structure, driver="torso", namespace=calm_namespace) as contacts,
+        ContactsWriter(structure, driver="torso", tracking=AT_ONCE, namespace=calm_namespace) as contacts,
         serving((), calm_namespace, robot=Robot({"arm": pose})) as url,
         page_of(url) as page,
     ):

@@ -386,6 +386,7 @@ def test_an_eased_grip_shows_what_is_left_of_it_also_where_the_patch_drifts(ease
     assert not bench.run(2, per_s=0.05).touched.any()
 
 
+@pytest.mark.thorough
 def test_the_uncertainty_grows_under_a_touch_by_the_drift_alone_and_shrinks_after_it() -> None:
     still, drifting = Bench(), Bench()
     for bench, per_s in ((still, 0.0), (drifting, 0.1)):

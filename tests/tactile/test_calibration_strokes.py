@@ -111,6 +111,7 @@ def test_nothing_is_found_in_a_right_geometry() -> None:
     assert not check_file(geometry_of(surface), surface.module)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("pair", [(2, 6), (3, 4), (1, 9), (0, 15)])
 def test_exchanged_connectors_are_named(pair: tuple[int, int]) -> None:
     surface, sums = flat()

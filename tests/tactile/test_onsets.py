@@ -82,6 +82,7 @@ def test_a_touch_is_found_in_its_second_frame_and_confirmed_later(rate_hz: float
     assert [kind for _, kind in hand.steps(0, round(rate_hz))] == [EventKind.ENDED]
 
 
+@pytest.mark.thorough
 def test_an_onset_that_ends_too_soon_is_withdrawn() -> None:
     hand = TouchedSkin(500.0)
     assert [kind for _, kind in hand.steps(8, 3)] == [EventKind.ONSET]

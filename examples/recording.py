@@ -15,7 +15,7 @@ import skinware.recording
 
 def main(path: str) -> None:
     with skinware.recording.open(path) as recording:
-        print(f"{path}: {recording.duration_s:.1f} s, {recording.missed} frames lost")
+        print(f"{path}: {recording.duration_s:.1f} s, {recording.missed} samples missed")
         for name in recording.drivers:
             for part in recording[name].parts:  # several where the driver came back with other sensors
                 tell(name, part)

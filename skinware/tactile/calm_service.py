@@ -259,7 +259,7 @@ class CalmService:
         if columns is None:
             return False
         chain.step(frame, columns["values"], columns["status"])
-        chain.tell_why(columns["uncertainty"], columns["why"])
+        chain.explain(columns["uncertainty"], columns["why"])
         if self.health is not None:
             self.health.step(columns["status"], frame.acquired_ns)
         self._warn_of_waiting(chain)

@@ -365,7 +365,7 @@ class Chain:
             of_type = of_type | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
 
-    def tell_why(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:
+    def explain(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
         for name, stage in self.baseline_stages.items():
             if stage.calm is not None:

@@ -131,8 +131,7 @@ class Rest:
         own, mode = dd - d * d / count, cc - c * c / count
         both = dc - d * c / count
         noise2 = _median((own - 2 * both + mode) / (count - 1)) / np.float32(typical)
-        total, mean_c = np.nansum(count, axis=0), np.nansum(c, axis=0) / np.maximum(np.nansum(count, axis=0), 1)
-        del total
+        mean_c = np.nansum(c, axis=0) / np.maximum(np.nansum(count, axis=0), 1)
         power = np.nansum(cc, axis=0) - mean_c * np.nansum(c, axis=0)
         beside = np.nansum(dc, axis=0) - mean_c * np.nansum(d, axis=0) - power
         prior = noise2 / np.float32(GAIN_SPREAD**2) + np.float32(1e-12)

@@ -87,7 +87,7 @@ class FingerPass:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What contacts made of a pass: what became of both identities, and how many there were."""
+    """Result of a pass: the fate of both identities, and the number of identities."""
 
     outcome: Outcome
     identities: int

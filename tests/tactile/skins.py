@@ -10,7 +10,7 @@ from skinware.tactile.tracking import TrackingSettings
 
 PITCH_M = 0.0065
 AT_ONCE = TrackingSettings(frames=1)
-"""What is touched in one frame is a contact."""
+"""A touch of a single frame is a contact."""
 
 
 def placed(position_m: npt.ArrayLike, frame: npt.ArrayLike = "chest", normal: npt.ArrayLike | None = None) -> Geometry:

@@ -173,7 +173,7 @@ class Trial:
 
 @dataclass
 class Result:
-    """What a rule did in a trial: the worst seed of each mark, and the mean of ``false``."""
+    """Result of a trial: the worst seed of each mark, and the mean of ``false``."""
 
     false: Floats
     on: dict[str, Floats]
@@ -236,7 +236,7 @@ class _Judge:
             self._left |= touched[(time_s >= trial.over_s) & (time_s < trial.until_s)].any(axis=(0, 2))
 
     def result(self) -> Result:
-        """What the rule did."""
+        """Return the result of the rule."""
         ten_s = round(10 * self._rate_hz)
         error = {}
         for name in self._on:

@@ -16,15 +16,12 @@ if TYPE_CHECKING:
     from skinware.tactile.calm_service import CalmService
 
 
-@click.command(
+@cli.command(
     "skin-calm",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-calm torso                        skin-top --namespace calm shows it",
-        "skin-calm torso --config chain.toml    with a filter, or in N",
-        "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
-        "skin-calm torso --into quiet           into another namespace",
-    ),
+    "skin-calm torso                        skin-top --namespace calm shows it",
+    "skin-calm torso --config chain.toml    with a filter, or in N",
+    "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
+    "skin-calm torso --into quiet           into another namespace",
 )
 @click.argument("name")
 @click.option(
@@ -77,7 +74,6 @@ if TYPE_CHECKING:
 @cli.group_option
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 @cli.verbose_option
 def command(
     name: str,

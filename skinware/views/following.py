@@ -87,7 +87,8 @@ class Newest:
         loads = self.physical(quantity) if loads is None else loads
         loads = np.where((self.status[quantity.where] & WITHOUT_VALUE) == 0, np.nan_to_num(loads), 0)
         structure = self.frame.structure
-        return np.bincount(structure.sensor_module[quantity.where], loads, structure.n_modules)
+        module = structure.sensor_module[quantity.where]
+        return np.bincount(module, loads, structure.n_modules).astype(np.float64)
 
     def contact_of(self, quantity: Quantity) -> npt.NDArray[np.int16] | None:
         """Return (n,) int16, row of the contact of each sensor, negative without one; None without contacts."""

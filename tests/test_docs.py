@@ -30,7 +30,7 @@ from tests.commands import COMMANDS, PATIENCE_S, parse, refused, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-ELSEWHERE = ("asyncio", "c-and-cpp", "icub")
+ELSEWHERE = ("asyncio", "icub")
 """Pages whose snippets other tests run."""
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 

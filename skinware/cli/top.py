@@ -26,15 +26,12 @@ _NEEDED = "textual>=8"
 """The package of the extra ``top``; installing it alone works however this package was installed."""
 
 
-@click.command(
+@cli.command(
     "skin-top",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-top                    in the terminal",
-        "skin-top --type proximity   draw another type of sensors",
-        "skin-top --region palm      draw a region of regions.toml",
-        "skin-top --plain -T 10      ten seconds of plain lines",
-    ),
+    "skin-top                    in the terminal",
+    "skin-top --type proximity   draw another type of sensors",
+    "skin-top --region palm      draw a region of regions.toml",
+    "skin-top --plain -T 10      ten seconds of plain lines",
 )
 @click.option(
     "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
@@ -53,7 +50,6 @@ _NEEDED = "textual>=8"
 @cli.regions_option
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 @click.pass_context
 def command(
     context: click.Context,

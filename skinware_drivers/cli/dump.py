@@ -1,17 +1,17 @@
-"""``skin-dump``: print snapshots of drivers (``skinware.cli.dump``), or with ``--raw`` the frames of a CAN bus."""
+"""``skin-dump``: print the snapshots of a driver, or with ``--raw`` the frames of a CAN bus."""
 
 from __future__ import annotations
 
 import select
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run, warn
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
-from skinware.cli.dump import command as frames_command
+from skinware.cli.dump import print_snapshots
 from skinware_drivers.bus_names import NETWORKS
 
 if TYPE_CHECKING:
@@ -21,17 +21,57 @@ _CAN_PAYLOAD = 64
 _SERIAL = ("serial", "pty", *NETWORKS)
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which two programs can listen."""
-_OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "counts": "--counts"}
 
 
-def dump(raw: str | None, **options: Any) -> None:
-    if raw is None:
-        click.get_current_context().invoke(frames_command, **options)
+@cli.command(
+    "skin-dump",
+    "skin-dump -n 3                              three frames",
+    "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
+    "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
+    "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
+)
+@click.argument("name", required=False)
+@click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
+@cli.timeout_option("Fail after SECONDS without a frame; also wait for the driver.")
+@cli.type_option("Only the sensors of one type, such as pressure.")
+@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
+@click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
+@cli.namespace_option
+@cli.json_option
+@click.option("--raw", metavar="BUS", help="Print the frames of a CAN bus instead, as candump -L; sends nothing.")
+def command(
+    name: str | None,
+    count: int | None,
+    timeout_s: float | None,
+    type_name: str | None,
+    rate_hz: float | None,
+    counts: bool,
+    namespace: str | None,
+    as_json: bool,
+    raw: str | None,
+) -> None:
+    """Print the frames of driver NAME, or of the only one, each once and in order.
+
+    Values are physical, in the unit of their type, as skin-top shows them.
+
+    A line of text has the minimum, maximum and mean of the fresh sensors of each type. JSON has everything.
+    """
+    from skinware.memory.namespace import Namespace
+
+    if raw is not None:
+        cli.refuse_others("--raw", {"count", "timeout_s", "as_json"})
+        dump_bus(raw, count, timeout_s, as_json)
         return
-    for option, flag in _OF_DRIVERS.items():
-        if options[option]:
-            raise click.UsageError(f"{flag} is about the frames of a driver, --raw about those of a bus")
-    dump_bus(raw, options["count"], options["timeout_s"], options["as_json"])
+    print_snapshots(
+        Namespace(namespace),
+        name,
+        count=count,
+        timeout_s=timeout_s,
+        type_name=type_name,
+        rate_hz=rate_hz,
+        counts=counts,
+        as_json=as_json,
+    )
 
 
 def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json: bool) -> None:
@@ -123,28 +163,8 @@ def _warn_of_missing(bus: Bus) -> None:
     }
     text = ", ".join(f"{count} {what}" for what, count in missing.items() if count)
     if text:
-        warn(text)
-
-
-command: click.Command = click.Command(
-    "skin-dump",
-    context_settings=CONTEXT_SETTINGS,
-    callback=dump,
-    params=[
-        *frames_command.params,
-        click.Option(
-            ["--raw"], metavar="BUS", help="Print the frames of a CAN bus instead, as candump -L; sends nothing."
-        ),
-    ],
-    help=frames_command.help,
-    epilog=examples(
-        "skin-dump -n 3                              three frames",
-        "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
-        "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
-        "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
-    ),
-)
+        cli.warn(text)
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run, version_option
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo
 
 _HOW_TO_RUN = {
@@ -28,16 +28,13 @@ _HOW_TO_RUN = {
 """Commands to type for each transport."""
 
 
-@click.command(
+@cli.command(
     "skin-new",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-new fingertip --transport can     a driver for a device on a CAN bus",
-        "skin-new forearm --transport serial    for a device on a serial line",
-        "skin-new palm --transport modbus       for registers, behind TCP or on a serial line",
-        "skin-new cuff --transport tcp          for a device behind a network, TCP or UDP",
-        "skin-new dummy --transport virtual     for values that a program computes",
-    ),
+    "skin-new fingertip --transport can     a driver for a device on a CAN bus",
+    "skin-new forearm --transport serial    for a device on a serial line",
+    "skin-new palm --transport modbus       for registers, behind TCP or on a serial line",
+    "skin-new cuff --transport tcp          for a device behind a network, TCP or UDP",
+    "skin-new dummy --transport virtual     for values that a program computes",
 )
 @click.argument("name")
 @click.option(
@@ -46,7 +43,6 @@ _HOW_TO_RUN = {
     required=True,
     help="Where the data comes from: a CAN bus, a serial line, Modbus registers, a network, or the program itself.",
 )
-@version_option
 def command(name: str, transport: str) -> None:
     """Create a driver package in the new folder NAME: driver, emulated hardware, tests and instructions.
 
@@ -66,4 +62,4 @@ def command(name: str, transport: str) -> None:
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.cli.dump import command as frames_command
 from skinware.wire import channel_name
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.candump import TextFrame, text_frames
@@ -135,7 +134,6 @@ def test_frames_of_drivers_are_dumped_as_before(capsys: pytest.CaptureFixture[st
     with publishing(FakeSkin("torso", fake_structure(2, 4))):
         assert exit_status(command, ["torso", "-n", "2", "--json"]) == 0
     assert [json.loads(line)["driver"] for line in capsys.readouterr().out.splitlines()] == ["torso"] * 2
-    assert {p.name for p in command.params} > {p.name for p in frames_command.params}
 
 
 @pytest.mark.parametrize(
@@ -145,8 +143,8 @@ def test_frames_of_drivers_are_dumped_as_before(capsys: pytest.CaptureFixture[st
         (["--raw", "no-such-can0"], 1, "CAN"),
         (["--raw", "/dev/ttyUSB0"], 2, "a serial line has one owner"),
         (["--raw", "serial:/dev/ttyUSB0"], 2, "a serial line has one owner"),
-        (["--raw", "virtual", "--type", "pressure"], 2, "--type is about the frames of a driver"),
-        (["torso", "--raw", "virtual"], 2, "NAME is about the frames of a driver"),
+        (["--raw", "virtual", "--type", "pressure"], 2, "--raw goes without --type"),
+        (["torso", "--raw", "virtual"], 2, "--raw goes without NAME"),
         (["--raw", "virtual?board=7"], 2, "did you mean 'boards'"),
     ],
 )

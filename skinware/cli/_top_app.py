@@ -31,7 +31,7 @@ _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
 _MOST_CONTACTS = 9
 """Lines of contacts, where there is room."""
-_WIDTHS = (19, 10, 8, 6, 11, 5, 7, 60)
+_WIDTHS = (19, 10, 8, 6, 11, 7, 7, 60)
 _LEFT_COLUMNS = (0, 1, 7)
 _STATE_COLOURS = {
     "live": "#6cc070",

@@ -212,7 +212,7 @@ def _show_event(event: dict[str, Any]) -> None:
 
 
 def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
-    from skinware.views.bridges import as_data
+    from skinware.bridge_state import as_data
 
     shown: dict[str, tuple[str, str]] = {}
 

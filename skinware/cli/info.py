@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from skinware.bridge_state import as_lines
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.text import (
@@ -25,7 +26,6 @@ from skinware.text import (
     words,
     wrapped,
 )
-from skinware.views.bridges import as_lines
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace

@@ -109,9 +109,9 @@ def _on_terminal() -> bool:
 
 
 def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
+    from skinware import bridge_state
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
-    from skinware.views import bridges
 
     for driver in drivers:
         places = overview.contacts_on(driver) or []
@@ -125,7 +125,7 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
     if not drivers:
         echo(f"no driver runs in namespace {overview.drivers.namespace.name!r}; start one: skin-driver --bus virtual")
     for bridge in overview.bridges.states():
-        echo(bridges.summary(bridge.robot, bridges.as_data(bridge)))
+        echo(bridge_state.summary(bridge.robot, bridge_state.as_data(bridge)))
 
 
 def main() -> None:

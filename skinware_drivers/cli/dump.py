@@ -17,7 +17,8 @@ from skinware_drivers.bus_names import NETWORKS
 if TYPE_CHECKING:
     from skinware_drivers.bus import Bus, FrameBatch
 
-_CAN_PAYLOAD = 64
+_CAN_PAYLOAD, _CLASSIC_PAYLOAD = 64, 8
+_FD_FLAGS = 0x03
 _SERIAL = ("serial", "pty", *NETWORKS)
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which two programs can listen."""
@@ -83,9 +84,8 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         BusError: no frame came for ``timeout_s``.
     """
     from skinware.realtime import now_ns
-    from skinware.wire import channel_name
+    from skinware.wire import EXTENDED, MASK, candump_line, channel_name
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.can.candump import text_frames
     from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)
@@ -97,20 +97,21 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
     try:
         for batch in _batches(bus, bus_name, timeout_s):
             offset_ns = time.time_ns() - now_ns()
-            frames = list(text_frames(batch, offset_ns))[:left]
-            for frame in frames if as_json else ():
+            frames = list(frames_of(batch, offset_ns))[:left]
+            for time_us, identifier, fd_flags, payload in frames if as_json else ():
                 print_json(
                     {
                         "bus": name,
-                        "time": frame.time_us / 1e6,
-                        "identifier": frame.identifier,
-                        "extended": frame.extended,
-                        "fd": frame.fd is not None,
-                        "data": frame.payload.hex().upper(),
+                        "time": time_us / 1e6,
+                        "identifier": identifier & MASK,
+                        "extended": bool(identifier & EXTENDED),
+                        "fd": fd_flags is not None,
+                        "data": payload.hex().upper(),
                     }
                 )
             if not as_json and frames:
-                echo("\n".join(frame.line(name) for frame in frames))
+                lines = (candump_line(at_us, name, who, flags, data) for at_us, who, flags, data in frames)
+                echo("\n".join(lines))
             if left is not None:
                 left -= len(frames)
                 if not left:
@@ -118,6 +119,22 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
     finally:
         bus.close()
         _warn_of_missing(bus)
+
+
+def frames_of(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[tuple[int, int, int | None, bytes]]:
+    """Yield time (microseconds since 1970), identifier, flags of CAN FD (None: a classic frame) and payload of frames.
+
+    Args:
+        epoch_offset_ns: time since 1970 minus CLOCK_MONOTONIC, ns.
+    """
+    from skinware.wire import IS_FD
+
+    rows = slice(batch.start, batch.stop)
+    wire, times_ns = batch.wire[rows], batch.time_ns[rows].tolist()
+    columns = (wire[name].tolist() for name in ("identifier", "length", "flags"))
+    for time_ns, identifier, length, flags, payload in zip(times_ns, *columns, wire["payload"], strict=True):
+        fd_flags = flags & _FD_FLAGS if length > _CLASSIC_PAYLOAD or flags & IS_FD else None
+        yield (time_ns + epoch_offset_ns) // 1000, identifier, fd_flags, payload[:length].tobytes()
 
 
 def _refuse_owned(bus_name: str, interface: str) -> None:

@@ -86,8 +86,7 @@ def command(
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
-    from skinware_drivers.cli.pressing import PressingService
+    from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, PressingService, SignalWatch
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus

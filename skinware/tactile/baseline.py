@@ -320,7 +320,7 @@ class Baseline:
             self._let_go(over, live, on, off, deviation, passed_s)
         held = self._surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
-            self._falls.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
+            self._falls.sag(touches.smooth, off, live & ~touches.touched, offsets.patches, passed_s)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
             floor: Floats | np.float32 = np.float32(min(passed_s / settings.tau_s, 0.5))

@@ -99,12 +99,14 @@ class Falls:
         """How far each fell when it got its newest offset, for a while."""
         self._dip_s: Floats = np.zeros(n, np.float32)
         self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
+        self._down_s: Floats = np.zeros(n, np.float32)
+        """How long each has been below."""
         self._before: Flags = np.zeros(n, bool)
         """Which were below before anything touched their patch."""
         self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
-    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Grouping) -> None:
+    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Grouping, passed_s: float) -> None:
         """Find the taxels at rest that are below their offsets, unless most of their patch is: that is common."""
         below = rests & (smooth < np.where(self.below, np.float32(0), np.float32(-0.5) * off))
         if below.any():
@@ -112,7 +114,8 @@ class Falls:
             if common.any():
                 below &= ~common[self._around.patch]
         self.below = below
-        self._before = np.where(self._around.busy, self._before, below)
+        self._down_s = np.where(below, self._down_s + np.float32(passed_s), np.float32(0))
+        self._before = np.where(self._around.busy, self._before, self._down_s > SAG_RETURNS_S)
         if self._around.busy.any():
             self._before &= below | ~self._around.busy
             self.sagging = below & self._around.busy & ~self._before

@@ -179,18 +179,19 @@ class Offsets:
         deviation: Floats = np.sqrt(self.variance + self.gain * self.gain * common)
         return deviation
 
-    def follow_common(self, deviation: Floats, free: Flags, passed_s: float) -> None:
+    def follow_common(self, deviation: Floats, free: Flags, hidden2: Floats, passed_s: float) -> None:
         """Move the offsets by the common mode, and take that off the deviations.
 
         Args:
             deviation: (n,) of the values from the offsets, changed in place; 0 where unknown.
             free: (n,) which taxels are at rest.
+            hidden2: (n,) square of the load that each may bear without being touched.
             passed_s: since the last frame.
         """
         if passed_s <= 0:
             return
         total = self.total()
-        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance), np.float32(0))
+        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance + hidden2), np.float32(0))
         limit = np.float32(2) * np.sqrt(total)
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)

@@ -26,6 +26,7 @@ class Surroundings:
         module, patch: as given.
         n_modules: number of modules.
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
+        held: (n,) bool, the taxels that are near a contact, or were in the last ``settle_s``.
         largest: (n_patches,) the largest load of each patch.
     """
 
@@ -34,15 +35,15 @@ class Surroundings:
         self.n_modules = int(module.max(initial=-1)) + 1
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
         self.busy: Flags = np.zeros(len(module), bool)
+        self.held: Flags = np.zeros(len(module), bool)
         self._since_s = np.full(len(self.largest), np.inf)
         self._settling_s: Floats = np.zeros(len(module), np.float32)
-        self._n_held = 0
 
-    def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> Flags:
-        """Return (n,) the taxels that are near a contact, or were in the last ``settle_s``."""
+    def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> None:
+        """Find the taxels that are near a contact."""
         active = np.flatnonzero(touches.touched & live)
-        if not len(active) and not self._n_held:
-            return np.zeros(len(live), bool)
+        if not len(active) and not self.busy.any():
+            return
         np.maximum(self._settling_s - np.float32(passed_s), 0, out=self._settling_s)
         self._since_s += passed_s
         over = self._since_s > max(settle_s, 1e-9)
@@ -53,9 +54,7 @@ class Surroundings:
             np.maximum.at(self.largest, patch, touches.smooth[active])
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
         self.busy = (self._since_s <= settle_s)[self.patch]
-        held: Flags = self._settling_s > 0
-        self._n_held = int(np.count_nonzero(self.busy)) + int(np.count_nonzero(held))
-        return held
+        self.held = self._settling_s > 0
 
     def _near(self, active: Rows) -> Flags:
         if self._neighbours is None:

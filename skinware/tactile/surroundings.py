@@ -42,7 +42,7 @@ class Surroundings:
     def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> None:
         """Find the taxels that are near a contact."""
         active = np.flatnonzero(touches.touched & live)
-        if not len(active) and not self.busy.any():
+        if not len(active) and not (self.busy.any() or self.held.any()):
             return
         np.maximum(self._settling_s - np.float32(passed_s), 0, out=self._settling_s)
         self._since_s += passed_s

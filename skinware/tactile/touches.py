@@ -57,11 +57,13 @@ class Touches:
         return np.abs(deviation) if self.signed else deviation
 
     def follow(self, deviation: Floats, live: Flags, on: Floats, passed_s: float, smooth_s: float) -> None:
-        """Smooth the deviations (n,), by no more than ``on``: a jump by two thresholds is no noise."""
+        """Smooth the deviations (n,); a rise above ``on`` begins at 0, however far the taxel had sunk before."""
+        if not self.signed:
+            np.maximum(self.smooth, 0, out=self.smooth, where=live & (deviation > on))
         share = np.float32(-math.expm1(-passed_s / smooth_s)) if smooth_s else np.float32(1)
         self.smooth += (deviation - self.smooth) * (share * live)
-        np.minimum(self.smooth, deviation + on, out=self.smooth, where=live)
-        np.maximum(self.smooth, deviation - on, out=self.smooth, where=live)
+        if not self.signed:
+            np.minimum(self.smooth, deviation + on, out=self.smooth, where=live)
 
     def judge(
         self, deviation: Floats, live: Flags, on: Floats, off: Floats, offsets: Offsets, passed_s: float, most_s: float

@@ -97,13 +97,17 @@ class CommonMode:
         self.variance, self.agility, self.rate, self.rate2, self.unknown_s = (np.zeros(n_patches) for _ in range(5))
         self.known_s = np.zeros(n_patches)
 
-    def step(self, found: Doubles, precision: Doubles, free: Doubles, passed_s: float) -> tuple[Doubles, Doubles]:
+    def step(
+        self, found: Doubles, precision: Doubles, free: Doubles, own: Doubles, passed_s: float
+    ) -> tuple[Doubles, Doubles]:
         """Return (p,) by how much the mode moves, and how much of that is sure enough to learn gains from.
 
         Args:
             found: (p,) how far the free taxels say that it moved.
             precision: (p,) one by the variance of that.
             free: (p,) number of free taxels.
+            own: (p,) by how much these moved by themselves since the last step: without it, mode and taxels could
+                run in opposite directions.
             passed_s: since the last step.
         """
         known = free > FEW_TAXELS
@@ -129,7 +133,7 @@ class CommonMode:
         if passed_s > 0:
             self.known_s += passed_s * known
             slow = -math.expm1(-passed_s / RATE_S)
-            self.rate += (move / passed_s - self.rate) * (slow * known)
+            self.rate += ((move + own) / passed_s - self.rate) * (slow * known)
             self.rate2 += (self.rate**2 - self.rate2) * (known * passed_s / np.clip(self.known_s, RATE_S, 10 * RATE_S))
         return move, ahead + share * news
 
@@ -166,6 +170,9 @@ class Offsets:
         self._grows: Floats = np.zeros(n, np.float32)
         """Variance that each offset gains in a second by a drift of its own."""
         self._tick_s = 0.0
+        self._weight: Floats = np.zeros(n, np.float32)
+        self._reach, self._own = np.ones(self.patches.n), np.zeros(self.patches.n)
+        """By how much the free taxels of each patch moved by themselves, on the average, in the last frame."""
 
     def total(self) -> Floats:
         """Return (n,) the variance of a deviation at rest: of noise, offset and common mode."""
@@ -195,10 +202,11 @@ class Offsets:
         limit = np.float32(2) * np.sqrt(total)
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)
-        reach = self.patches.sum(weight * self.gain)
+        reach = np.maximum(self.patches.sum(weight * self.gain), 1e-30)
         precision = reach * reach / np.maximum(self.patches.sum(weight), 1e-30)
-        found = self.patches.sum(clipped * weight) / np.maximum(reach, 1e-30)
-        move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
+        found = self.patches.sum(clipped * weight) / reach
+        move, sure = self.common.step(found, precision, self.patches.sum(free), self._own, passed_s)
+        self._weight, self._reach, self._own = weight, reach, np.zeros(self.patches.n)
         moved = self.patches.spread(move)
         change = self.gain * moved
         self.level += change
@@ -214,7 +222,7 @@ class Offsets:
         Args:
             deviation: (n,) of the values from the offsets.
             taxels: (n,) which are measured.
-            calm: (n,) those of them that are far from a touch: only they say something of gains and noise.
+            calm: (n,) those of them that are far from a touch: only they say something of gains.
             floor: least share of a deviation that the offset follows where it drifts by itself.
             passed_s: since the last frame.
         """
@@ -232,15 +240,18 @@ class Offsets:
         share = self.variance / total
         share = np.where(taxels, np.where(drifts, np.maximum(share, floor), share), np.float32(0))
         of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
-        self.level += share * innovation
+        own = share * innovation
+        self.level += own
+        self._own = self.patches.sum(own * self._weight) / self._reach
         self.gain += of_gain * innovation
         self.gain_variance -= of_gain * self.cross
         keep = np.float32(1) - share
         self.cross *= keep
         self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
-        self.slow += (innovation - self.slow) * (np.float32(slowly) * taxels)
         quick = innovation - self.slow
-        self.noise2 += (quick * quick - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
+        self.slow += quick * (np.float32(slowly) * taxels)
+        quick2 = quick * quick * np.float32(1 - slowly / 2)  # the slow part is noisy, too
+        self.noise2 += (quick2 - self.noise2) * (taxels * np.float32(min(passed_s / NOISE_S, 0.1)))
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, passed_s)

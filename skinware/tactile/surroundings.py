@@ -105,9 +105,9 @@ class Falls:
         self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
-    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Grouping, passed_s: float) -> None:
-        """Find the taxels at rest that are below their offsets, unless most of their patch is: that is common."""
-        below = rests & (smooth < np.where(self.below, np.float32(0), np.float32(-0.5) * off))
+    def sag(self, smooth: Floats, rustle: Floats, rests: Flags, patches: Grouping, passed_s: float) -> None:
+        """Find the taxels at rest that are below their offsets by more than noise, unless most of their patch is."""
+        below = rests & (smooth < np.where(self.below, np.float32(0), -rustle))
         if below.any():
             common = patches.sum(below) > 0.5 * patches.sum(rests)
             if common.any():

@@ -203,3 +203,12 @@ class Adapter(HasOptions[OptionsT], ABC):
 
 
 AnyAdapter = Adapter[Any]
+
+
+class VirtualAdapter(Adapter[OptionsT]):
+    """One bus of a skin whose values a program makes, ``--bus virtual``.
+
+    There is no wire: payloads can have any length that the layout declares.
+    """
+
+    medium: ClassVar[str] = "virtual"

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from skinware.cli._terminal import Formatter, echo, patient_output
 from skinware.errors import BadRecording, ConfigurationError, SkinwareError
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
-CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
-"""For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
+CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
+"""For ``click.group(context_settings=...)``, so that ``-h`` helps everywhere."""
 
 DEFAULT_REGIONS = "regions.toml"
 """File of regions where none is named, in the current folder."""
@@ -59,56 +60,63 @@ def examples(*lines: str) -> str:
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
 
 
-def namespace_option(command: _Decorated) -> _Decorated:
-    text = "Namespace of drivers and readers.  [default: $SKINWARE_NAMESPACE, else 'default']"
-    return click.option("--namespace", metavar="NAME", help=text)(command)
+def command(
+    name: str,
+    *lines: str,
+    cls: type[click.Command] = click.Command,
+    context_settings: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a command of a function, with ``-h``, ``--version``, and these examples in its help.
 
-
-def json_option(command: _Decorated) -> _Decorated:
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
-
-
-def group_option(command: _Decorated) -> _Decorated:
-    return click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")(command)
-
-
-def verbose_option(command: _Decorated) -> _Decorated:
-    return click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")(command)
-
-
-def tls_option(command: _Decorated) -> _Decorated:
-    return click.option(
-        "--tls",
-        metavar="DIR",
-        type=click.Path(path_type=Path, file_okay=False),
-        help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
-    )(command)
-
-
-def caller_option(command: _Decorated) -> _Decorated:
-    return click.option(
-        "--caller",
-        "callers",
-        multiple=True,
-        metavar="NAME",
-        help="Only certificates of this name may call operations (tare ...); may be repeated.",
-    )(command)
-
-
-def insecure_option(command: _Decorated) -> _Decorated:
-    return click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")(command)
+    Args:
+        more: further arguments of ``click.command``.
+    """
+    settings = {**CONTEXT_SETTINGS, **(context_settings or {})}
+    made = click.command(name, cls, context_settings=settings, epilog=examples(*lines), **more)
+    return lambda function: version_option(made(function))
 
 
 def version_option(command: _Decorated) -> _Decorated:
+    # one for each command: it keeps the name of the first program that asks
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
+
+
+namespace_option = click.option(
+    "--namespace",
+    metavar="NAME",
+    help="Namespace of drivers and readers.  [default: $SKINWARE_NAMESPACE, else 'default']",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")
+group_option = click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
+driver_option = click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")
+verbose_option = click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
+tls_option = click.option(
+    "--tls",
+    metavar="DIR",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
+)
+caller_option = click.option(
+    "--caller",
+    "callers",
+    multiple=True,
+    metavar="NAME",
+    help="Only certificates of this name may call operations (tare ...); may be repeated.",
+)
+insecure_option = click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+regions_option = click.option(
+    "--regions",
+    "region_files",
+    metavar="FILE",
+    multiple=True,
+    type=FILE,
+    help=f"File with regions; may be repeated.  [default with --region: {DEFAULT_REGIONS}]",
+)
 
 
 def type_option(what: str) -> Callable[[_Decorated], _Decorated]:
     return click.option("--type", "type_name", metavar="TYPE", help=what)
-
-
-def driver_option(command: _Decorated) -> _Decorated:
-    return click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")(command)
 
 
 def duration_option(what: str = "End after SECONDS.") -> Callable[[_Decorated], _Decorated]:
@@ -139,17 +147,6 @@ def output_option(
     )
 
 
-def regions_option(command: _Decorated) -> _Decorated:
-    return click.option(
-        "--regions",
-        "region_files",
-        metavar="FILE",
-        multiple=True,
-        type=FILE,
-        help=f"File with regions; may be repeated.  [default with --region: {DEFAULT_REGIONS}]",
-    )(command)
-
-
 def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
     """Return the regions of files, or of the default file.
 
@@ -176,6 +173,24 @@ def regions_asked_for(names: Collection[str], files: Sequence[Path]) -> Regions:
     if files and not names:
         raise click.UsageError("--regions names files of regions: choose regions with --region")
     return regions_of(files, names) if names else Regions(())
+
+
+def refuse_others(option: str, allowed: Collection[str]) -> None:
+    """Refuse what is given on the command line and does not go with an option.
+
+    Args:
+        allowed: names of the parameters that go with it.
+
+    Raises:
+        click.UsageError: another one was given.
+    """
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE and context.params[name]
+        if is_given and name not in {option.strip("-"), *allowed}:
+            shown = parameter.opts[0] if isinstance(parameter, click.Option) else parameter.human_readable_name
+            raise click.UsageError(f"{option} goes without {shown}")
 
 
 def warn(text: str) -> None:

@@ -28,7 +28,6 @@ from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.text import age_text_ms, count_text, plural, table, words, wrapped
-from skinware.views import bridges
 
 SampleT = TypeVar("SampleT", bound=Sample)
 
@@ -107,7 +106,7 @@ def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
     """Return the state that a bridge publishes; None before its first sample."""
     with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
         frame = _newest(reader)
-        return None if frame is None else {"robot": frame.state.robot, **bridges.as_data(frame.state)}
+        return None if frame is None else {"robot": frame.state.robot, **bridge_state.as_data(frame.state)}
 
 
 def _newest(service: ServiceReader[SampleT]) -> SampleT | None:

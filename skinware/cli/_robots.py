@@ -31,7 +31,6 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "dropped"
 
 @click.command(
     "route",
-    context_settings=cli.CONTEXT_SETTINGS,
     epilog=cli.examples(
         "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            the router",
         "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   on a robot",
@@ -117,7 +116,6 @@ class _Routed:
 
 @click.command(
     "list",
-    context_settings=cli.CONTEXT_SETTINGS,
     epilog=cli.examples(
         "skin-bridge list --connect tcp/192.168.1.10:7448 --connect tcp/192.168.1.11:7448",
         "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all robots, every second",

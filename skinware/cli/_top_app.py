@@ -15,6 +15,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
+from skinware.bridge_state import as_data, summary
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._painting import HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
@@ -24,14 +25,13 @@ from skinware.memory.namespace import Namespace
 from skinware.state import LIVE, life_of
 from skinware.tactile.regions import Regions
 from skinware.text import NOT_FRESH, counters_text, plural, printable
-from skinware.views.bridges import as_data, summary
 from skinware.views.live import LiveDriver, Overview
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
 _MOST_CONTACTS = 9
 """Lines of contacts, where there is room."""
-_WIDTHS = (19, 10, 8, 6, 11, 5, 7, 60)
+_WIDTHS = (19, 10, 8, 6, 11, 7, 7, 60)
 _LEFT_COLUMNS = (0, 1, 7)
 _STATE_COLOURS = {
     "live": "#6cc070",

@@ -8,22 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from skinware.cli import _command as cli
 from skinware.cli import bridge_ros2, bridge_yarp
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    caller_option,
-    examples,
-    insecure_option,
-    json_option,
-    namespace_option,
-    regions_asked_for,
-    regions_option,
-    run,
-    signals_end,
-    tls_option,
-    version_option,
-    warn,
-)
 from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json
 
@@ -40,8 +26,8 @@ _MODES = {
 }
 
 
-@click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
-@version_option
+@click.group("skin-bridge", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Publish the drivers and services of one machine on another, in a ROS 2 graph, or as ports of YARP.
 
@@ -56,8 +42,7 @@ for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
 
 @command.command(
     "serve",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    epilog=cli.examples(
         "skin-bridge serve --robot icub                                     for programs of this machine",
         "skin-bridge serve --robot icub --listen tcp/0.0.0.0:7448 --insecure  for all in a trusted network",
         "skin-bridge serve --robot icub --listen tls/0.0.0.0:7448 --tls certs  for all with a certificate",
@@ -72,11 +57,11 @@ for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
     help=f"Where peers connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Connect to a router instead.")
-@tls_option
-@caller_option
-@insecure_option
-@namespace_option
-@json_option
+@cli.tls_option
+@cli.caller_option
+@cli.insecure_option
+@cli.namespace_option
+@cli.json_option
 def serve(
     names: tuple[str, ...],
     robot: str,
@@ -111,7 +96,7 @@ def serve(
     )
     with contextlib.closing(Link(places)) as link:
         server = Server(robot, link, place, names or None, callers=callers)
-        with contextlib.closing(server), signals_end(server.stop):
+        with contextlib.closing(server), cli.signals_end(server.stop):
             if as_json:
                 where = {"listen": list(places.listen), "connect": list(places.connect)}
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, **where})
@@ -144,8 +129,7 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
 
 @command.command(
     "join",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    epilog=cli.examples(
         "skin-bridge join icub --connect tcp/192.168.1.10:7448     then: skin-top --namespace icub",
         "skin-bridge join icub --connect tls/icub.local:7448 --tls certs --into default",
         "skin-bridge join icub --connect tcp/192.168.1.10:7448 --region palm --into palm   only those sensors travel",
@@ -160,7 +144,7 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
     help="Robot or router: tcp/HOST:PORT.",
 )
 @click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
-@tls_option
+@cli.tls_option
 @click.option(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),
@@ -170,8 +154,8 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
 )
 @click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; repeatable.")
 @click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; repeatable.")
-@regions_option
-@json_option
+@cli.regions_option
+@cli.json_option
 def join(
     robot: str,
     connect: tuple[str, ...],
@@ -195,7 +179,7 @@ def join(
     from skinware.bridge.messages import Keys
     from skinware.memory.namespace import Namespace
 
-    regions = tuple(regions_asked_for(in_regions, region_files))
+    regions = tuple(cli.regions_asked_for(in_regions, region_files))
     wish = Wish(patches, in_regions, regions) if patches or in_regions else None  # None: all sensors and services
     Keys(robot)  # refuses a wrong name before anything is opened
     place = Namespace(into or robot)
@@ -210,7 +194,7 @@ def join(
             why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
             on_event=print_json if as_json else _show_event,
         )
-        with contextlib.closing(joiner), signals_end(joiner.stop):
+        with contextlib.closing(joiner), cli.signals_end(joiner.stop):
             if as_json:
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
             else:
@@ -220,7 +204,7 @@ def join(
 
 def _show_event(event: dict[str, Any]) -> None:
     if event["event"] == "trouble":
-        warn(event["why"])
+        cli.warn(event["why"])
     elif event["event"] == "mode":
         echo(f"{event['service']}: {_MODES[event['mode']]}")
     else:
@@ -228,7 +212,7 @@ def _show_event(event: dict[str, Any]) -> None:
 
 
 def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
-    from skinware.views.bridges import as_data
+    from skinware.bridge_state import as_data
 
     shown: dict[str, tuple[str, str]] = {}
 
@@ -246,4 +230,4 @@ def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    signals_end,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -28,8 +21,7 @@ if TYPE_CHECKING:
 
 @click.command(
     "ros2",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    epilog=cli.examples(
         "skin-bridge ros2                                       then, where ROS is: ros2 topic list",
         "skin-bridge ros2 --rmw zenoh                           for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp",
         "skin-bridge ros2 arm --domain 7 --ros-namespace /icub  /icub/skin/arm/points/pressure ... in domain 7",
@@ -85,8 +77,8 @@ if TYPE_CHECKING:
     " without rotation.",
 )
 @click.option("--tare", "with_tare", is_flag=True, help="Offer a service NAME/tare to everyone in the graph.")
-@namespace_option
-@json_option
+@cli.namespace_option
+@cli.json_option
 def command(
     names: tuple[str, ...],
     rmw: str,
@@ -130,9 +122,9 @@ def command(
             rate_hz=rate,
             root_frame=root_frame,
             with_tare=with_tare,
-            trouble=warn,
+            trouble=cli.warn,
         )
-        with contextlib.closing(server), signals_end(server.stop):
+        with contextlib.closing(server), cli.signals_end(server.stop):
             where = f"{identity.prefix}/{identity.name}"
             if as_json:
                 print_json({"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name})
@@ -162,7 +154,7 @@ def _router_report(as_json: bool) -> Callable[[bool, str], None]:
         if as_json:
             print_json({"event": "router", "is_there": is_there, "why": line})
         else:
-            (echo if is_there else warn)(line)
+            (echo if is_there else cli.warn)(line)
 
     return report
 

@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    signals_end,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
@@ -28,8 +21,7 @@ if TYPE_CHECKING:
 
 @click.command(
     "yarp",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
+    epilog=cli.examples(
         "skin-bridge yarp torso --yarp 4               then, with YARP: yarp read ... /skinware/torso",
         "skin-bridge yarp --yarp 3 --namespace calm --prefix /icub/skin --regions skin/left_arm.regions.toml",
         "skin-bridge yarp --yarp 4 --server 10.0.0.1:10000 --listen 10.0.0.7   for a robot's network",
@@ -64,8 +56,8 @@ if TYPE_CHECKING:
 @click.option(
     "--listen", "host", default="127.0.0.1", show_default=True, metavar="HOST", help="Address at which ports listen."
 )
-@namespace_option
-@json_option
+@cli.namespace_option
+@cli.json_option
 def command(
     names: tuple[str, ...],
     prefix: str,
@@ -95,7 +87,7 @@ def command(
     settings = Settings(names, prefix.rstrip("/"), type_name, full_scale, regions, host, int(yarp) if yarp else None)
     place, known_by = Namespace(namespace), _name_server(server)
     yarp_server = YarpServer(place, settings, known_by, print_json if as_json else _show_event)
-    with contextlib.closing(yarp_server), signals_end(yarp_server.stop):
+    with contextlib.closing(yarp_server), cli.signals_end(yarp_server.stop):
         if as_json:
             address = f"{known_by.host}:{known_by.port}"
             print_json({"event": "ready", "namespace": place.name, "server": address, "listen": host})
@@ -118,7 +110,7 @@ def _name_server(text: str | None) -> NameServer:
 
 def _show_event(event: dict[str, Any]) -> None:
     if event["event"] == "trouble":
-        warn(f"{event['about']}: {event['why']}")
+        cli.warn(f"{event['about']}: {event['why']}")
     else:
         echo(f"{event['port']}: driver {event['driver']}")
 

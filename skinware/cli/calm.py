@@ -16,15 +16,12 @@ if TYPE_CHECKING:
     from skinware.tactile.calm_service import CalmService
 
 
-@click.command(
+@cli.command(
     "skin-calm",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-calm torso                        skin-top --namespace calm shows it",
-        "skin-calm torso --config chain.toml    with a filter, or in N",
-        "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
-        "skin-calm torso --into quiet           into another namespace",
-    ),
+    "skin-calm torso                        skin-top --namespace calm shows it",
+    "skin-calm torso --config chain.toml    with a filter, or in N",
+    "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
+    "skin-calm torso --into quiet           into another namespace",
 )
 @click.argument("name")
 @click.option(
@@ -60,6 +57,12 @@ if TYPE_CHECKING:
     type=cli.FILE,
     help="File with regions whose motion is published; may be repeated.",
 )
+@click.option(
+    "--links",
+    metavar="FILE",
+    type=cli.FILE,
+    help="Links of the robot, as for skin-view: contacts hang together across the borders of links.",
+)
 @click.option("--motion", metavar="NAME", default="motion", show_default=True, help="Name of the service of motion.")
 @click.option(
     "--health",
@@ -71,7 +74,6 @@ if TYPE_CHECKING:
 @cli.group_option
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 @cli.verbose_option
 def command(
     name: str,
@@ -80,6 +82,7 @@ def command(
     state_path: Path | None,
     contacts: str,
     region_files: tuple[Path, ...],
+    links: Path | None,
     motion: str,
     health: str,
     group: str | None,
@@ -102,6 +105,7 @@ def command(
     from skinware.tactile.chain_state import default_path
     from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
+    from skinware.views.robot import read_robot
 
     cli.log_to_stderr(verbose)
     check_name(name, "driver")
@@ -119,6 +123,7 @@ def command(
         state_path=state_path or default_path(target.name, name),
         contacts=contacts or None,
         watched=WatchedRegions(read_regions(*region_files), motion) if region_files else None,
+        poses=read_robot(links).poses if links else None,
         health=health or None,
     )
     services = source.services()

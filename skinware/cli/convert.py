@@ -145,19 +145,16 @@ _WIRE_FORMATS = ("candump", "pcapng")
 _LEARNING_FORMATS = ("lerobot",)
 
 
-@click.command(
+@cli.command(
     "skin-convert",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-convert walk.mcap --to npz                        writes walk.npz",
-        "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
-        "skin-convert walk.mcap --to parquet --region palm -o palm",
-        "skin-convert walk.mcap --to mcap --end 12 -o part.mcap a part, still a recording",
-        "skin-convert walk.mcap --to candump                    the frames on CAN buses, for canplayer",
-        "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
-        "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
-        "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
-    ),
+    "skin-convert walk.mcap --to npz                        writes walk.npz",
+    "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
+    "skin-convert walk.mcap --to parquet --region palm -o palm",
+    "skin-convert walk.mcap --to mcap --end 12 -o part.mcap a part, still a recording",
+    "skin-convert walk.mcap --to candump                    the frames on CAN buses, for canplayer",
+    "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
+    "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
+    "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.argument("names", metavar="[NAME]...", nargs=-1)
@@ -179,7 +176,6 @@ _LEARNING_FORMATS = ("lerobot",)
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @_learning_options
 @cli.json_option
-@cli.version_option
 def command(
     file: Path,
     names: tuple[str, ...],
@@ -199,8 +195,7 @@ def command(
     candump and pcapng contain the frames on the buses, if they were recorded (skin-record --wire). lerobot is a
     learning set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
 
-    FILE may also be a file that this command wrote as npz, hdf5 or parquet. FILE does not change; its damaged parts are
-    left out and reported. The new file appears when it is complete.
+    FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
     from skinware.conversion import Selection
 

@@ -1,12 +1,10 @@
-"""``skin-dump``: print the snapshots of a driver."""
+"""Print the snapshots of a driver, for ``skin-dump``."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
@@ -21,52 +19,23 @@ if TYPE_CHECKING:
 _LOOK_EVERY_S = 0.1
 
 
-@click.command(
-    "skin-dump",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-dump -n 3                              three frames",
-        "skin-dump -T 2 --type pressure              fail if no frame arrives for 2 s",
-        "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
-    ),
-)
-@click.argument("name", required=False)
-@click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
-@cli.timeout_option("Fail after SECONDS without a frame; also wait for the driver.")
-@cli.type_option("Only the sensors of one type, such as pressure.")
-@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
-@click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
-@click.option("--physical", is_flag=True, hidden=True)
-@cli.namespace_option
-@cli.json_option
-@cli.version_option
-def command(
+def print_snapshots(
+    namespace: Namespace,
     name: str | None,
-    count: int | None,
-    timeout_s: float | None,
-    type_name: str | None,
-    rate_hz: float | None,
-    counts: bool,
-    physical: bool,
-    namespace: str | None,
-    as_json: bool,
+    *,
+    count: int | None = None,
+    timeout_s: float | None = None,
+    type_name: str | None = None,
+    rate_hz: float | None = None,
+    counts: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Print the frames of driver NAME, or of the only one, each once and in order.
-
-    Values are physical, in the unit of their type, as skin-top shows them.
-
-    A line of text has the minimum, maximum and mean of the fresh sensors of each type. JSON has everything.
-    """
+    """Print the snapshots of a driver, or of the only one; the arguments are the options of ``skin-dump``."""
     from skinware.cli._terminal import terminal_width
-    from skinware.memory.namespace import Namespace
     from skinware.text import wrapped
 
-    if physical:
-        if counts:
-            raise click.UsageError("--counts and --physical are opposites")
-        cli.warn("--physical is not needed any more: values are physical")
     taken = 0
-    with _attach(Namespace(namespace), name, timeout_s) as reader:
+    with _attach(namespace, name, timeout_s) as reader:
         _check_type(reader.structure, type_name)
         for frame in _frames(reader, rate_hz, timeout_s):
             if as_json:
@@ -245,7 +214,3 @@ def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> I
         newest = reader.read(newer_than=newest, timeout_s=timeout_s)
         yield newest
         timer.wait()
-
-
-def main() -> None:
-    cli.run(command)

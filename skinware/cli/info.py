@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from skinware.bridge_state import as_lines
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
 from skinware.text import (
@@ -25,7 +26,6 @@ from skinware.text import (
     words,
     wrapped,
 )
-from skinware.views.bridges import as_lines
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -46,15 +46,12 @@ _LIFE_COLOURS = {
 }
 
 
-@click.command(
+@cli.command(
     "skin-info",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-info                       everything in this namespace",
-        "skin-info roboskin --sensors    every sensor of one driver, in frame order",
-        "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm found them",
-        "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
-    ),
+    "skin-info                       everything in this namespace",
+    "skin-info roboskin --sensors    every sensor of one driver, in frame order",
+    "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm found them",
+    "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
 )
 @click.argument("name", required=False)
 @click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
@@ -68,7 +65,6 @@ _LIFE_COLOURS = {
 )
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 def command(name: str | None, sensors: bool, health: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
     """Show all drivers with their buses and patches, other services, and their readers.
 

@@ -17,15 +17,13 @@ _OPERATION = "press"
 _ASK_S = 1.0
 
 
-@click.command(
+@cli.command(
     "skin-press",
-    context_settings={**cli.CONTEXT_SETTINGS, "ignore_unknown_options": True},  # -0.02 is a coordinate
-    epilog=cli.examples(
-        "skin-driver --bus virtual                       an emulated forearm and hand, in another terminal",
-        "skin-press 0.07 0.0225 0                        for one second",
-        "skin-press 0.19 0 -0.0125 --seconds 60          its palm, for a minute",
-        "skin-press 0.07 0 0.02 --force 6 --radius 0.01  hard, with a thumb",
-    ),
+    "skin-driver --bus virtual                       an emulated forearm and hand, in another terminal",
+    "skin-press 0.07 0.0225 0                        for one second",
+    "skin-press 0.19 0 -0.0125 --seconds 60          its palm, for a minute",
+    "skin-press 0.07 0 0.02 --force 6 --radius 0.01  hard, with a thumb",
+    context_settings={"ignore_unknown_options": True},
 )
 @click.argument("x", type=float)
 @click.argument("y", type=float)
@@ -46,7 +44,6 @@ _ASK_S = 1.0
 @click.option("--name", metavar="NAME", help="Driver or emulator.  [default: the only one that can be pressed]")
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 def command(
     x: float,
     y: float,

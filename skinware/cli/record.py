@@ -90,16 +90,13 @@ def past(text: str) -> float:
     return float(found[1]) * (60 if found[2] == "min" else 1)
 
 
-@click.command(
+@cli.command(
     "skin-record",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-record                          everything, until Ctrl-C",
-        "skin-record torso -o walk.mcap -T 60  one driver, one minute",
-        "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
-        "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
-        "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
-    ),
+    "skin-record                          everything, until Ctrl-C",
+    "skin-record torso -o walk.mcap -T 60  one driver, one minute",
+    "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
+    "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
+    "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @cli.output_option("The new file.  [default: skin-DATE-TIME.mcap]")
@@ -127,7 +124,6 @@ def past(text: str) -> float:
 @click.option("--until-eof", is_flag=True, hidden=True)
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 def command(
     names: tuple[str, ...],
     output: Path | None,

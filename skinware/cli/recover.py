@@ -10,18 +10,14 @@ from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 
-@click.command(
+@cli.command(
     "skin-recover",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-recover walk.mcap                      writes walk.recovered.mcap",
-        "skin-recover walk.mcap -o /mnt/walk.mcap    where there is room",
-    ),
+    "skin-recover walk.mcap                      writes walk.recovered.mcap",
+    "skin-recover walk.mcap -o /mnt/walk.mcap    where there is room",
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @cli.output_option("The new file.  [default: FILE.recovered.mcap]")
 @cli.json_option
-@cli.version_option
 def command(file: Path, output: Path | None, as_json: bool) -> None:
     """Repair a recording whose recorder was killed, whose disk was full, or that was damaged.
 

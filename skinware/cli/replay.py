@@ -1,4 +1,4 @@
-"""``skin-replay``: publish a recording again, controlled by keys."""
+"""Publish a recording again, controlled by keys, for ``skin-replay``."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ import signal
 import sys
 import termios
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, terminal_width
@@ -128,87 +126,37 @@ def clock(time_s: float) -> str:
     return f"{hours}:{of_hour:02}:{rest / 10:04.1f}" if hours else f"{of_hour}:{rest / 10:04.1f}"
 
 
-_NAMESPACE = "replay"
+NAMESPACE = "replay"
 _DRAW_EVERY_S = 0.1
 
 
-def speed(text: str) -> float:
-    """Return a factor above 0; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
-    factor = cli.seconds(text)
-    if not factor:
-        raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
-    return factor
-
-
-@click.command(
-    "skin-replay",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-replay walk.mcap                         skin-top --namespace replay shows it",
-        "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
-        "skin-replay walk.mcap --start 10 --end 12 --loop",
-        "skin-replay walk.mcap --paused                step through it with . and ,",
-    ),
-)
-@click.argument("file", type=cli.FILE)
-@click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
-@click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
-@click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
-@click.option("--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--paused", is_flag=True, help="Wait for a key or a request first.")
-@click.option("--stay", is_flag=True, help="Pause at the end, instead of ending.")
-@click.option(
-    "--times",
-    type=click.Choice(["now", "recorded"]),
-    default="now",
-    show_default=True,
-    help="Times of frames: moved to now, which keeps their ages, or as recorded.",
-)
-@click.option(
-    "--namespace",
-    metavar="NAME",
-    help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{_NAMESPACE}', if nothing runs there]",
-)
-@cli.json_option
-@cli.version_option
-def command(
+def publish_again(
     file: Path,
-    names: tuple[str, ...],
-    factor: float,
+    names: Sequence[str],
+    namespace: str | None,
+    *,
+    speed: float,
     start_s: float,
     end_s: float | None,
     loop: bool,
     paused: bool,
     stay: bool,
     times: str,
-    namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Publish the drivers and services of a recording, or only NAME..., as if they ran now.
-
-    They have the recorded names, structures, states and counters, and restart where they restarted. In a terminal, keys
-    pause, step, seek and change the speed. Other programs call the same operations of any of the services: pause,
-    resume, step, seek, speed, loop, replay.
-
-    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
-    """
+    """Publish the services of a recording until its end; the arguments are the options of ``skin-replay``."""
     import skinware.recording
     from skinware.memory.namespace import Namespace
     from skinware.recording.replaying import Replayer
 
-    place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or _NAMESPACE)
+    place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or NAMESPACE)
     _heed_others(place, is_chosen=bool(namespace))
     with skinware.recording.open(file) as recording:
         replayer = Replayer(
             recording,
             names=names or None,
             namespace=place,
-            speed=factor,
+            speed=speed,
             start_s=start_s,
             end_s=end_s,
             loop=loop,
@@ -255,7 +203,7 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
         )
 
 
-def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json: bool) -> None:
+def _ready(recording: Recording, names: Sequence[str], namespace: str, as_json: bool) -> None:
     published = list(names or recording.services)
     if as_json:
         ready = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
@@ -272,7 +220,3 @@ def _report(event: str, replayer: Replayer, as_json: bool) -> None:
         elif event == "stopped":
             late = f", {replayer.late} of them late" if replayer.late else ""
             echo(f"{replayer.frames.total()} frames published{late}")
-
-
-def main() -> None:
-    cli.run(command, goes_on=True)

@@ -26,15 +26,12 @@ _NEEDED = "textual>=8"
 """The package of the extra ``top``; installing it alone works however this package was installed."""
 
 
-@click.command(
+@cli.command(
     "skin-top",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-top                    in the terminal",
-        "skin-top --type proximity   draw another type of sensors",
-        "skin-top --region palm      draw a region of regions.toml",
-        "skin-top --plain -T 10      ten seconds of plain lines",
-    ),
+    "skin-top                    in the terminal",
+    "skin-top --type proximity   draw another type of sensors",
+    "skin-top --region palm      draw a region of regions.toml",
+    "skin-top --plain -T 10      ten seconds of plain lines",
 )
 @click.option(
     "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
@@ -53,7 +50,6 @@ _NEEDED = "textual>=8"
 @cli.regions_option
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 @click.pass_context
 def command(
     context: click.Context,
@@ -113,9 +109,9 @@ def _on_terminal() -> bool:
 
 
 def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
+    from skinware import bridge_state
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
-    from skinware.views import bridges
 
     for driver in drivers:
         places = overview.contacts_on(driver) or []
@@ -129,7 +125,7 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
     if not drivers:
         echo(f"no driver runs in namespace {overview.drivers.namespace.name!r}; start one: skin-driver --bus virtual")
     for bridge in overview.bridges.states():
-        echo(bridges.summary(bridge.robot, bridges.as_data(bridge)))
+        echo(bridge_state.summary(bridge.robot, bridge_state.as_data(bridge)))
 
 
 def main() -> None:

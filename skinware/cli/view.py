@@ -42,15 +42,12 @@ def token_text(text: str) -> str:
     return text
 
 
-@click.command(
+@cli.command(
     "skin-view",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-view                       all drivers, in the browser",
-        "skin-view torso --no-browser    one driver; prints the address to open",
-        "skin-view --links robot.urdf    on the meshes of a robot",
-        "skin-view --host 0.0.0.0        for other machines too; the address contains a token",
-    ),
+    "skin-view                       all drivers, in the browser",
+    "skin-view torso --no-browser    one driver; prints the address to open",
+    "skin-view --links robot.urdf    on the meshes of a robot",
+    "skin-view --host 0.0.0.0        for other machines too; the address contains a token",
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option(
@@ -80,7 +77,6 @@ def token_text(text: str) -> str:
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 def command(
     names: tuple[str, ...],
     port: int | None,

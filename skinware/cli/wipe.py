@@ -25,20 +25,16 @@ if TYPE_CHECKING:
 _REPORT_EVERY_S = 1.0
 
 
-@click.command(
+@cli.command(
     "skin-wipe",
-    context_settings=cli.CONTEXT_SETTINGS,
-    epilog=cli.examples(
-        "skin-wipe left_hand              wipe over the whole hand; Ctrl-C when you have been everywhere",
-        "skin-wipe left_hand -T 60 --json for programs",
-    ),
+    "skin-wipe left_hand              wipe over the whole hand; Ctrl-C when you have been everywhere",
+    "skin-wipe left_hand -T 60 --json for programs",
 )
 @click.argument("name", required=False)
 @cli.type_option("Sensors to test.  [default: the driver's first type]")
 @cli.duration_option()
 @cli.namespace_option
 @cli.json_option
-@cli.version_option
 @click.pass_context
 def command(
     context: click.Context,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
@@ -127,6 +129,7 @@ class CalmService:
         state_path: file that keeps what was learned; None: it is not kept.
         contacts: name of the service of its contacts, in the namespace of the calmed driver; None: there is none.
         watched: regions whose motion is published beside the contacts; None: none.
+        poses: by name of a coordinate frame, (4, 4) its pose on the robot: contacts hang together across its border.
         health: name of the service of its sensors' health, in the same namespace; None: there is none.
 
     Attributes:
@@ -150,6 +153,7 @@ class CalmService:
         state_path: Path | None = None,
         contacts: str | None = contacts_service.NAME,
         watched: WatchedRegions | None = None,
+        poses: Mapping[str, npt.ArrayLike] | None = None,
         health: str | None = health_service.NAME,
     ) -> None:
         self.name = name
@@ -159,7 +163,7 @@ class CalmService:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
         self.restored = 0
-        self.contacts = CalmContacts(contacts, name, self.into, group, watched) if contacts else None
+        self.contacts = CalmContacts(contacts, name, self.into, group, watched, poses) if contacts else None
         self.health = CalmHealth(health, name, self.into, group) if health else None
         self._settings = settings or ChainSettings.calm()
         self._learned = LearnedState(state_path, self.health)

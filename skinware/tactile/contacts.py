@@ -184,8 +184,9 @@ class Contacts:
         self._n = n
         self._components = Components(n, neighbours, module)
         geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
-        self._position_m, self._normal = np.nan_to_num(geometry.position_m), np.nan_to_num(geometry.normal)
-        self._area_m2 = area_m2(geometry)
+        area = area_m2(geometry)
+        of_taxel = [geometry.position_m, geometry.normal, area[:, None], np.isfinite(area)[:, None]]
+        self._of_taxel = np.nan_to_num(np.hstack(of_taxel).astype(np.float64))  # place, normal, area, and whether known
         self._is_pressure = unit == "Pa"
         self._least = 0.0  # value of a taxel that is just touched; 0: none was seen yet
         known = np.isfinite(geometry.position_m).all(axis=1)
@@ -195,7 +196,8 @@ class Contacts:
         self._frame[known] = number
         pitch = pitch_m(geometry)
         median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
-        self._tracker = Tracker(self._position_m, median_m, tracking)
+        self._tracker = Tracker(self._of_taxel[:, :3], median_m, tracking)
+        self._nothing = {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in COLUMNS.items()}
 
     @classmethod
     def of(
@@ -251,10 +253,13 @@ class Contacts:
             shapes = f"values of {np.shape(value)}, touched of {np.shape(touched)}"
             raise ConfigurationError(f"contacts of {self._n} taxels: {shapes}")
         taxels = np.flatnonzero(touched if onset is None else touched | onset)
+        contact_of = np.full(self._n, NO_CONTACT, np.int16)
+        if not len(taxels) and self._tracker.rests(time_ns):
+            nothing = {name: column.copy() for name, column in self._nothing.items()}
+            return ContactSet(contact_of=contact_of, beyond=0, frames=self.frames, **nothing)
         contact, count = self._components.of(taxels)
         load = value[taxels].astype(np.float64)
         load = np.where(np.isfinite(load) & (load > 0), load, 0.0)
-        contact_of = np.full(self._n, NO_CONTACT, np.int16)
         beyond = max(0, count - MOST)
         if beyond:
             contact_of[taxels] = BEYOND
@@ -286,30 +291,30 @@ class Contacts:
     def _measure(
         self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
     ) -> dict[str, npt.NDArray[Any]]:
-        def total(of_taxel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-            return np.bincount(contact, of_taxel, count).astype(np.float64)  # without weights it counts integers
-
-        peak = np.zeros(count)
-        np.maximum.at(peak, contact, load)
-        frame = self._frame_of(taxels, contact, load, count)
+        order = np.argsort(contact, kind="stable")
+        taxels, contact, load = taxels[order], contact[order], load[order]
+        first = np.searchsorted(contact, np.arange(count))  # each contact has at least one taxel
+        peak = np.maximum.reduceat(load, first) if count else np.zeros(0)
+        frame = self._frame_of(taxels, contact, load, peak)
+        of_taxel = self._of_taxel[taxels]
         counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0)
         weight = np.where(counts, load, 0.0)
-        weight += counts * (total(weight) == 0)[contact]  # without any load, each taxel weighs the same
-        weights = total(weight)
-        weights[weights == 0] = np.nan
-        cop_m = np.column_stack([total(weight * self._position_m[taxels, axis]) / weights for axis in range(3)])
-        normal = np.column_stack([total(weight * self._normal[taxels, axis]) for axis in range(3)])
-        length = np.linalg.norm(normal, axis=1)
-        area = self._area_m2[taxels]
-        has_area = total(np.isfinite(area).astype(float)) > 0
-        area = np.nan_to_num(area)
+        if count:  # without any load, each taxel weighs the same
+            weight += counts * (np.add.reduceat(weight, first) == 0)[contact]
+        parts = np.column_stack(
+            [load, load * of_taxel[:, 6], weight, of_taxel[:, 6:], weight[:, None] * of_taxel[:, :6]]
+        )
+        total = np.add.reduceat(parts, first, axis=0) if count else np.zeros((0, parts.shape[1]))
+        loads, forces, weights, areas, with_area = total[:, :5].T
+        has_area, normal = with_area > 0, total[:, 8:]
+        length = np.sqrt((normal**2).sum(axis=1))
         return {
-            "load": total(load),
+            "load": loads,
             "peak": peak,
             "n": np.bincount(contact, minlength=count),
-            "area_m2": np.where(has_area, total(area), np.nan),
-            "force_n": np.where(has_area & self._is_pressure, total(load * area), np.nan),
-            "cop_m": cop_m,
+            "area_m2": np.where(has_area, areas, np.nan),
+            "force_n": np.where(has_area & self._is_pressure, forces, np.nan),
+            "cop_m": total[:, 5:8] / np.where(weights > 0, weights, np.nan)[:, None],
             "normal": normal / np.where(length > 0, length, np.nan)[:, None],
             "frame": frame,
         }
@@ -332,16 +337,20 @@ class Contacts:
         return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)
 
     def _frame_of(
-        self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
+        self,
+        taxels: npt.NDArray[np.int64],
+        contact: npt.NDArray[np.int64],
+        load: npt.NDArray[np.float64],
+        peak: npt.NDArray[np.float64],
     ) -> npt.NDArray[np.int64]:
         """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
-        placed = np.flatnonzero(self._frame[taxels] >= 0)
-        contact, load, of_taxel = contact[placed], load[placed], self._frame[taxels[placed]]
-        largest = np.full(count, -1.0)
-        np.maximum.at(largest, contact, load)
-        is_largest = load == largest[contact]
-        frame = np.full(count, -1)
-        frame[contact[is_largest]] = of_taxel[is_largest]
+        placed = self._frame[taxels] >= 0
+        if not placed.all():  # the largest value at a known place
+            peak = np.full(len(peak), -1.0)
+            np.maximum.at(peak, contact[placed], load[placed])
+        is_largest = placed & (load == peak[contact])
+        frame = np.full(len(peak), -1)
+        frame[contact[is_largest]] = self._frame[taxels[is_largest]]
         return frame
 
 

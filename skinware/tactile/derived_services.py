@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -25,6 +25,7 @@ from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, HealthWriter
 from skinware.tactile.motion_service import NAME, MotionWriter
+from skinware.tactile.neighbours import Table, neighbours, posed
 from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
 from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
@@ -104,6 +105,11 @@ class DerivedService(ABC, Generic[WriterT]):
 class CalmContacts(DerivedService[ContactsWriter]):
     """The contacts of one calmed driver, found in its pressure sensors, or else in others that a touch only raises.
 
+    Args:
+        name, driver, into, group: as for :class:`DerivedService`.
+        watched: regions whose motion is published.
+        poses: by name of a coordinate frame, (4, 4) its pose on the robot: contacts hang together across its border.
+
     Attributes:
         motion: the service of motion; None: there are no regions.
         count: number of contacts in the newest frame.
@@ -112,10 +118,17 @@ class CalmContacts(DerivedService[ContactsWriter]):
     subject = "contacts"
 
     def __init__(
-        self, name: str, driver: str, into: Namespace, group: str | None = None, watched: WatchedRegions | None = None
+        self,
+        name: str,
+        driver: str,
+        into: Namespace,
+        group: str | None = None,
+        watched: WatchedRegions | None = None,
+        poses: Mapping[str, npt.ArrayLike] | None = None,
     ) -> None:
         super().__init__(name, driver, into, group)
         self.count = 0
+        self._poses = poses or {}
         self.motion: CalmMotion | None = None
         if watched is not None:
             self.motion = CalmMotion(watched.name, driver, into, group, watched.regions)
@@ -137,15 +150,25 @@ class CalmContacts(DerivedService[ContactsWriter]):
         self._chain, self._stage, self._type_name, self.count = chain, stages.get(type_name), type_name, 0
         if self._stage is not None:
             self._onsets = Onsets(len(self._stage.before), self._stage.before.resolution)
+        beside = self._neighbours(chain)
         if self._writer is not None and type_name == before:
-            self._writer.restructure(chain.structure)
+            self._writer.restructure(chain.structure, neighbours=beside)
             return
         super().close()
         if type_name:
             options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
             self._open(
-                lambda name: ContactsWriter(chain.structure, type_name, driver=self._driver, name=name, **options)
+                lambda name: ContactsWriter(
+                    chain.structure, type_name, driver=self._driver, neighbours=beside, name=name, **options
+                )
             )
+
+    def _neighbours(self, chain: Chain) -> Table | None:
+        """Return (n, k) the neighbours, across the borders of frames with a pose; None: those within each frame."""
+        geometry = chain.structure.geometry
+        if geometry is None or not self._poses or not self._type_name:
+            return None
+        return neighbours(posed(geometry[chain.structure.index(self._type_name)], self._poses))
 
     def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
         """Find the contacts of the next frame, and publish them.

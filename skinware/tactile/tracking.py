@@ -142,6 +142,13 @@ class Tracker:
         """(n,) the track that each taxel was last in; -1: none."""
         return self._track_of
 
+    def rests(self, time_ns: int) -> bool:
+        """Take a frame without blobs, if no contact is followed; return whether that is so."""
+        if len(self._tracks):
+            return False
+        self._time_ns = time_ns
+        return True
+
     def follow(self, blobs: TouchedBlobs, time_ns: int) -> Tracked:
         """Return the identities of the blobs of the next frame, and how they move."""
         self._forget(time_ns)

@@ -20,7 +20,7 @@ from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
-from skinware.views.quantities import Quantity, physical_values, quantities_of
+from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
@@ -75,6 +75,20 @@ class Newest:
             ("calm", quantity.name), lambda: calm.physical(quantity.type.name)
         )
         return values
+
+    def totals(self, quantity: Quantity) -> npt.NDArray[np.float64] | None:
+        """Return (n_modules,) the load on each module, in the quantity's unit.
+
+        None where values are no loads: they are counts, and no calmed driver has their baselines.
+        """
+        loads = self.above_baseline(quantity)
+        if loads is None and not quantity.type.unit.endswith("N"):
+            return None
+        loads = self.physical(quantity) if loads is None else loads
+        loads = np.where((self.status[quantity.where] & WITHOUT_VALUE) == 0, np.nan_to_num(loads), 0)
+        structure = self.frame.structure
+        module = structure.sensor_module[quantity.where]
+        return np.bincount(module, loads, structure.n_modules).astype(np.float64)
 
     def contact_of(self, quantity: Quantity) -> npt.NDArray[np.int16] | None:
         """Return (n,) int16, row of the contact of each sensor, negative without one; None without contacts."""

@@ -185,6 +185,9 @@ class Viewer:
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
+        totals = None if self.look.mode == "wipe" else newest.totals(quantity)
+        if totals is not None:
+            shown["totals"] = blobs.add(totals, "<f4")
         contact_of = newest.contact_of(quantity)
         if contact_of is not None and (contact_of >= 0).any():
             shown["contact_of"] = blobs.add(contact_of, "i1")

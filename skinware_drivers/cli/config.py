@@ -11,15 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
@@ -35,17 +27,14 @@ class Declined(SkinwareError):
     """The user did not confirm."""
 
 
-@click.command(
+@cli.command(
     "skin-config",
-    context_settings=CONTEXT_SETTINGS,
+    "skin-config can0                        list the operations for can0",
+    "skin-config can0 versions               boards and their firmware",
+    "skin-config torso rebaseline            for the boards of a running driver",
+    "skin-config torso rate hz=50 --yes      without confirmation",
+    "skin-config can0 set_address address=9 patch='board 7'",
     no_args_is_help=True,
-    epilog=examples(
-        "skin-config can0                        list the operations for can0",
-        "skin-config can0 versions               boards and their firmware",
-        "skin-config torso rebaseline            for the boards of a running driver",
-        "skin-config torso rate hz=50 --yes      without confirmation",
-        "skin-config can0 set_address address=9 patch='board 7'",
-    ),
 )
 @click.argument("target", metavar="NAME_OR_BUS")
 @click.argument("operation", required=False)
@@ -58,12 +47,11 @@ class Declined(SkinwareError):
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")
-@click.option("-T", "timeout_s", type=seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
+@click.option("-T", "timeout_s", type=cli.seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @click.option("--force", is_flag=True, help="Make changes even if something is sending on the bus.")
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
 def command(
     target: str,
     operation: str | None,
@@ -257,4 +245,4 @@ def _lines(value: dict[str, Any], indent: str = "") -> list[str]:
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    EXIT_FAILED,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, style
 from skinware.text import age_text, plural, wrapped
 from skinware_drivers.doctor.finding import Finding, Severity
@@ -95,27 +86,23 @@ def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
     yield from wrapped(head + text, _WIDTH, hang=width)
 
 
-@click.command(
+@cli.command(
     "skin-doctor",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-doctor                       this machine and what runs on it",
-        "skin-doctor walk.mcap             a recording",
-        "skin-doctor --report report.md    a text to attach to an issue",
-        "skin-doctor --json | jq '.findings[] | {severity, what, where}'",
-    ),
+    "skin-doctor                       this machine and what runs on it",
+    "skin-doctor walk.mcap             a recording",
+    "skin-doctor --report report.md    a text to attach to an issue",
+    "skin-doctor --json | jq '.findings[] | {severity, what, where}'",
 )
 @click.argument("file", type=click.Path(path_type=Path), required=False)
-@click.option("--seconds", "watch_s", type=seconds, default="3", show_default=True, help="Look for SECONDS.")
+@click.option("--seconds", "watch_s", type=cli.seconds, default="3", show_default=True, help="Look for SECONDS.")
 @click.option(
     "--report",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="Write all of it to FILE (Markdown), without names of people, machines and folders.",
 )
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
 def command(file: Path | None, watch_s: float, report: Path | None, namespace: str | None, as_json: bool) -> None:
     """Find out what is wrong: look at interfaces, permissions, buses, patches, times, taxels, files and the machine.
 
@@ -138,7 +125,7 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
     else:
         echo("\n".join(as_text(evidence, found, None if report is None else str(report))))
     if found.findings:
-        click.get_current_context().exit(EXIT_FAILED)
+        click.get_current_context().exit(cli.EXIT_FAILED)
 
 
 def as_data(evidence: Evidence, found: Examination) -> dict[str, Any]:
@@ -207,4 +194,4 @@ def _progress() -> Callable[[float], None]:
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -15,17 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    group_option,
-    json_option,
-    log_to_stderr,
-    namespace_option,
-    run,
-    verbose_option,
-    version_option,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
 from skinware.text import plural
@@ -87,21 +77,18 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     context.exit()
 
 
-@click.command(
+@cli.command(
     "skin-driver",
+    "skin-driver --bus virtual                  emulated boards, no hardware",
+    "skin-driver --bus can0                     ROBOSKIN boards on CAN",
+    "skin-driver --bus can0 --boards 7,8,9,10   only these boards",
+    "skin-driver --bus can0 --listen-only       send nothing",
+    "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
+    "skin-driver --driver xela --help           the options of another driver",
+    "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
+    "skin-driver --bus can0 --capture it.mcap   make a capture for a bug report",
+    "skin-driver --bus replay:it.mcap           decode it again, with the recorded driver and options",
     cls=DriverCommand,
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-driver --bus virtual                  emulated boards, no hardware",
-        "skin-driver --bus can0                     ROBOSKIN boards on CAN",
-        "skin-driver --bus can0 --boards 7,8,9,10   only these boards",
-        "skin-driver --bus can0 --listen-only       send nothing",
-        "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
-        "skin-driver --driver xela --help           the options of another driver",
-        "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
-        "skin-driver --bus can0 --capture it.mcap   make a capture for a bug report",
-        "skin-driver --bus replay:it.mcap           decode it again, with the recorded driver and options",
-    ),
 )
 @click.option(
     "--bus",
@@ -149,7 +136,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     type=click.Path(path_type=Path),
     help="TOML file with the positions of the sensors, which the driver publishes.",
 )
-@group_option
+@cli.group_option
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to run on, such as 1,2-3.")
 @click.option(
@@ -166,10 +153,9 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     callback=_print_unit,
     help="Print a systemd unit that runs this program as a service, and end.",
 )
-@namespace_option
-@json_option
-@version_option
-@verbose_option
+@cli.namespace_option
+@cli.json_option
+@cli.verbose_option
 def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) -> None:
     """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
@@ -185,7 +171,7 @@ def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) ->
     from skinware_drivers.cli.driver_setup import DriverArguments, DriverSetup
     from skinware_drivers.running.flow import FlowLoop
 
-    log_to_stderr(verbose)
+    cli.log_to_stderr(verbose)
     names = {field.name for field in fields(DriverArguments)}
     own = {name: given.pop(name) for name in names & given.keys()}
     setup = DriverSetup(DriverArguments(hardware=hardware_values(given), **own))
@@ -260,7 +246,7 @@ def _has_terminal() -> bool:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)
 
 
 def print_ready(runner: Runner, as_json: bool) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, namespace_option, run, seconds, version_option
+from skinware.cli import _command as cli
 from skinware.errors import ConfigurationError
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
@@ -36,17 +36,14 @@ class EmulateCommand(HardwareCommand):
         return f"emulated {short_name(driver)}", load_emulator(driver).Options
 
 
-@click.command(
+@cli.command(
     "skin-emulate",
+    "skin-emulate --bus vcan0 --boards 7,8                  ROBOSKIN boards",
+    "skin-emulate --bus vcan0 --lose 0.01 --restart 7       with faults",
+    "skin-emulate --driver openpatch --bus pty:/tmp/skin    on a serial line",
+    "skin-emulate --driver skintalk --bus tcp://:5000       as a TCP server",
+    "skin-emulate --driver xela --help                      options of another",
     cls=EmulateCommand,
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-emulate --bus vcan0 --boards 7,8                  ROBOSKIN boards",
-        "skin-emulate --bus vcan0 --lose 0.01 --restart 7       with faults",
-        "skin-emulate --driver openpatch --bus pty:/tmp/skin    on a serial line",
-        "skin-emulate --driver skintalk --bus tcp://:5000       as a TCP server",
-        "skin-emulate --driver xela --help                      options of another",
-    ),
 )
 @click.option("--bus", "bus_name", metavar="BUS", required=True, help="Bus to use: vcan0, pty:/tmp/skin ...")
 @click.option(
@@ -67,10 +64,9 @@ class EmulateCommand(HardwareCommand):
 @click.option(
     "--name", metavar="NAME", help="Publish a service by which programs press the skin (skin-press).  [default: none]"
 )
-@namespace_option
+@cli.namespace_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
-@click.option("-T", "duration_s", type=seconds, metavar="SECONDS", help="End after SECONDS.")
-@version_option
+@click.option("-T", "duration_s", type=cli.seconds, metavar="SECONDS", help="End after SECONDS.")
 def command(
     bus_name: str,
     driver: str,
@@ -90,8 +86,7 @@ def command(
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
-    from skinware_drivers.cli.pressing import PressingService
+    from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, PressingService, SignalWatch
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus
@@ -143,7 +138,7 @@ def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
 
 
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)
 
 
 if __name__ == "__main__":

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    examples,
-    json_option,
-    run,
-    seconds,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
@@ -27,18 +19,15 @@ if TYPE_CHECKING:
 _DETECTION_S = 10.0
 
 
-@click.command(
+@cli.command(
     "skin-find",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-find                     CAN interfaces, adapters, serial ports",
-        "skin-find can0 --probe        ask which devices are on can0",
-        "skin-find --udev              fixed names for the serial ports",
-        "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
-    ),
+    "skin-find                     CAN interfaces, adapters, serial ports",
+    "skin-find can0 --probe        ask which devices are on can0",
+    "skin-find --udev              fixed names for the serial ports",
+    "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
-@click.option("--listen", "listen_s", type=seconds, default="1", show_default=True, help="Listen for SECONDS.")
+@click.option("--listen", "listen_s", type=cli.seconds, default="1", show_default=True, help="Listen for SECONDS.")
 @click.option("--probe", is_flag=True, help="Send harmless requests to see which devices answer.")
 @click.option(
     "--driver",
@@ -49,8 +38,7 @@ _DETECTION_S = 10.0
 )
 @click.option("--force", is_flag=True, help="With --probe: also where requests may disturb devices or programs.")
 @click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")
-@json_option
-@version_option
+@cli.json_option
 def command(
     buses: tuple[str, ...],
     listen_s: float,
@@ -256,14 +244,14 @@ def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
         raise click.UsageError(f"{others[0]} is not a serial port, and needs no udev rule")
     rules = rules_for(ports)
     if not rules:
-        warn("no serial device is plugged in by USB; these are the rules for the adapters that are usual")
+        cli.warn("no serial device is plugged in by USB; these are the rules for the adapters that are usual")
         rules = shipped_rules()
     if as_json:
         print_json({"place": PLACE, "rules": rules, "then": list(RELOAD)})
     else:
         echo(rules, nl=False)
-        warn(f"to use them: skin-find --udev | sudo tee {PLACE}; {'; '.join(RELOAD)}")
+        cli.warn(f"to use them: skin-find --udev | sudo tee {PLACE}; {'; '.join(RELOAD)}")
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS
+from skinware.cli import _command as cli
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,7 +61,7 @@ class HardwareCommand(click.Command):
 
 def reserved_names(command: click.Command) -> frozenset[str]:
     """Names that no option of hardware can have, because the command's own flags have them."""
-    flags = [flag for option in command.params for flag in option.opts] + CONTEXT_SETTINGS["help_option_names"]
+    flags = [flag for option in command.params for flag in option.opts] + cli.CONTEXT_SETTINGS["help_option_names"]
     return frozenset(flag[2:].replace("-", "_") for flag in flags if flag.startswith("--"))
 
 

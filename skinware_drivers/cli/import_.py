@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, run, version_option
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
@@ -26,15 +26,15 @@ _HEADINGS = {
 }
 
 
-@click.group("skin-import", context_settings=CONTEXT_SETTINGS)
-@version_option
+@click.group("skin-import", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Create configurations for skin-driver from the files of other systems."""
 
 
 @command.command(
     "icub",
-    epilog=examples(
+    epilog=cli.examples(
         "skin-import icub iCubGenova02 -o skin             a whole robot",
         "skin-import icub iCubGenova02 positions -o skin   with skinGui's positions",
         "skin-import icub torso.xml --bus 1=can0           one device, on stdout",
@@ -59,7 +59,7 @@ def command() -> None:
     metavar="BUS",
     help="Read YARP ports instead of CAN: their common beginning, as yarp://HOST:PORT/icub/skin.",
 )
-@json_option
+@cli.json_option
 @click.option("-v", "--verbose", is_flag=True, help="Also list remarks that need no action.")
 def icub(
     paths: tuple[Path, ...],
@@ -201,4 +201,4 @@ def _report(notes: Sequence[Note], verbose: bool) -> None:
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

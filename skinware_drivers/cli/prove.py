@@ -17,19 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
-from skinware.cli._command import (
-    CONTEXT_SETTINGS,
-    EXIT_FAILED,
-    examples,
-    json_option,
-    namespace_option,
-    run,
-    seconds,
-    version_option,
-    warn,
-)
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import DriverError, SkinwareError
 
@@ -46,17 +35,14 @@ _DRIVER = "from skinware_drivers.cli.driver import main; main()"
 _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged": "yellow"}
 
 
-@click.command(
+@cli.command(
     "skin-prove",
-    context_settings=CONTEXT_SETTINGS,
-    epilog=examples(
-        "skin-prove                                    the only driver that runs",
-        "skin-prove hand --only index --only palm      only these modules",
-        "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
-        "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
-        "skin-prove --captured hand.mcap               without the device: are the decoded values the same?",
-        "skin-prove --captured hand.mcap -- --driver ./my.py",
-    ),
+    "skin-prove                                    the only driver that runs",
+    "skin-prove hand --only index --only palm      only these modules",
+    "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
+    "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
+    "skin-prove --captured hand.mcap               without the device: are the decoded values the same?",
+    "skin-prove --captured hand.mcap -- --driver ./my.py",
 )
 @click.argument("name", required=False)
 @click.argument("driver_arguments", metavar="[-- OPTIONS OF SKIN-DRIVER]", nargs=-1, type=click.UNPROCESSED)
@@ -64,9 +50,9 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "--type", "type_name", metavar="TYPE", help="Sensors to look at.  [default: pressure, force, or the first]"
 )
 @click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; repeat it for several.")
-@click.option("--wait", "patience_s", type=seconds, default="30", show_default=True, help="SECONDS for each step.")
+@click.option("--wait", "patience_s", type=cli.seconds, default="30", show_default=True, help="SECONDS for each step.")
 @click.option(
-    "--rest", "rest_s", type=seconds, default="3", show_default=True, help="Look at the skin at rest for SECONDS."
+    "--rest", "rest_s", type=cli.seconds, default="3", show_default=True, help="Look at the skin at rest for SECONDS."
 )
 @click.option("--tare", "with_tare", is_flag=True, help="At the end, let the driver tare, if it can.")
 @click.option(
@@ -88,9 +74,8 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     is_flag=True,
     help="With --captured: write the values that are decoded now beside FILE, as the expected ones.",
 )
-@namespace_option
-@json_option
-@version_option
+@cli.namespace_option
+@cli.json_option
 @click.pass_context
 def command(
     context: click.Context,
@@ -125,13 +110,11 @@ def command(
     if name is not None and name.startswith("-"):  # nothing stands before the --
         driver_arguments, name = (name, *driver_arguments), None
     if captured is not None:
-        _refuse_others(
-            context, {"captured", "save", "driver_arguments", "as_json", *(["name"] if name is None else [])}
-        )
+        cli.refuse_others("--captured", {"save", "driver_arguments", "as_json", *(["name"] if name is None else [])})
         from skinware_drivers.cli.comparing import compare_capture
 
         if not compare_capture(captured, driver_arguments, save=save, as_json=as_json):
-            context.exit(EXIT_FAILED)
+            context.exit(cli.EXIT_FAILED)
         return
     if save:
         raise click.UsageError("--save needs --captured")
@@ -165,7 +148,7 @@ def command(
     if trouble is not None:
         raise trouble
     if not proof.is_proven:
-        context.exit(EXIT_FAILED)
+        context.exit(cli.EXIT_FAILED)
 
 
 @contextlib.contextmanager
@@ -184,14 +167,6 @@ def _captured(
             keep: Callable[[Capture], None] = lambda done: files.captured.update(done.result)  # noqa: E731
             beside.enter_context(captured(files.capture, reader.name, place.name, keep))
         yield reader
-
-
-def _refuse_others(context: click.Context, allowed: set[str]) -> None:
-    """Refuse options that are about a device."""
-    for parameter in context.command.params:
-        is_given = parameter.name and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
-        if is_given and parameter.name not in allowed and context.params[parameter.name]:
-            raise click.UsageError(f"--captured goes without {parameter.opts[0]}")
 
 
 def _facts() -> dict[str, str]:
@@ -326,10 +301,10 @@ def _print(proof: Proof, files: ProofFiles, as_json: bool) -> None:
         echo(f"ended early: {proof.about['ended early']}")
     echo(style("proven" if proof.is_proven else "not proven", bold=True))
     if files.captured.get("problem"):
-        warn(f"{files.capture} ended early: {files.captured['problem']}")
+        cli.warn(f"{files.capture} ended early: {files.captured['problem']}")
     if files.written:
         echo(f"written to {', '.join(files.written)}; read them before you give them to others")
 
 
 def main() -> None:
-    run(command)
+    cli.run(command)

@@ -1,4 +1,4 @@
-"""``skin-replay``: publish a recording again (``skinware.cli.replay``), or with ``--wire`` send its frames on buses."""
+"""``skin-replay``: publish a recording again, or with ``--wire`` send its frames on buses."""
 
 from __future__ import annotations
 
@@ -7,51 +7,119 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run, signals_end, warn
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
-from skinware.cli.replay import command as frames_command
+from skinware.cli.replay import NAMESPACE, publish_again
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireTrack
     from skinware_drivers.bus import Bus
     from skinware_drivers.virtual.recorded_wire import RecordedWire
 
-_OF_SERVICES = {"paused": "--paused", "stay": "--stay", "namespace": "--namespace"}
 _LONGEST_SLEEP_S = 0.05
 _FULL_S = 0.1
 """Longest wait for a bus that takes no frame, before the frame is dropped."""
 _PAYLOAD = 64
 
 
-def replay(wire: bool, buses: tuple[str, ...], **options: Any) -> None:
-    if not wire:
-        if buses:
-            raise click.UsageError("--bus needs --wire")
-        click.get_current_context().invoke(frames_command, **options)
+def speed(text: str) -> float:
+    """Return a factor above 0; for ``click.option(type=...)``.
+
+    Raises:
+        click.BadParameter: the text is no such number.
+    """
+    factor = cli.seconds(text)
+    if not factor:
+        raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
+    return factor
+
+
+@cli.command(
+    "skin-replay",
+    "skin-replay walk.mcap                         skin-top --namespace replay shows it",
+    "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
+    "skin-replay walk.mcap --start 10 --end 12 --loop",
+    "skin-replay walk.mcap --paused                step through it with . and ,",
+    "skin-replay walk.mcap --wire --bus vcan0      the frames on the recorded bus, for any program",
+)
+@click.argument("file", type=cli.FILE)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
+@click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
+@click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
+@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--paused", is_flag=True, help="Wait for a key or a request first.")
+@click.option("--stay", is_flag=True, help="Pause at the end, instead of ending.")
+@click.option(
+    "--times",
+    type=click.Choice(["now", "recorded"]),
+    default="now",
+    show_default=True,
+    help="Times of frames: moved to now, which keeps their ages, or as recorded.",
+)
+@click.option(
+    "--namespace",
+    metavar="NAME",
+    help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{NAMESPACE}', if nothing runs there]",
+)
+@cli.json_option
+@click.option("--wire", is_flag=True, help="Send the recorded frames of buses on a --bus instead.")
+@click.option(
+    "--bus",
+    "buses",
+    metavar="[RECORDED=]BUS",
+    multiple=True,
+    help="With --wire: bus to send on; with several recorded buses, which one: can0=vcan0. Repeat it.",
+)
+def command(
+    file: Path,
+    names: tuple[str, ...],
+    factor: float,
+    start_s: float,
+    end_s: float | None,
+    loop: bool,
+    paused: bool,
+    stay: bool,
+    times: str,
+    namespace: str | None,
+    as_json: bool,
+    wire: bool,
+    buses: tuple[str, ...],
+) -> None:
+    """Publish the drivers and services of a recording, or only NAME..., as if they ran now.
+
+    They have the recorded names, structures, states and counters, and restart where they restarted. In a terminal, keys
+    pause, step, seek and change the speed. Other programs call the same operations of any of the services: pause,
+    resume, step, seek, speed, loop, replay.
+
+    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
+    """
+    if wire:
+        cli.refuse_others("--wire", {"file", "names", "factor", "start_s", "end_s", "loop", "as_json", "buses"})
+        if not buses:
+            raise click.UsageError(
+                f"--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:{file}"
+            )
+        _replay_wires(file, names, buses, factor, start_s, end_s, loop, as_json)
         return
-    for option, flag in _OF_SERVICES.items():
-        if options[option]:
-            raise click.UsageError(f"{flag} is about drivers and services, --wire about frames on buses")
-    if options["times"] != "now":
-        raise click.UsageError("--times is about snapshots of drivers, --wire about frames on buses")
-    if not buses:
-        file = options["file"]
-        raise click.UsageError(
-            f"--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:{file}"
-        )
-    _replay_wires(
-        options["file"],
-        options["names"],
-        buses,
-        options["factor"],
-        options["start_s"],
-        options["end_s"],
-        options["loop"],
-        options["as_json"],
+    if buses:
+        raise click.UsageError("--bus needs --wire")
+    publish_again(
+        file,
+        names,
+        namespace,
+        speed=factor,
+        start_s=start_s,
+        end_s=end_s,
+        loop=loop,
+        paused=paused,
+        stay=stay,
+        times=times,
+        as_json=as_json,
     )
 
 
@@ -70,7 +138,7 @@ def _replay_wires(
     with skinware.recording.open(file) as recording:
         pairs = _pairs(recording, drivers, buses)
         sender = WireSender(pairs, speed, start_s, end_s)
-        with contextlib.closing(sender), signals_end(sender.stop):
+        with contextlib.closing(sender), cli.signals_end(sender.stop):
             sender.open()
             names = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
             if as_json:
@@ -79,7 +147,7 @@ def _replay_wires(
                 echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in names.items())} (Ctrl-C ends)")
             sender.send_all(loop=loop)
         for problem in recording.problems:
-            warn(problem)
+            cli.warn(problem)
     if as_json:
         print_json({"event": "stopped", "frames": dict(sender.sent), "failed": sender.failed})
     else:
@@ -200,30 +268,5 @@ class WireSender:
                 return
 
 
-command: click.Command = click.Command(
-    "skin-replay",
-    context_settings=CONTEXT_SETTINGS,
-    callback=replay,
-    params=[
-        *frames_command.params,
-        click.Option(["--wire"], is_flag=True, help="Send the recorded frames of buses on a --bus instead."),
-        click.Option(
-            ["--bus", "buses"],
-            metavar="[RECORDED=]BUS",
-            multiple=True,
-            help="With --wire: bus to send on; with several recorded buses, which one: can0=vcan0. Repeat it.",
-        ),
-    ],
-    help=frames_command.help,
-    epilog=examples(
-        "skin-replay walk.mcap                         skin-top --namespace replay shows it",
-        "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
-        "skin-replay walk.mcap --start 10 --end 12 --loop",
-        "skin-replay walk.mcap --paused                step through it with . and ,",
-        "skin-replay walk.mcap --wire --bus vcan0      the frames on the recorded bus, for any program",
-    ),
-)
-
-
 def main() -> None:
-    run(command, goes_on=True)
+    cli.run(command, goes_on=True)

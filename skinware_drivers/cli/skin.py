@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, run, version_option
+from skinware.cli import _command as cli
 from skinware.cli._terminal import echo
 from skinware_drivers.options.declared import nearest_name
 
@@ -86,11 +86,11 @@ class CommandGroup(click.Group):
 @click.group(
     "skin",
     cls=CommandGroup,
-    context_settings=CONTEXT_SETTINGS,
+    context_settings=cli.CONTEXT_SETTINGS,
     invoke_without_command=True,
     epilog="skin NAME --help explains a command; skin-NAME is the same command. Completion: skin completion --help",
 )
-@version_option
+@cli.version_option
 @click.pass_context
 def command(context: click.Context) -> None:
     """Read robot skin and tactile hands."""
@@ -121,4 +121,4 @@ def main() -> NoReturn:
     if words and words[0] in COMMANDS and "_SKIN_COMPLETE" not in os.environ:
         sys.argv = [f"skin-{words[0]}", *words[1:]]
         import_module(COMMANDS[words[0]].module).main()
-    run(command)
+    cli.run(command)

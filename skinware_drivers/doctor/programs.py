@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from skinware.bridge_state import BridgeState
+from skinware.bridge_state import BridgeState, as_data, summary
 from skinware.realtime import NS_PER_S
 from skinware.text import age_text, count_text, plural, rate_text
-from skinware.views.bridges import as_data, summary
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Rule, Severity
 from skinware_drivers.doctor.machine import circumstances

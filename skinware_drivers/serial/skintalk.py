@@ -10,28 +10,22 @@ the last record before a pause waits for the next one. Only two bytes can be che
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Bits, Expand, Frame, Layout, Link, Module, Options, Packed, Patch, Values, taxels
+from skinware_drivers import Bits, Frame, Layout, Link, Module, Options, Packed, Patch, Values, taxels
 from skinware_drivers.serial import Field, Packet, SerialAdapter, Unframed
 
 _START, _STOP = b"1", b"0"
-_Bytes = npt.NDArray[np.uint8]
 
 
 class SkintalkOptions(Options, frozen=True):
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches, 0-15")] = tuple(range(1, 9))
     cells: Annotated[int, Meta(description="cells of each patch", ge=1, le=16)] = 16
-    negative: Annotated[
-        Literal["twos_complement", "off_by_one"],
-        Meta(description="negative values: two's complement, or one more, as older skintalk shows them"),
-    ] = "twos_complement"
     period_ms: Annotated[int, Meta(description="nominal time between two records of a cell, ms", ge=1)] = 20
 
     def __post_init__(self) -> None:
@@ -55,8 +49,7 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
 
     def __init__(self, options: SkintalkOptions) -> None:
         super().__init__(options)
-        exact = Values(0, Packed(24, signed=True), 1)
-        values = exact if options.negative == "twos_complement" else Expand(_off_by_one)
+        values = Values(0, Packed(24, signed=True), 1)
         self.layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
         self.patches = tuple(
             Patch(
@@ -72,13 +65,3 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
 
     async def stop(self, link: Link) -> None:
         await link.send(0, _STOP)
-
-
-def _off_by_one(
-    payload: _Bytes, length: _Bytes
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]:
-    """Return values in which a negative one is minus its inverted bits: FF FF FF is 0."""
-    row = np.arange(len(length))
-    high, middle, low = payload[:, :3].astype(np.int32).T
-    value = (high << 16 | middle << 8 | low) - ((high >> 7) << 24)
-    return row, np.zeros_like(row), value + (value < 0)

@@ -17,8 +17,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.layout_check import check_layout
-from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.leaks import Belongings, files_left
+from skinware_drivers.testing.defect import Belongings, defect, files_left, require
 from skinware_drivers.testing.rig import Running, in_its_time, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.virtual.hand_clock import HandClock

@@ -5,22 +5,18 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import EXTENDED_FLAG, Bus
-from skinware_drivers.modbus.bus import ModbusBus
-from skinware_drivers.modbus.registers import Wanted
-from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.ports import Port
+from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.testing.defect import defect
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.hand_clock import HandClock, HandTimer
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, next_read
+from skinware_drivers.virtual.hand_clock import HandClock
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.line import VirtualModbusBus, VirtualSerialBus
 
 _LONGEST_HOLD = 2.5
 _BETWEEN = 6
@@ -248,109 +244,27 @@ class Interference:
         return sorted([*frames, *others], key=lambda frame: frame.time_ns)
 
 
-class _LineEnd(Port):
-    """A serial line whose other end is emulated: the payloads of its frames are the bytes on the line."""
-
-    def __init__(self, hardware: EmulatedHardware, clock: HandClock) -> None:
-        self._hardware = hardware
-        self._clock = clock
-        self._timer: HandTimer = clock.timer()
-        self._unread: list[bytes] = []
-        self.present = True
-        hardware.skip(clock())
-        self._wake()
-
-    def fileno(self) -> int:
-        return self._timer.fileno()
-
-    def read(self, size: int) -> bytes:
-        if not self.present:
-            raise BusNotAvailable("the emulated line went away, perhaps unplugged")
-        self._unread += [frame.payload for frame in self._hardware.emit(self._clock())]
-        data = next_read(self._hardware, self._unread, size)
-        self._wake()
-        return data
-
-    def write(self, data: bytes) -> int:
-        if not self.present:
-            raise OSError("unplugged")
-        self._hardware.receive(0, data, self._clock())
-        self._wake()
-        return len(data)
-
-    def close(self) -> None:
-        self._timer.close()
-
-    def wake(self) -> None:
-        self._timer.wake_at(0)
-
-    def _wake(self) -> None:
-        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
-
-
-class _OnLine(Bus):
-    """A bus at the end of an emulated line, which can go away and come back."""
-
-    opens_slowly: ClassVar[bool] = False  # a thread would not follow the clock's time
-    _hardware: EmulatedHardware
-    _clock: HandClock
-    _end: _LineEnd | None = None
-    _present = True
-
-    def _open_port(self) -> Port:
-        if not self._present:
-            raise BusNotAvailable("the emulated line is away")
-        self._end = _LineEnd(self._hardware, self._clock)
-        return self._end
-
-    def vanish(self) -> None:
-        self._present = False
-        if self._end is not None:
-            self._end.present = False
-            self._end.wake()
-
-    def come_back(self) -> None:
-        """End :meth:`vanish`."""
-        self._present = True
-
-
-class EmulatedSerialBus(_OnLine, SerialBus):
-    """A serial line with emulated devices, in a clock's time."""
-
-    def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
-        super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
-        self._hardware, self._clock = hardware, clock
-
-
-class EmulatedModbusBus(_OnLine, ModbusBus):
-    """A Modbus line with emulated devices, in a clock's time."""
-
-    def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
-        super().__init__("emulated", payload_size=payload_size, listen_only=listen_only, make_timer=clock.timer)
-        self._hardware, self._clock = hardware, clock
-
-    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
-        """Return 0: the line has no baud rate."""
-        return 0.0
-
-
-EmulatedBus = VirtualCanBus | EmulatedSerialBus | EmulatedModbusBus
+EmulatedBus = VirtualCanBus | VirtualSerialBus | VirtualModbusBus
+_KINDS: dict[str, type[EmulatedBus]] = {
+    "can": VirtualCanBus,
+    "virtual": VirtualCanBus,
+    "serial": VirtualSerialBus,
+    "modbus": VirtualModbusBus,
+}
 
 
 def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
-    if adapter.medium in ("can", "virtual"):
-        return VirtualCanBus.with_hardware(
-            hardware,
-            payload_size=adapter.payload_size,
-            listen_only=listen_only,
-            clock=clock,
-            make_timer=clock.timer,
-        )
-    if adapter.medium == "serial":
-        return EmulatedSerialBus(hardware, clock, adapter.payload_size, listen_only)
-    if adapter.medium == "modbus":
-        return EmulatedModbusBus(hardware, clock, adapter.payload_size, listen_only)
-    return defect(f"{type(adapter).__name__}: there is no emulated bus of the medium {adapter.medium!r}")
+    kind = _KINDS.get(adapter.medium)
+    if kind is None:
+        return defect(f"{type(adapter).__name__}: there is no emulated bus of the medium {adapter.medium!r}")
+    return kind(
+        "emulated",
+        payload_size=adapter.payload_size,
+        listen_only=listen_only,
+        hardware=hardware,
+        clock=clock,
+        make_timer=clock.timer,
+    )
 
 
 def foreign_identifiers(own: Collection[int]) -> list[int]:

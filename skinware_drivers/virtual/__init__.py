@@ -1,10 +1,9 @@
 """Emulated hardware, in this process or on a real bus: emulators and their base classes."""
 
-from skinware_drivers.virtual.adapter import VirtualAdapter
+from skinware_drivers.adapter import VirtualAdapter
 from skinware_drivers.virtual.device import Device, EmulatorOptions
 from skinware_drivers.virtual.emulator import CanFrame, Emulator, on_a_grid
-from skinware_drivers.virtual.modbus_device import ModbusEmulator
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual.serial_device import ModbusEmulator, SerialEmulator, SerialEmulatorOptions, cut_packets
 
 __all__ = [
     "CanFrame",

@@ -153,21 +153,6 @@ def medium_of(emulator: HardwareFactory) -> str:
     return medium
 
 
-def next_read(hardware: EmulatedHardware, waiting: list[bytes], size: int) -> bytes:
-    """Return the bytes of one read at the other end of an emulated line: all that wait, or one datagram.
-
-    Args:
-        hardware: its attribute ``datagrams`` says whether it sends datagrams.
-        waiting: payloads that were sent and not read yet; those that are read are removed.
-        size: most bytes of a read.
-    """
-    if getattr(hardware, "datagrams", False):
-        return waiting.pop(0)[:size] if waiting else b""
-    data = b"".join(waiting)
-    waiting[:] = [data[size:]] if len(data) > size else []
-    return data[:size]
-
-
 def emulators_instead(medium: str) -> str:
     """Name the emulators that drivers of a medium can use instead, for people; empty if there are none."""
     fitting = []

@@ -6,7 +6,10 @@ On a line, the payloads of the emulator's frames are the bytes, framing and all;
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import ClassVar
 
+from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus, chosen_by
 from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.registers import Wanted
@@ -14,14 +17,13 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, PlacedCanBus, VirtualCanBus
-from skinware_drivers.virtual.hand_clock import MonotonicTimer
+from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
 from skinware_drivers.virtual.hardware import (
     EmulatedHardware,
     PlacedHardware,
     emulators_instead,
     load_emulator,
     medium_of,
-    next_read,
 )
 
 _LONGEST_BACKLOG_NS = 1_000_000_000
@@ -34,10 +36,15 @@ class _EmulatedLine(Bus):
     Args:
         payload_size: longest body that fits into a batch.
         listen_only: refuse every ``send``.
+        hardware: devices that exist already, instead of ``channel`` and ``options``.
+        clock: returns CLOCK_MONOTONIC ns.
+        make_timer: makes the timer that wakes the reader; another clock needs another timer.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
+
+    opens_slowly: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -46,10 +53,18 @@ class _EmulatedLine(Bus):
         *,
         payload_size: int = 8,
         listen_only: bool = False,
+        hardware: EmulatedHardware | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        make_timer: Callable[[], Timer] = MonotonicTimer,
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        emulator = load_emulator(channel)
-        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
+        if hardware is None:
+            emulator = load_emulator(channel)
+            hardware = emulator(options_from_strings(emulator.Options, options or {}))
+        self.hardware: EmulatedHardware = hardware
+        self._clock, self._make_timer = clock, make_timer
+        self._end: _EmulatedPort | None = None
+        self._is_away = False
 
     @property
     def name(self) -> str:
@@ -58,8 +73,21 @@ class _EmulatedLine(Bus):
     def instead(self, medium: str) -> str:
         return emulators_instead(medium) or super().instead(medium)
 
+    def vanish(self) -> None:
+        """Go away as an unplugged port does: ``receive`` raises, and ``open`` until :meth:`come_back`."""
+        self._is_away = True
+        if self._end is not None:
+            self._end.vanish()
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`."""
+        self._is_away = False
+
     def _open_port(self) -> Port:
-        return _EmulatedPort(self.hardware)
+        if self._is_away:
+            raise BusNotAvailable(f"{self.name}: the emulated line is away")
+        self._end = _EmulatedPort(self.hardware, self._clock, self._make_timer())
+        return self._end
 
 
 class VirtualSerialBus(_EmulatedLine, SerialBus):
@@ -77,33 +105,49 @@ class VirtualModbusBus(_EmulatedLine, ModbusBus):
 class _EmulatedPort(Port):
     """The host's end of a line with emulated devices at the other."""
 
-    def __init__(self, hardware: EmulatedHardware) -> None:
-        self._hardware = hardware
-        self._timer = MonotonicTimer()
+    def __init__(self, hardware: EmulatedHardware, clock: Callable[[], int], timer: Timer) -> None:
+        self._hardware, self._clock, self._timer = hardware, clock, timer
         self._unread: list[bytes] = []
-        hardware.skip(time.monotonic_ns())
+        self._is_away = False
+        hardware.skip(clock())
         self._wake_when_due()
 
     def fileno(self) -> int:
         return self._timer.fileno()
 
     def read(self, size: int) -> bytes:
-        now_ns = time.monotonic_ns()
+        if self._is_away:
+            raise BusNotAvailable("the emulated line went away, perhaps unplugged")
+        now_ns = self._clock()
         due_ns = self._hardware.next_due_ns()
         if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         self._unread += [frame.payload for frame in self._hardware.emit(now_ns)]
-        data = next_read(self._hardware, self._unread, size)
+        data = self._next_read(size)
         self._wake_when_due()
         return data
 
     def write(self, data: bytes) -> int:
-        self._hardware.receive(0, data, time.monotonic_ns())
+        if self._is_away:
+            raise OSError("unplugged")
+        self._hardware.receive(0, data, self._clock())
         self._wake_when_due()
         return len(data)
 
     def close(self) -> None:
         self._timer.close()
+
+    def vanish(self) -> None:
+        self._is_away = True
+        self._timer.wake_at(0)
+
+    def _next_read(self, size: int) -> bytes:
+        """Return the bytes of one read: all that wait, or one datagram."""
+        if getattr(self._hardware, "datagrams", False):
+            return self._unread.pop(0)[:size] if self._unread else b""
+        data = b"".join(self._unread)
+        self._unread = [data[size:]] if len(data) > size else []
+        return data[:size]
 
     def _wake_when_due(self) -> None:
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())

@@ -22,7 +22,7 @@ DESKTOP, PHONE = (1100, 700), (390, 844)
 DRIVER = "skin.drivers[0]?.id"
 READY = "window.skin?.connected && skin.drawn > 2 && skin.drivers.length"
 """JavaScript: of the first driver that the page has; it has drawn one."""
-RAW_SCALE = "mode=raw&scale=0,255&sharp=1"
+RAW_SCALE = "mode=raw&scale=0,255&sharp=1&names=0"
 """Part of an address: physical values from 0 to 255, which the sleeve has for 255 to 0 raw; all pixels, however slow
 the machine is."""
 OURS = ("127.0.0.1", "localhost")

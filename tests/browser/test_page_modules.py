@@ -48,6 +48,42 @@ def tell(page: Page) -> Callable[..., Any]:
     return tell
 
 
+# -- names.js ------------------------------------------------------------------------------------------------------
+
+
+HAND = """(() => {
+    const names = ["index tip", "index pad", "thumb tip", "thumb pad", "palm"];
+    const at = [[0, 5], [0, 3], [3, 5], [3, 3], [1.5, 0]];
+    const driver = { name: "hand", patches: [{ name: "right hand" }] };
+    driver.modules = names.map((name) => ({ name: `right hand, ${name}`, patch: 0 }));
+    const places = at.flatMap(([x, y]) => [[x, y, 0], [x + 1, y + 1, 0]]).flat();
+    const sheet = { driver, n: 10, unit: "N", position: places, radius: Array(10).fill(0.1), shown: {} };
+    Object.assign(sheet, { normal: Array(10).fill([0, 0, 1]).flat(), patch: Array(10).fill(0) });
+    sheet.module = Array.from({ length: 10 }, (_, i) => i >> 1);
+    sheet.shown.totals = a[1];
+    const stage = { pixels: 100, camera: { position: { toArray: () => [2, 3, a[2]] } } };
+    stage.project = (x, y, z) => [a[0] * 100 * x, -a[0] * 100 * y, 1 / a[0]];
+    const found = new m.Names();
+    found.arrange([sheet]);
+    return found.place(stage);
+})()"""
+
+
+def test_parts_of_a_hand_have_names_and_totals_where_there_is_room(tell: Callable[..., Any]) -> None:
+    near = tell("names.js", HAND, 1, None, 9)
+    pads = ["index pad", "index tip", "palm", "thumb pad", "thumb tip"]
+    assert sorted(name["text"] for name in near) == sorted([*pads, "index", "thumb", "right hand"])
+    for one, other in pairwise(sorted(near, key=lambda name: name["y"])):
+        assert abs(one["y"] - other["y"]) >= 14 or abs(one["x"] - other["x"]) >= (one["width"] + other["width"]) / 2
+    loaded = tell("names.js", HAND, 2, [1.5, 0, 0, 0, 2], 9)
+    assert {"index tip  1.5 N", "index  1.5 N", "palm  2 N", "right hand  3.5 N", "thumb"} <= {
+        n["text"] for n in loaded
+    }
+    assert [name["text"] for name in tell("names.js", HAND, 0.07, None, 9)] == ["right hand"]
+    assert tell("names.js", HAND, 0.02, None, 9) == []
+    assert tell("names.js", HAND, 1, None, -9) == []  # from behind
+
+
 # -- turn.js -------------------------------------------------------------------------------------------------------
 
 
@@ -175,6 +211,7 @@ def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
         "selected": "default/a b/can0/board #8&c",
         "pins": ["default/x:pressure:7a", "default/y:force:1"],
         "normals": True,
+        "names": False,
         "theme": "light",
     }
     assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False, "sharp": False}

@@ -17,8 +17,9 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceWriter, Status
 from skinware.cli import dump
 from skinware.cli._command import exit_status
-from skinware.cli.dump import _attach, _frames, command
+from skinware.cli.dump import _attach, _frames
 from skinware.errors import ServiceNotFound, ServiceTimeout
+from skinware_drivers.cli.dump import command
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, PATIENCE_S
 
@@ -92,16 +93,6 @@ def test_people_see_a_line_per_frame(capsys: pytest.CaptureFixture[str]) -> None
         assert exit_status(command, ["-n", "1", "--type", "pressure"]) == 0
         line = capsys.readouterr().out
         assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  1 not fresh\n", line)
-
-
-def test_the_option_of_before_is_told_off_and_changes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeSkin("a", fake_structure(1, 1)) as skin:
-        skin.publish()
-        assert exit_status(command, ["-n", "1", "--physical"]) == 0
-        printed = capsys.readouterr()
-        assert " counts (mean" in printed.out
-        assert printed.err == "skin-dump: --physical is not needed any more: values are physical\n"
-        assert exit_status(command, ["-n", "1", "--physical", "--counts"]) == 2
 
 
 def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,7 +240,7 @@ def test_frames_end_with_the_timeout() -> None:
             next(frames)
 
 
-@pytest.mark.parametrize("form", ["--json", "--counts"])
+@pytest.mark.parametrize("form", ["--json", pytest.param("--counts", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespace) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):

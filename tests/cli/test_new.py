@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+import skinware_drivers
 from skinware.cli._command import exit_status
 from skinware.errors import ConfigurationError, SkinwareError
-from skinware_drivers import new_package
-from skinware_drivers.cli.new import command
-from skinware_drivers.new_package import check_name, make_package
+from skinware_drivers.cli import new
+from skinware_drivers.cli.new import check_name, command, make_package
 from tests.commands import BIN
 
 TRANSPORTS = ["can", "serial", "modbus", "tcp", "virtual"]
@@ -91,10 +91,10 @@ def test_what_is_made_is_clean_whatever_its_name(transport: str, name: str, tmp_
 
 
 def test_every_template_is_used() -> None:
-    folder = Path(new_package.__file__).parent / "templates"
+    folder = Path(skinware_drivers.__file__).parent / "templates"
     found = {(path.parent.name, path.name) for path in folder.rglob("*") if path.is_file()}
-    used = {("common", f"{name}.template") for name in new_package._COMMON}
-    used |= {(part, f"{name}.template") for part in TRANSPORTS for name in new_package._OF_TRANSPORT}
+    used = {("common", f"{name}.template") for name in new._COMMON}
+    used |= {(part, f"{name}.template") for part in TRANSPORTS for name in new._OF_TRANSPORT}
     assert found == used
 
 

@@ -34,7 +34,7 @@ from tests.unprivileged import without_rights_to_all_files
 KILLS = 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespace, number: int) -> None:
     file = tmp_path / "skin.mcap"
     with running("skin-record", "-o", str(file)) as recorder:

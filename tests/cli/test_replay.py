@@ -12,7 +12,7 @@ import pytest
 import skinware.recording
 from skinware import DriverReader, Namespace
 from skinware.cli._command import exit_status
-from skinware.cli.replay import command as replay
+from skinware_drivers.cli.replay import command as replay
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin
 from tests.commands import refused, run, running

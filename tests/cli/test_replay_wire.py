@@ -119,8 +119,8 @@ def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
     [
         (["--wire"], "--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:walk.mcap"),
         (["--bus", "vcan0"], "--bus needs --wire"),
-        (["--wire", "--bus", "x", "--paused"], "--paused is about drivers and services"),
-        (["--wire", "--bus", "x", "--times", "recorded"], "--times is about snapshots of drivers"),
+        (["--wire", "--bus", "x", "--paused"], "--wire goes without --paused"),
+        (["--wire", "--bus", "x", "--times", "recorded"], "--wire goes without --times"),
         (["--wire", "--bus", "vcan0"], "walk.mcap: which bus? there are: bus=can0&driver=torso, bus=can1&driver=torso"),
         (["--wire", "--bus", "can0=a", "--bus", "can0=b"], "--bus can0=b: can0 is sent already"),
     ],

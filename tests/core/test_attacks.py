@@ -234,6 +234,7 @@ def test_an_attacker_in_the_group_stops_nobody(users: Users, attack: Callable[[P
     assert users.board.rows[2, STALE] == 0
 
 
+@pytest.mark.thorough
 def test_garbage_on_the_socket_stops_nobody(users: Users, request: pytest.FixtureRequest) -> None:
     sent, _, answers = reads_on(users, garbage, users.board.path, seeded(request).getrandbits(32))
     assert sent > 100

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S, Periodic, Profile, _profile, cpus_from_text, now_ns
-from skinware.realtime._profile import cpus_as_text, online_cpus
+from skinware.realtime import NS_PER_S, Periodic, Profile, cpus_as_text, cpus_from_text, now_ns, online_cpus, set_cpus
 from tests.apply_profile import LATER_KIB, command, result_of
 from tests.scheduling import may_have_fifo
 from tests.unprivileged import without_rights
@@ -72,7 +71,7 @@ def test_strict_raises_what_would_have_been_warnings() -> None:
 
 def test_refused_cpus_leave_the_old_ones() -> None:
     before = os.sched_getaffinity(0)
-    refusal = _profile.set_cpus({1000})
+    refusal = set_cpus({1000})
     assert refusal is not None
     allowed = ",".join(map(str, sorted(before)))
     assert str(refusal).startswith("CPUs 1000 refused: outside the CPU set of this process's container or service")

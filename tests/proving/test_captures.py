@@ -155,7 +155,7 @@ def test_what_cannot_be_compared(capture: Path, tmp_path: Path, mistaken: Path) 
     assert (unnamed.returncode, "tip" in unnamed.stderr) == (2, True)
     for more, words in (
         (["--tare"], "goes without --tare"),
-        (["hand"], "goes without name"),
+        (["hand"], "goes without NAME"),
         (["--", "--driver", str(mistaken), "--listen-only"], "--listen-only is not about decoding"),
     ):
         told = refused("skin-prove", "--captured", str(capture), *more)

@@ -20,9 +20,9 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.wire import EmulatedSerialBus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.line import VirtualSerialBus
 from tests.sdk.driving import TroubledBus, driving_lines, read_until
 
 
@@ -127,7 +127,9 @@ def test_bytes_of_a_serial_line_without_a_frame() -> None:
     clock = HandClock()
 
     async def scenario() -> list[str]:
-        bus = EmulatedSerialBus(Babbler((0, b"\xaa\x55garbage")), clock, 64, listen_only=True)
+        hardware = Babbler((0, b"\xaa\x55garbage"))
+        timing: Any = {"clock": clock, "make_timer": clock.timer}
+        bus = VirtualSerialBus("babbler", payload_size=64, listen_only=True, hardware=hardware, **timing)
         bus.use(Packet(sync=(0xAA, 0x55), length=9, checksum=XOR))
         bus.open()
         for _ in range(4):

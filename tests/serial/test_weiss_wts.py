@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from skinware import DriverSnapshot, PatchState
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions, _runs
+from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
 from tests.sdk.driving import read_until, restarted_on_demand
@@ -80,12 +79,6 @@ def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
         whole(live=True)
 
 
-def test_impossible_options_and_run_lengths() -> None:
-    with pytest.raises(ConfigurationError, match=r"SDHLibrary.*RobWork.*rle_offset"):
-        WeissWtsOptions(rle=True)
+def test_a_payload_that_is_not_hexadecimal_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="not hexadecimal"):
         WeissWtsOptions(tare_payload="x")
-    units = np.array([[3 << 12 | 7, 1 << 12 | 0xFFF, 0], [1 << 12, 1 << 12, 1 << 12]], "<u2")
-    payload = np.concatenate([np.zeros((2, 5), np.uint8), units.view(np.uint8)], axis=1)
-    row, channel, value = _runs(payload, np.array([9, 11], np.uint16), 5, 4)
-    assert (row.tolist(), channel.tolist(), value.tolist()) == ([0] * 4, [0, 1, 2, 3], [7, 7, 7, 0xFFF])

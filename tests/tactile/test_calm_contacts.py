@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,36 @@ def test_when_the_driver_is_gone_nothing_is_touched(into: Namespace) -> None:
             read_until(contacts, lambda frame: len(frame.contacts) == 1)
             driver.close()
             read_until(contacts, lambda frame: len(frame.contacts) == 0)
+
+
+def test_a_contact_across_the_border_of_two_links_is_one(
+    into: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    structure = placed_structure()
+    geometry = structure.geometry
+    assert geometry is not None
+    x = geometry.position_m[structure.index("pressure"), 0]
+    middle = np.median(x)
+    beside, border = int(np.where(x > middle, -1, x).argmax()), int(np.where(x > middle, x, 1).argmin())
+    right = geometry.position_m[:, 0] > middle
+    apart = replace(geometry, frame=np.where(right, "right", "left"), position_m=geometry.position_m.copy())
+    apart.position_m[right] -= (0.3, 0, 0)
+    links = tmp_path / "links.toml"
+    left_link, right_link = 'frame = "left"', 'frame = "right"\nxyz = [0.3, 0, 0]'
+    links.write_text(f'format = "skinware-links"\nversion = 1\n[[link]]\n{left_link}\n[[link]]\n{right_link}\n')
+    skin = FakeSkin("fake", structure.placed(apart))
+    press(skin)
+    with publishing(skin):
+        for options, number in (("--links", str(links)), 1), ((), 2):
+            with running("skin-calm", "fake", "--into", into.name, *options) as command:
+                command.wait_for("ready")
+                with ContactsReader(namespace=into, timeout_s=10) as contacts:
+                    tare(into)
+                    press(skin, border, beside)
+                    sample = read_until(contacts, lambda frame: len(frame.contacts) > 0)
+                    assert len(sample.contacts) == number
+                    press(skin)
 
 
 @pytest.mark.thorough

@@ -237,6 +237,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         picture = page.pull_picture(condition=lambda picture: picture["levels"][2] > 100)
         assert np.flatnonzero(picture["levels"]).tolist() == [2, 3]
         assert np.flatnonzero(picture["contact_of"] >= 0).tolist() == [2, 3]
+        assert picture["totals"].tolist() == [120, 0]  # by module
         assert page.status[0, "pressure"][9] & Status.UNHEALTHY
         assert types(page)["pressure"]["placed"]
 

@@ -4,7 +4,7 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`, `flat`, `sharp`; what is missing is
+ *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
  *     left out.
  */
 export function toHash(view) {
@@ -17,6 +17,7 @@ export function toHash(view) {
   for (const pin of view.pins ?? []) parts.append("pin", pin);
   if (view.theme) parts.set("theme", view.theme);
   for (const how of ["normals", "flat", "sharp"]) if (view[how]) parts.set(how, "1");
+  if (view.names === false) parts.set("names", "0");
   return `#${parts}`;
 }
 
@@ -42,6 +43,7 @@ export function fromHash(hash) {
     selected: parts.get("selected"),
     pins: parts.getAll("pin"),
     normals: parts.get("normals") === "1",
+    names: parts.get("names") !== "0",
     theme: theme === "dark" || theme === "light" ? theme : undefined,
     flat: parts.get("flat") === "1",
     sharp: parts.get("sharp") === "1",

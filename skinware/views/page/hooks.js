@@ -5,7 +5,7 @@ import { ramp } from "./palette.js";
 import { untouched } from "./wipe.js";
 
 /** @param {object} parts of main.js. */
-export function hooks({ skin, stage, tree, probes, rewind, past, view, now }) {
+export function hooks({ skin, stage, tree, probes, names, rewind, past, view, now }) {
   const pairOf = ({ sheet, i }) => [sheet.driver.id, sheet.index[i]];
   return {
     get connected() { return now.isAlive; },
@@ -15,6 +15,7 @@ export function hooks({ skin, stage, tree, probes, rewind, past, view, now }) {
     },
     get problems() { return now.problems.map(({ text }) => text); },
     get contacts() { return now.contacts; },
+    get names() { return names.place(stage); },
     get wipe() { return now.wipe; },
     get recording() { return now.recording; },
     get mode() { return view.mode; },

@@ -19,6 +19,7 @@ const KEYS = [
   ["j k", "next, previous taxel"],
   ["p", "pin the taxel that is pointed at, or let it go"],
   ["n", "normals"],
+  ["h", "names of hands, fingers, pads and boards"],
   ["a", "scale as it fits"],
   ["d", "light, dark"],
   ["esc", "select nothing, let all pins go"],

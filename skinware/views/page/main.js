@@ -13,6 +13,7 @@ import { fillHelp, onKeys } from "./keys.js";
 import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
+import { Names } from "./names.js";
 import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
 import { savePicture, showRecording } from "./keeping.js";
@@ -43,6 +44,7 @@ const view = {
   type: wanted.type ?? null,
   scale: wanted.scale,
   normals: wanted.normals,
+  names: wanted.names,
   theme: wanted.theme ?? storedTheme() ?? (system.matches ? "light" : "dark"),
   isThemeChosen: Boolean(wanted.theme ?? storedTheme()),
 };
@@ -64,6 +66,7 @@ const stage = new Stage(byId("stage"), {
     overlay.draw(its, {
       theme: view.theme,
       normals: view.normals,
+      names: view.names ? names.place(its) : [],
       contacts: now.contacts,
       hovered: probes.hovered,
       pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
@@ -72,6 +75,7 @@ const stage = new Stage(byId("stage"), {
   resized: () => now.isAlive && frameAll(true),
   changed: () => notify(stage.isSolid ? "" : "WebGL is lost: drawn without it"),
 });
+const names = new Names();
 const overlay = new Overlay(byId("stage"));
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live${location.search}`, {
   open: connected,
@@ -220,6 +224,7 @@ function showFigures() {
 
 function sheetsChanged() {
   stage.setSheets(skin.shown(view.type));
+  names.arrange(stage.sheets);
   if (view.scale && unitsOf(stage.sheets).size > 1) {
     view.scale = null; // it was of another unit
     sendLook();
@@ -433,6 +438,11 @@ onKeys({
     stage.ask();
     keep();
   },
+  h: () => {
+    view.names = !view.names;
+    stage.ask();
+    keep();
+  },
   a: () => {
     view.scale = null;
     look();
@@ -442,7 +452,7 @@ onKeys({
   "?": clicks.help,
 });
 
-window.skin = hooks({ skin, stage, tree, probes, rewind, past, view, now });
+window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now });
 setTheme(view.theme, false);
 look();
 addEventListener("hashchange", () => location.reload()); // another address was typed

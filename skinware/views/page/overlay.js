@@ -1,5 +1,6 @@
-// Draw over the taxels: normals, shear, contacts, names of regions, and rings around chosen taxels.
+// Draw over the taxels: normals, shear, contacts, names of parts, and rings around chosen taxels.
 
+import { FONT } from "./names.js";
 import { GROUND, INK } from "./palette.js";
 
 const MOST_ARROWS = 8000;
@@ -20,8 +21,8 @@ export class Overlay {
 
   /**
    * @param {object} stage where things are.
-   * @param {object} what `theme`, `normals` (shown or not), `contacts`, `hovered` ({sheet, i} or null),
-   *     `pins` ([{sheet, i, letter}]).
+   * @param {object} what `theme`, `normals` (shown or not), `names` (as Names.place makes them), `contacts`,
+   *     `hovered` ({sheet, i} or null), `pins` ([{sheet, i, letter}]).
    */
   draw(stage, what) {
     const ratio = Math.min(devicePixelRatio, 2);
@@ -38,6 +39,7 @@ export class Overlay {
       if (what.normals) this.#normals(stage, sheet);
       if (sheet.shown.shear) this.#shear(stage, sheet);
     }
+    for (const name of what.names) this.#name(name);
     for (const contact of what.contacts) this.#contact(stage, contact);
     for (const { sheet, i, letter } of what.pins) this.#ring(stage, sheet, i, letter);
     if (what.hovered) this.#ring(stage, what.hovered.sheet, what.hovered.i, "");
@@ -105,6 +107,22 @@ export class Overlay {
     context.globalAlpha = 1;
   }
 
+  #name({ text, x, y, alpha }) {
+    this.#isEmpty = false;
+    const { context } = this;
+    context.globalAlpha = alpha;
+    context.font = FONT;
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.lineWidth = 3;
+    context.lineJoin = "round";
+    context.strokeStyle = this.ground;
+    context.strokeText(text, x, y);
+    context.fillStyle = this.ink;
+    context.fillText(text, x, y);
+    context.globalAlpha = 1;
+  }
+
   #ring(stage, sheet, i, letter) {
     const [x, y, depth] = stage.project(...sheet.place(i));
     if (depth <= 0) return;
@@ -129,7 +147,7 @@ export class Overlay {
 
   #tag(text, x, y) {
     const { context } = this;
-    context.font = "600 11px system-ui, sans-serif";
+    context.font = FONT;
     context.textAlign = "center";
     context.textBaseline = "middle";
     const half = Math.max(8, context.measureText(text).width / 2 + 5);

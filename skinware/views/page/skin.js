@@ -23,6 +23,7 @@ class Sheet {
     this.status = new Uint8Array(this.n).fill(1); // never seen, until a picture says more
     this.levels = new Uint8Array(this.n).fill(NOTHING);
     this.shear = null;
+    this.totals = null; // by module
     this.scale = [0, 1];
     this.mode = "raw";
     this.dimmed = null;
@@ -46,6 +47,7 @@ class Sheet {
     this.levels = blob(picture.levels, Uint8Array);
     if (picture.status) this.status = blob(picture.status, Uint8Array);
     this.shear = picture.shear ? blob(picture.shear, Int8Array) : null;
+    this.totals = picture.totals ? blob(picture.totals, Float32Array) : null;
     this.scale = picture.scale ?? this.scale;
     this.mode = mode;
     this.sequence = picture.sequence;
@@ -53,8 +55,8 @@ class Sheet {
 
   /** Show the newest, or a picture of the past. */
   show(picture = this) {
-    const { levels, status, shear, scale, mode } = picture;
-    Object.assign(this.shown, { levels, status, shear, scale, mode });
+    const { levels, status, shear, totals, scale, mode } = picture;
+    Object.assign(this.shown, { levels, status, shear, totals: totals ?? null, scale, mode });
     this.fill();
   }
 

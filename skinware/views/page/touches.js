@@ -31,7 +31,7 @@ export class Touches {
         `${contact.id}`,
         contact.kind ?? "",
         load.write(contact.load, contact.unit),
-        short(1000 * contact.speed),
+        (1000 * contact.speed).toFixed(0),
         short(contact.age_s),
       ]),
     );

@@ -1,0 +1,122 @@
+// Name hands, fingers, pads and boards above their taxels, each while it is large enough in the picture.
+
+import { measure } from "./format.js";
+
+export const FONT = "600 11px system-ui, sans-serif";
+const LINE = 14; // pixels
+const [FADED, WHOLE] = [0.8, 1.3]; // size of a part, in widths of its name, at which that is not seen yet, and is seen whole
+const NUMBERED = 3; // times that size for one of many, "triangle 4", whose neighbours its name would cover
+const MOST_LINES = 4; // that a name may stand higher to be free
+const CORNERS = Array.from({ length: 8 }, (_, k) => [k & 1, (k >> 1) & 1, k >> 2]);
+const ruler = document.createElement("canvas").getContext("2d");
+const widths = new Map();
+
+/** Some taxels of a sheet that have one name. */
+class Part {
+  /** @param {number} size 0 for a pad; larger for what has parts itself. */
+  constructor(size, name, sheet, taxels, modules) {
+    Object.assign(this, { size, name, sheet, modules });
+    this.low = [Infinity, Infinity, Infinity];
+    this.high = this.low.map((x) => -x);
+    this.normal = [0, 0, 0];
+    for (const i of taxels) {
+      for (let c = 0; c < 3; c++) {
+        this.low[c] = Math.min(this.low[c], sheet.position[3 * i + c] - sheet.radius[i]);
+        this.high[c] = Math.max(this.high[c], sheet.position[3 * i + c] + sheet.radius[i]);
+        this.normal[c] += sheet.normal[3 * i + c];
+      }
+    }
+    this.middle = this.low.map((low, c) => (low + this.high[c]) / 2);
+    this.diameter = Math.hypot(...this.low.map((low, c) => this.high[c] - low));
+  }
+
+  /** Sum of its loads; 0 also where they are not known. */
+  get total() {
+    const { totals } = this.sheet.shown;
+    return totals ? this.modules.reduce((sum, module) => sum + totals[module], 0) : 0;
+  }
+
+  isAway(eye) {
+    return this.normal.reduce((sum, n, c) => sum + n * (eye[c] - this.middle[c]), 0) < 0;
+  }
+}
+
+export class Names {
+  #parts = [];
+
+  arrange(sheets) {
+    const areSeveral = new Set(sheets.map(({ driver }) => driver)).size > 1;
+    this.#parts = sheets.flatMap((sheet) => partsOf(sheet, areSeveral)).sort((a, b) => a.size - b.size);
+  }
+
+  /** The names of a picture, none over another: [{text, x, y, alpha}], x and y of its middle, CSS pixels. */
+  place(stage) {
+    const eye = stage.camera.position.toArray();
+    const placed = [];
+    for (const part of this.#parts) {
+      const depth = stage.project(...part.middle)[2];
+      const text = part.total ? `${part.name}  ${measure(part.total, part.sheet.unit)}` : part.name;
+      const label = { text, width: widthOf(text), alpha: 0 };
+      const room = label.width * (isNumbered(part.name) && !part.size ? NUMBERED : 1);
+      const share = depth > 0 ? (part.diameter * stage.pixels) / depth / room : 0;
+      if (share <= FADED || part.isAway(eye)) continue;
+      const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
+      label.x = seen.reduce((sum, at) => sum + at[0], 0) / 8;
+      label.y = Math.min(...seen.map((at) => at[1])) - LINE / 2;
+      label.alpha = Math.min(1, (share - FADED) / (WHOLE - FADED));
+      for (let line = 0; line <= (part.size ? MOST_LINES : 0); line++, label.y -= LINE) {
+        if (placed.some((other) => areOver(label, other))) continue;
+        placed.push(label);
+        break;
+      }
+    }
+    return placed;
+  }
+}
+
+function partsOf(sheet, areSeveral) {
+  const { driver } = sheet;
+  const taxels = new Map(); // by module
+  for (let i = 0; i < sheet.n; i++) {
+    if (!taxels.has(sheet.module[i])) taxels.set(sheet.module[i], []);
+    taxels.get(sheet.module[i]).push(i);
+  }
+  const part = (size, name, modules) =>
+    new Part(size, name, sheet, modules.flatMap((module) => taxels.get(module)), modules);
+  const patches = groups([...taxels.keys()], (module) => driver.modules[module].patch);
+  const parts = areSeveral ? [part(3, driver.name, [...taxels.keys()])] : [];
+  for (const [patch, modules] of patches) {
+    const { name } = driver.patches[patch];
+    const ownName = (module) => driver.modules[module].name.replace(`${name}, `, "");
+    if (!areSeveral || patches.size > 1) parts.push(part(2, name, modules));
+    if (modules.length > 1) parts.push(...modules.map((module) => part(0, ownName(module), [module])));
+    for (const [finger, pads] of groups(modules, (module) => fingerOf(ownName(module)))) {
+      if (finger && pads.length > 1 && pads.length < modules.length) parts.push(part(1, finger, pads));
+    }
+  }
+  return parts;
+}
+
+const isNumbered = (name) => /\d$/.test(name);
+
+/** The finger of a pad, "index" of "index tip"; empty where the name counts: "triangle 4" is no part of a "triangle". */
+const fingerOf = (name) => (isNumbered(name) ? "" : name.split(" ").slice(0, -1).join(" "));
+
+function groups(items, keyOf) {
+  const found = new Map();
+  for (const item of items) found.set(keyOf(item), [...(found.get(keyOf(item)) ?? []), item]);
+  return found;
+}
+
+function areOver(one, other) {
+  return Math.abs(one.y - other.y) < LINE && Math.abs(one.x - other.x) < (one.width + other.width) / 2 + 4;
+}
+
+function widthOf(text) {
+  if (!widths.has(text)) {
+    if (widths.size > 10_000) widths.clear();
+    ruler.font = FONT;
+    widths.set(text, ruler.measureText(text).width);
+  }
+  return widths.get(text);
+}

@@ -91,23 +91,21 @@ class CommonMode:
         rate: (p,) average speed, a second.
         rate2: (p,) its mean square.
         unknown_s: (p,) for how long too few taxels have been free to say how it moves.
+        own: (p,) by how much the free taxels moved by themselves since the last step. It counts as the speed of the
+            mode: else mode and taxels could run in opposite directions.
     """
 
     def __init__(self, n_patches: int) -> None:
         self.variance, self.agility, self.rate, self.rate2, self.unknown_s = (np.zeros(n_patches) for _ in range(5))
-        self.known_s = np.zeros(n_patches)
+        self.known_s, self.own = np.zeros(n_patches), np.zeros(n_patches)
 
-    def step(
-        self, found: Doubles, precision: Doubles, free: Doubles, own: Doubles, passed_s: float
-    ) -> tuple[Doubles, Doubles]:
+    def step(self, found: Doubles, precision: Doubles, free: Doubles, passed_s: float) -> tuple[Doubles, Doubles]:
         """Return (p,) by how much the mode moves, and how much of that is sure enough to learn gains from.
 
         Args:
             found: (p,) how far the free taxels say that it moved.
             precision: (p,) one by the variance of that.
             free: (p,) number of free taxels.
-            own: (p,) by how much these moved by themselves since the last step: without it, mode and taxels could
-                run in opposite directions.
             passed_s: since the last step.
         """
         known = free > FEW_TAXELS
@@ -133,7 +131,8 @@ class CommonMode:
         if passed_s > 0:
             self.known_s += passed_s * known
             slow = -math.expm1(-passed_s / RATE_S)
-            self.rate += ((move + own) / passed_s - self.rate) * (slow * known)
+            self.rate += ((move + self.own) / passed_s - self.rate) * (slow * known)
+            self.own[:] = 0
             self.rate2 += (self.rate**2 - self.rate2) * (known * passed_s / np.clip(self.known_s, RATE_S, 10 * RATE_S))
         return move, ahead + share * news
 
@@ -171,8 +170,7 @@ class Offsets:
         """Variance that each offset gains in a second by a drift of its own."""
         self._tick_s = 0.0
         self._weight: Floats = np.zeros(n, np.float32)
-        self._reach, self._own = np.ones(self.patches.n), np.zeros(self.patches.n)
-        """By how much the free taxels of each patch moved by themselves, on the average, in the last frame."""
+        self._reach = np.ones(self.patches.n)
 
     def total(self) -> Floats:
         """Return (n,) the variance of a deviation at rest: of noise, offset and common mode."""
@@ -202,11 +200,12 @@ class Offsets:
         limit = np.float32(2) * np.sqrt(total)
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)
-        reach = np.maximum(self.patches.sum(weight * self.gain), 1e-30)
-        precision = reach * reach / np.maximum(self.patches.sum(weight), 1e-30)
+        weights = np.maximum(self.patches.sum(weight), 1e-30)
+        reach = np.maximum(self.patches.sum(weight * self.gain), LEAST_GAIN * weights)
+        precision = reach * reach / weights
         found = self.patches.sum(clipped * weight) / reach
-        move, sure = self.common.step(found, precision, self.patches.sum(free), self._own, passed_s)
-        self._weight, self._reach, self._own = weight, reach, np.zeros(self.patches.n)
+        move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
+        self._weight, self._reach = weight, reach
         moved = self.patches.spread(move)
         change = self.gain * moved
         self.level += change
@@ -242,7 +241,7 @@ class Offsets:
         of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
         own = share * innovation
         self.level += own
-        self._own = self.patches.sum(own * self._weight) / self._reach
+        self.common.own[:] = self.patches.sum(own * self._weight) / self._reach
         self.gain += of_gain * innovation
         self.gain_variance -= of_gain * self.cross
         keep = np.float32(1) - share
@@ -281,8 +280,8 @@ class Offsets:
     def begin(self, taxels: Rows, level: Floats, noise2: Floats, gain: Floats, gain_variance: Floats) -> None:
         """Give k taxels what was measured of them: levels, noise and gains (k,)."""
         self.level[taxels], self.noise2[taxels] = level, noise2
-        self.gain[taxels], self.gain_variance[taxels] = gain, gain_variance
-        self._gain_before[taxels] = gain
+        self.gain[taxels] = self._gain_before[taxels] = np.clip(gain, LEAST_GAIN, MOST_GAIN)
+        self.gain_variance[taxels] = gain_variance
         self.variance[taxels], self.cross[taxels], self.slow[taxels] = noise2 / 20, 0, 0
 
     def lose_common(self) -> None:

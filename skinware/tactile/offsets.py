@@ -91,13 +91,11 @@ class CommonMode:
         rate: (p,) average speed, a second.
         rate2: (p,) its mean square.
         unknown_s: (p,) for how long too few taxels have been free to say how it moves.
-        own: (p,) by how much the free taxels moved by themselves since the last step. It counts as the speed of the
-            mode: else mode and taxels could run in opposite directions.
     """
 
     def __init__(self, n_patches: int) -> None:
         self.variance, self.agility, self.rate, self.rate2, self.unknown_s = (np.zeros(n_patches) for _ in range(5))
-        self.known_s, self.own = np.zeros(n_patches), np.zeros(n_patches)
+        self.known_s = np.zeros(n_patches)
 
     def step(self, found: Doubles, precision: Doubles, free: Doubles, passed_s: float) -> tuple[Doubles, Doubles]:
         """Return (p,) by how much the mode moves, and how much of that is sure enough to learn gains from.
@@ -131,8 +129,7 @@ class CommonMode:
         if passed_s > 0:
             self.known_s += passed_s * known
             slow = -math.expm1(-passed_s / RATE_S)
-            self.rate += ((move + self.own) / passed_s - self.rate) * (slow * known)
-            self.own[:] = 0
+            self.rate += (move / passed_s - self.rate) * (slow * known)
             self.rate2 += (self.rate**2 - self.rate2) * (known * passed_s / np.clip(self.known_s, RATE_S, 10 * RATE_S))
         return move, ahead + share * news
 
@@ -169,8 +166,6 @@ class Offsets:
         self._grows: Floats = np.zeros(n, np.float32)
         """Variance that each offset gains in a second by a drift of its own."""
         self._tick_s = 0.0
-        self._weight: Floats = np.zeros(n, np.float32)
-        self._reach = np.ones(self.patches.n)
 
     def total(self) -> Floats:
         """Return (n,) the variance of a deviation at rest: of noise, offset and common mode."""
@@ -205,7 +200,6 @@ class Offsets:
         precision = reach * reach / weights
         found = self.patches.sum(clipped * weight) / reach
         move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
-        self._weight, self._reach = weight, reach
         moved = self.patches.spread(move)
         change = self.gain * moved
         self.level += change
@@ -221,7 +215,7 @@ class Offsets:
         Args:
             deviation: (n,) of the values from the offsets.
             taxels: (n,) which are measured.
-            calm: (n,) those of them that are far from a touch: only they say something of gains.
+            calm: (n,) those of them that are far from a touch: only they say something of gains and noise.
             floor: least share of a deviation that the offset follows where it drifts by itself.
             passed_s: since the last frame.
         """
@@ -239,9 +233,7 @@ class Offsets:
         share = self.variance / total
         share = np.where(taxels, np.where(drifts, np.maximum(share, floor), share), np.float32(0))
         of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
-        own = share * innovation
-        self.level += own
-        self.common.own[:] = self.patches.sum(own * self._weight) / self._reach
+        self.level += share * innovation
         self.gain += of_gain * innovation
         self.gain_variance -= of_gain * self.cross
         keep = np.float32(1) - share
@@ -249,8 +241,7 @@ class Offsets:
         self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
         quick = innovation - self.slow
         self.slow += quick * (np.float32(slowly) * taxels)
-        quick2 = quick * quick * np.float32(1 - slowly / 2)  # the slow part is noisy, too
-        self.noise2 += (quick2 - self.noise2) * (taxels * np.float32(min(passed_s / NOISE_S, 0.1)))
+        self.noise2 += (quick * (innovation - self.slow) - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, passed_s)

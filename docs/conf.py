@@ -23,6 +23,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_click",
     "driver_options",
+    "json_fields",
 ]
 source_suffix = {".md": "markdown"}
 master_doc = "index"

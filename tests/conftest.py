@@ -1,4 +1,4 @@
-"""Every test gets a namespace of its own, and must leave nothing behind."""
+"""Every test gets a namespace of its own, and must leave nothing behind; a push runs few drivers through all tests."""
 
 from __future__ import annotations
 
@@ -19,8 +19,30 @@ settings.load_profile("busy")
 os.environ.setdefault("SKINWARE_TEST_PATIENCE", "5")  # read when the first test module asks for it
 os.environ.setdefault("PYTHONFAULTHANDLER", "1")  # a command that dies of a signal says where it was
 
+WHOLE = ("TestBarrett", "TestAbilityHand", "TestArray", "TestTesollo", "TestFlexiTac")
+"""Drivers for which a push runs the whole suite: CAN, serial with answers, Modbus, TCP, serial alone."""
+LONG = (
+    "test_a_damaged_frame_costs_its_own_burst_only",
+    "test_a_listener_sends_nothing",
+    "test_both_data_paths_do_the_same",
+    "test_it_can_be_stopped_at_any_moment",
+    "test_memory_does_not_grow",
+    "test_no_run_of_lost_frames_tears_a_burst",
+    "test_nothing_is_valid_before_the_first_data",
+    "test_nothing_leaks",
+    "test_nothing_torn_is_shown_while_a_sender_stumbles",
+)
+"""Tests of the suite that a push leaves out for the other drivers."""
+
 # what a shell runs in the background ignores Ctrl-C, and so would all that the tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        owner = getattr(item, "cls", None)
+        if owner is not None and item.originalname in LONG and owner.__name__ not in WHOLE:  # type: ignore[attr-defined]
+            item.add_marker(pytest.mark.thorough)
 
 
 @pytest.fixture(autouse=True)

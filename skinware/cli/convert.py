@@ -189,8 +189,7 @@ def command(
     candump and pcapng contain the frames on the buses, if they were recorded (skin-record --wire). lerobot is a
     learning set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
 
-    FILE may also be a file that this command wrote as npz, hdf5 or parquet. FILE does not change; its damaged parts are
-    left out and reported. The new file appears when it is complete.
+    FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
     from skinware.conversion import Selection
 

@@ -98,8 +98,14 @@ def test_the_clock_of_the_same_machine_is_found_to_be_the_same(namespace: Namesp
         assert abs(told["clock"]["offset_ms"]) <= told["clock"]["error_ms"]
 
 
-@pytest.mark.parametrize("end", ["serve", "join"])
-@pytest.mark.parametrize("how", ["killed", "stopped"])
+@pytest.mark.parametrize(
+    ("how", "end"),
+    [
+        ("killed", "serve"),
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in (("killed", "join"), ("stopped", "serve"))),
+        ("stopped", "join"),
+    ],
+)
 def test_either_end_goes_and_comes_back(namespace: Namespace, here: Namespace, end: str, how: str) -> None:
     port, generator = free_port(), random.Random(3)
     with driver(namespace), ExitStack() as stack:

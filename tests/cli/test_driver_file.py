@@ -21,8 +21,7 @@ from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.sdk.driving import follow
 
-PAGE = Path(__file__).parents[2] / "docs/drivers.md"
-(FINGER,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+FINGER = (Path(__file__).parents[2] / "examples/finger.py").read_text()
 EMULATOR = FINGER.index("class EmulatedFinger")
 Write = Callable[[str, str], str]
 

@@ -240,7 +240,7 @@ def test_frames_end_with_the_timeout() -> None:
             next(frames)
 
 
-@pytest.mark.parametrize("form", ["--json", "--counts"])
+@pytest.mark.parametrize("form", ["--json", pytest.param("--counts", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespace) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):

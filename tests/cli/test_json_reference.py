@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import runpy
 import shutil
 import socket
 from collections.abc import Callable, Iterator
@@ -69,11 +70,19 @@ PLAIN: dict[str, Callable[[Any], bool]] = {
 Rows = dict[str, str]
 
 
+def page_with_tables() -> str:
+    """The page as readers see it, with the tables that its directives make."""
+    made = runpy.run_path(str(PAGE.parents[1] / "json_fields.py"))["json_fields"]
+    return re.sub(
+        r"^```\{json-fields\} (.+)\n```$", lambda at: "\n".join(made(*at[1].split())), PAGE.read_text(), flags=re.M
+    )
+
+
 def sections() -> dict[str, Rows]:
     """Type of every key, under the heading where it stands."""
     found: dict[str, Rows] = {}
     rows: Rows = {}
-    for line in PAGE.read_text().splitlines():
+    for line in page_with_tables().splitlines():
         if line.startswith("#"):
             rows = found.setdefault(line.strip("# "), {})
         elif line.startswith("| `"):

@@ -34,7 +34,7 @@ from tests.unprivileged import without_rights_to_all_files
 KILLS = 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespace, number: int) -> None:
     file = tmp_path / "skin.mcap"
     with running("skin-record", "-o", str(file)) as recorder:
@@ -282,7 +282,7 @@ def test_a_kill_costs_no_frame_that_was_written_and_little_time(tmp_path: Path, 
                 whole = tmp_path / f"{number}.whole.mcap"
                 assert exit_status(recover, [str(file), "-o", str(whole)]) == 0
                 with skinware.recording.open(whole) as opened:
-                    frames = list(opened["torso"].frames())
+                    frames = list(opened["torso"].samples())
                 wait_until(lambda frames=frames: frames[-1].position in seen)  # type: ignore[misc]
                 known = [frame for frame in frames if frame.position in seen]
                 assert len(known) > 20

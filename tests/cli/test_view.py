@@ -18,7 +18,7 @@ from tests.commands import refused, run, running
 from tests.views.client import page_of
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))), publishing(FakeSkin("arm", fake_structure(1, 2))):
         with running("skin-view", "torso", "--port", "0", "--no-browser") as server:

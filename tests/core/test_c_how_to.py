@@ -1,8 +1,7 @@
-"""The programs of docs/how-to/c-and-cpp.md, compiled and run as they stand there."""
+"""The programs that docs/how-to/c-and-cpp.md shows, compiled and run."""
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,13 +17,7 @@ from skinware.realtime import now_ns
 from tests.compiling import compiled
 from tests.core.c_programs import structure
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "how-to" / "c-and-cpp.md").read_text()
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", DOCUMENT, flags=re.M | re.S)
-
-
-def program_text(language: str, beginning: str) -> str:
-    (text,) = [text for name, text in BLOCKS if name == language and text.startswith(beginning)]
-    return str(text)
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @contextmanager
@@ -50,10 +43,8 @@ def publish(writer: DriverWriter, value: int) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("language", ["c99", "c++11"])
-def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    source = tmp_path / "touch.c"
-    source.write_text(program_text("c", "/* touch.c"))
-    program = compiled(source, language, tmp_path_factory)
+def test_the_reading_program(language: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    program = compiled(EXAMPLES / "touch.c", language, tmp_path_factory)
     assert subprocess.run([program, "torso"], capture_output=True).returncode == 1
     writer = DriverWriter("torso", structure(), rate_hz=0.1)
     publish(writer, 10)
@@ -71,13 +62,10 @@ def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: py
 
 
 @pytest.mark.thorough
-def test_the_writing_program(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    source, script = tmp_path / "fingers.c", tmp_path / "fingers.py"
-    source.write_text(program_text("c", "/* fingers.c"))
-    script.write_text(program_text("python", "import ctypes"))
+def test_the_writing_program(tmp_path_factory: pytest.TempPathFactory) -> None:
     options = ["-D_POSIX_C_SOURCE=200809L", "-shared", "-fPIC"]
-    library = compiled(source, "c99", tmp_path_factory, options)
-    with lines_of(sys.executable, script, library), DriverReader("fingers", timeout_s=60) as reader:
+    library = compiled(EXAMPLES / "fingers.c", "c99", tmp_path_factory, options)
+    with lines_of(sys.executable, EXAMPLES / "fingers.py", library), DriverReader("fingers", timeout_s=60) as reader:
         frames = reader.in_order(timeout_s=60)
         taken = [next(frames) for _ in range(50)]
         for before, frame in pairwise(taken):

@@ -30,7 +30,10 @@ pytestmark = pytest.mark.usefixtures("process_server")
 # -- the header itself --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("standard", ["c99", "c11", "c2x", "gnu17", "c++11", "c++17", "c++20"])
+@pytest.mark.parametrize(
+    "standard",
+    ["c99", *(pytest.param(s, marks=pytest.mark.thorough) for s in ("c11", "c2x", "gnu17", "c++11", "c++17")), "c++20"],
+)
 def test_the_header_needs_nothing_and_warns_of_nothing(
     standard: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 
-import pytest
-
 from skinware import Namespace
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import examine
@@ -16,7 +14,6 @@ from skinware_drivers.testing.waiting import wait_until
 
 SHORT_S = 0.4
 _RUNS = 12
-_FAR_TOO_BUSY = 4.0  # programs that want to run, for each processor
 
 
 def looked(seconds: float = SHORT_S) -> Evidence:
@@ -42,18 +39,12 @@ def found_until(is_there: Callable[[Finding], bool], seconds: float = SHORT_S) -
 
 
 def nothing_found(run_and_look: Callable[[], Sequence[Finding]]) -> None:
-    """Nothing is found in one of some runs.
-
-    A busy machine keeps drivers waiting, which is rightly found: not in every run. On one that is far too busy in every
-    run; there, the test is skipped.
-    """
+    """Nothing is found in one of some runs; where other programs want all processors, the findings may name that."""
     for _ in range(_RUNS):
         if not (findings := run_and_look()):
             return
-    load = os.getloadavg()[0]
-    if load > _FAR_TOO_BUSY * (os.cpu_count() or 1):
-        pytest.skip(f"drivers are late on this machine, with a load of {load:.0f}: {findings}")
-    pytest.fail(f"in each of {_RUNS} runs something was found, in the last: {findings}")
+    assert any("machine load" in finding.evidence for finding in findings), findings
+    assert os.getloadavg()[0] > (os.cpu_count() or 1), findings
 
 
 def of(area: str, words: str) -> Callable[[Finding], bool]:

@@ -332,8 +332,6 @@ def test_a_burst_that_waited_is_published_cycle_by_cycle() -> None:
     bus = emulated(boards=(7,), pattern="cycle")
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
-        import time
-
         running.do(lambda: time.sleep(0.4))  # the whole loop stands still
         seen = [int(f.values[0]) for _, f in zip(range(30), reader.in_order(timeout_s=30), strict=False)]
         steps = np.diff(seen) % 256

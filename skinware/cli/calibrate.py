@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,20 +21,10 @@ if TYPE_CHECKING:
     from skinware.tactile.calibration.placing import Placement
     from skinware.tactile.calibration.shapes import Shape
 
-_Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
 _POSES_TIMEOUT_S = 5.0
 _MM = 1e3
 _STROKE = "stroke the whole skin with one finger"
 _PRESS = "press the skin at known places; hold each for a moment"
-
-
-def _options(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
-    def decorate(command: _Decorated) -> _Decorated:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return decorate
 
 
 _output = cli.output_option("File to write.", name="file", metavar="GEOMETRY", required=True)
@@ -47,7 +37,7 @@ _pitch = click.option(
     show_default=True,
     help="Distance between neighbouring sensors, metres.",
 )
-_gathering = _options(
+_gathering = cli.options(
     cli.driver_option,
     cli.type_option("Sensors.  [default: pressure, or the first type]"),
     click.option(
@@ -66,7 +56,7 @@ _gathering = _options(
     cli.json_option,
     cli.version_option,
 )
-_pressing = _options(
+_pressing = cli.options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
     click.option("--poses-namespace", metavar="NAME", help="Namespace of that service.  [default: as --namespace]"),
     click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted on each sensor."),

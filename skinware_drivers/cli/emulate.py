@@ -58,7 +58,7 @@ class EmulateCommand(HardwareCommand):
     "--geometry",
     "geometry_path",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="Write the places of the emulated sensors to FILE, for skin-driver --geometry FILE.",
 )
 @click.option(
@@ -66,7 +66,7 @@ class EmulateCommand(HardwareCommand):
 )
 @cli.namespace_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
-@click.option("-T", "duration_s", type=cli.seconds, metavar="SECONDS", help="End after SECONDS.")
+@cli.duration_option()
 def command(
     bus_name: str,
     driver: str,

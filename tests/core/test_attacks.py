@@ -72,7 +72,7 @@ def read_and_ask(board: Path) -> None:
             frame = reader.request(timeout_s=PATIENCE_S)
             assert (frame.column("values") == frame.sequence).all()
             mine[ANSWERS] += 1
-            for frame in itertools.islice(reader.frames(timeout_s=PATIENCE_S), 3):
+            for frame in itertools.islice(reader.samples(timeout_s=PATIENCE_S), 3):
                 mine[FRAMES] += 1
                 mine[STALE] += frame.stale
 

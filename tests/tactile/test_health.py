@@ -49,7 +49,7 @@ def judged(world: World, settings: HealthSettings | None = None, until_s: float 
     baseline = Baseline(MODULE, SURFACE.patch)
     geometry = placed(SURFACE.position_m, normal=SURFACE.normal)
     health = Health(MODULE, geometry, settings, limits=(world.minimum, world.maximum))
-    for sample in world.frames(until_s):
+    for sample in world.samples(until_s):
         values = sample.values.astype(np.float32)
         health.update(sample.time_ns, values, baseline.update(sample.time_ns, values, sample.usable))
     return health.report()
@@ -233,7 +233,7 @@ def test_what_was_mended_is_good_again() -> None:
     baseline, geometry = Baseline(MODULE, SURFACE.patch), placed(SURFACE.position_m, normal=SURFACE.normal)
     health = Health(MODULE, geometry, QUICK, limits=(0, 255))
     kinds = set()
-    for sample in world.frames(END_S):
+    for sample in world.samples(END_S):
         values = sample.values.astype(np.float32)
         health.update(sample.time_ns, values, baseline.update(sample.time_ns, values, sample.usable))
         if sample.time_ns % 1_000_000_000 < 60_000_000:
@@ -254,7 +254,7 @@ def test_a_finger_that_leaves_what_was_tared_under_it_makes_no_noise(
     world = World(grid(5, 4, 4), seed=1, rate_hz=20)
     world.push(world.surface.position_m[37], 120, *touched, radius_m=0.006)
     baseline, health = Baseline(world.surface.module, world.surface.patch), Health(world.surface.module)
-    for number, sample in enumerate(world.frames(45)):
+    for number, sample in enumerate(world.samples(45)):
         values = sample.values.astype(np.float32)
         health.update(sample.time_ns, values, baseline.update(sample.time_ns, values))
         if tared_s == number / 20:
@@ -271,7 +271,7 @@ def test_taxels_that_stay_far_below_their_baselines_are_judged_as_well() -> None
     world.noisy([11], 8)
     world.jump(range(8, 16), -12, at_s=7)
     baseline, health = Baseline(world.surface.module, world.surface.patch), Health(world.surface.module)
-    for number, sample in enumerate(world.frames(45)):
+    for number, sample in enumerate(world.samples(45)):
         values = sample.values.astype(np.float32)
         health.update(sample.time_ns, values, baseline.update(sample.time_ns, values))
         baseline.hold(number > 120)

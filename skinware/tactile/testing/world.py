@@ -261,7 +261,7 @@ class World:
 
     # Frames
 
-    def frames(self, until_s: float) -> Iterator[Sample]:
+    def samples(self, until_s: float) -> Iterator[Sample]:
         """Yield every frame from second 0 on; always the same ones."""
         for block in self.blocks(until_s):
             yield from block

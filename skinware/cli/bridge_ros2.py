@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     "--connect",
     multiple=True,
     metavar="ENDPOINT",
-    help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/localhost:7447]",
+    help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/127.0.0.1:7447]",
 )
 @click.option(
     "--interface",

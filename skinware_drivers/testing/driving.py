@@ -16,6 +16,7 @@ from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
+from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.flow import FlowLoop
@@ -210,12 +211,23 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
     """
     if isinstance(emulator, str):
         emulator = load_emulator(emulator)
-    given = msgspec.convert(options, emulator.Options, strict=False)
-    hardware, control = emulator(given), _Control()
+    with carried_on(bus, emulator(msgspec.convert(options, emulator.Options, strict=False))):
+        yield
+
+
+@contextmanager
+def carried_on(bus: Bus, hardware: EmulatedHardware) -> Iterator[None]:
+    """Carry the frames of emulated devices over a bus while the block runs.
+
+    Args:
+        bus: not opened yet.
+    """
+    control = _Control()
 
     def run() -> None:
         try:
-            Emulation(bus, hardware, control.note).run(control, bus_name=bus.name, driver=str(emulator), options=given)
+            emulation = Emulation(bus, hardware, control.note)
+            emulation.run(control, bus_name=bus.name, driver=type(hardware).__name__, options=NoOptions())
         except BaseException as error:  # noqa: BLE001  (raised in the test)
             control.failure = error
             control.ready.set()

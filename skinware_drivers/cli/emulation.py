@@ -8,7 +8,7 @@ import signal
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any, Protocol, Self, TextIO
 
@@ -36,40 +36,28 @@ _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 """Pauses between attempts to open a bus that went down."""
 
 
-class EventSink(Protocol):
-    """Receives the events of an emulation."""
-
-    def event(self, name: str, **facts: Any) -> None:
-        """Receive an event: ready, status, bus_down, bus_up, stopped."""
+Report = Callable[..., None]
+"""Receives the events of an emulation: ready, status, bus_down, bus_up, stopped; with facts as keywords."""
 
 
-class JsonReport:
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+def report_to(stream: TextIO, *, as_json: bool) -> Report:
+    """Return a function that prints events: all of them for programs, without ``status`` for people."""
 
-    def event(self, name: str, **facts: Any) -> None:
-        self._stream.write(json_text({"event": name, **facts}) + "\n")
-        self._stream.flush()
+    def report(name: str, **facts: Any) -> None:
+        if as_json or name != "status":
+            stream.write((json_text({"event": name, **facts}) if as_json else shown(_in_words(name, facts))) + "\n")
+            stream.flush()
+
+    return report
 
 
-class HumanReport:
-    """Print lines for people, without the status of each second."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def event(self, name: str, **facts: Any) -> None:
-        if name == "status":
-            return
-        if name == "ready":
-            note = f" ({facts['note']})" if facts.get("note") else ""
-            text = f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
-        elif name == "stopped":
-            text = "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
-        else:
-            text = f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
-        self._stream.write(shown(text) + "\n")
-        self._stream.flush()
+def _in_words(name: str, facts: Mapping[str, Any]) -> str:
+    if name == "ready":
+        note = f" ({facts['note']})" if facts.get("note") else ""
+        return f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
+    if name == "stopped":
+        return "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
+    return f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
 
 
 class SignalWatch:
@@ -139,7 +127,7 @@ class Emulation:
         self,
         bus: Bus,
         hardware: EmulatedHardware,
-        report: EventSink,
+        report: Report,
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,
@@ -174,7 +162,7 @@ class Emulation:
         start_ns = self._clock()
         self._hardware.skip(start_ns)
         facts = {"driver": driver, "bus": bus_name, "note": self._bus.note, "options": msgspec.to_builtins(options)}
-        self._report.event("ready", **facts)
+        self._report("ready", **facts)
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
         status_ns = start_ns + _STATUS_NS
         try:
@@ -183,7 +171,7 @@ class Emulation:
                 if end_ns is not None and now_ns >= end_ns:
                     break
                 if now_ns >= status_ns:
-                    self._report.event("status", **self._totals())
+                    self._report("status", **self._totals())
                     status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
                 next_ns = self._step(now_ns)
                 companion_ns = None if self._companion is None else self._companion.step(now_ns)
@@ -191,7 +179,7 @@ class Emulation:
                 self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
-        self._report.event("stopped", **self._totals())
+        self._report("stopped", **self._totals())
 
     def _step(self, now_ns: int) -> int | None:
         """Do the work that is due, and return the time of the next."""
@@ -206,7 +194,7 @@ class Emulation:
             self.send_failures += len(self._outbox)
             self._outbox.clear()
             self._backoff_ns = _FIRST_BACKOFF_NS
-            self._report.event("bus_down", reason=str(error))
+            self._report("bus_down", reason=str(error))
             return now_ns + self._backoff_ns
 
     def _reopen(self, now_ns: int) -> int | None:
@@ -217,7 +205,7 @@ class Emulation:
             return now_ns + self._backoff_ns
         self._open = True
         self._hardware.skip(now_ns)
-        self._report.event("bus_up")
+        self._report("bus_up")
         return now_ns
 
     def _receive(self, now_ns: int) -> None:

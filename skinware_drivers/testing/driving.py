@@ -164,9 +164,8 @@ class _Control:
     def fileno(self) -> int:
         return self._event
 
-    def event(self, name: str, **facts: Any) -> None:
-        del facts
-        if name == "ready":
+    def note(self, event: str, **_facts: Any) -> None:
+        if event == "ready":
             self.ready.set()
 
     def stop(self) -> None:
@@ -184,9 +183,8 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     Args:
         emulator: class or registered name of an emulator of serial devices.
     """
-    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = PtyBus("", payload_size=_LONGEST_WRITE)
-    with emulated_on(bus, factory, **options):
+    with emulated_on(bus, emulator, **options):
         yield bus.note.removeprefix("serial port ")
 
 
@@ -197,9 +195,8 @@ def emulated_over_tcp(emulator: Any, **options: Any) -> Iterator[str]:
     Args:
         emulator: class or registered name of an emulator of serial or Modbus devices.
     """
-    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = TcpServerBus("127.0.0.1:0", payload_size=_LONGEST_WRITE)
-    with emulated_on(bus, factory, **options):
+    with emulated_on(bus, emulator, **options):
         yield bus.note.removeprefix("listens on ")
 
 
@@ -209,13 +206,16 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
 
     Args:
         bus: not opened yet.
+        emulator: class or registered name of an emulator.
     """
+    if isinstance(emulator, str):
+        emulator = load_emulator(emulator)
     given = msgspec.convert(options, emulator.Options, strict=False)
     hardware, control = emulator(given), _Control()
 
     def run() -> None:
         try:
-            Emulation(bus, hardware, control).run(control, bus_name=bus.name, driver=str(emulator), options=given)
+            Emulation(bus, hardware, control.note).run(control, bus_name=bus.name, driver=str(emulator), options=given)
         except BaseException as error:  # noqa: BLE001  (raised in the test)
             control.failure = error
             control.ready.set()

@@ -128,21 +128,12 @@ class Stop:
         self._writer.close()
 
 
-class Silent:
-    def event(self, name: str, **facts: Any) -> None:
-        pass
-
-
 @contextmanager
 def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
     bus, stop = PtyBus(str(link), payload_size=4096), Stop()
     ready = threading.Event()
 
-    class Ready(Silent):
-        def event(self, name: str, **facts: Any) -> None:
-            ready.set()
-
-    emulation = Emulation(bus, patch, Ready())
+    emulation = Emulation(bus, patch, lambda *_, **__: ready.set())
 
     def run() -> None:
         emulation.run(stop, bus_name="pty", driver="openpatch", options=patch.options)

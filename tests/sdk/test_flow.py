@@ -6,7 +6,6 @@ Datagrams of the loopback stand in for CAN: emulated boards at one end, the driv
 from __future__ import annotations
 
 import asyncio
-import io
 import itertools
 import os
 import socket
@@ -26,7 +25,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.cli.emulation import Emulation, JsonReport
+from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.native.structs import Source
@@ -81,7 +80,7 @@ class Stop:
 def boards_on(cable: Cable, hardware: EmulatedRoboskin) -> Iterator[None]:
     """Emulated boards at the far end, in a thread."""
     stop = Stop()
-    emulation = Emulation(EndOfCable(cable.out), hardware, JsonReport(io.StringIO()))
+    emulation = Emulation(EndOfCable(cable.out), hardware, lambda *_, **__: None)
     run = {"bus_name": "cable", "driver": "roboskin", "options": EmulatorOptions()}
     thread = threading.Thread(target=lambda: emulation.run(stop, **run), daemon=True)  # type: ignore[arg-type]
     thread.start()

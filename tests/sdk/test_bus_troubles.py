@@ -115,7 +115,7 @@ def test_a_bus_that_goes_down_while_boards_are_set_up(caplog: pytest.LogCaptureF
 
 
 def test_a_full_queue_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(Link.send.__kwdefaults__, "timeout_s", PATIENCE_S)
+    monkeypatch.setattr(Link.send, "__kwdefaults__", {"timeout_s": PATIENCE_S})
     log: list[Event] = []
     bus = troubled(log, boards=(7,))
     tries: list[bytes] = []

@@ -20,7 +20,6 @@ from skinware.errors import BusNotAvailable, BusSendError
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
-from skinware.realtime import now_ns as clock_ns
 from skinware.service import ServiceWriter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware, Pressing, WireFrame
@@ -288,7 +287,7 @@ class PressingService:
         """Publish and answer what is due, and return the next time of publishing, CLOCK_MONOTONIC ns."""
         waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
-            self._publish(clock_ns())  # later than the requests
+            self._publish(time.monotonic_ns())  # later than the requests
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ
         for request in waiting:
             request.reply(position=self._writer.position)
@@ -303,7 +302,7 @@ class PressingService:
             ValueError: the numbers make no sense, or no part of the skin would feel it.
         """
         pressing = Pressing.of(at_m, force_n, radius_m, seconds)
-        return {self._bus_name: self._hardware.press(pressing, clock_ns())}
+        return {self._bus_name: self._hardware.press(pressing, time.monotonic_ns())}
 
     def close(self) -> None:
         self._writer.close()

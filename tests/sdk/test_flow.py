@@ -54,12 +54,9 @@ class EndOfCable(SocketCanBus):
 
 @contextmanager
 def flowing(cable: Cable, driver: Any = RoboskinDriver, **options: str) -> Iterator[tuple[Driving, EndOfCable]]:
-    bus = EndOfCable(cable.end, **options)
-    hardware = EmulatedRoboskin(EmulatorOptions(boards=BOARDS))
-    with (
-        carried_on(EndOfCable(cable.out), hardware),
-        driving_lines([(driver(RoboskinOptions()), bus)], "roboskin") as running,
-    ):
+    bus, far_end = EndOfCable(cable.end, **options), EndOfCable(cable.out)
+    hardware, lines = EmulatedRoboskin(EmulatorOptions(boards=BOARDS)), [(driver(RoboskinOptions()), bus)]
+    with carried_on(far_end, hardware), driving_lines(lines, "roboskin") as running:
         yield running, bus
 
 

@@ -215,10 +215,10 @@ class Reader(_Awaited, Generic[SampleT]):
             await self._wakeups.wait([word], remaining_s)
             self.sync.refresh()
 
-    async def frames(
+    async def samples(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
     ) -> AsyncIterator[SampleT]:
-        """As :meth:`skinware.ServiceReader.frames`; it raises the same."""
+        """As :meth:`skinware.ServiceReader.samples`; it raises the same."""
         frame: SampleT | None = None
         timer = None if rate_hz is None else Periodic(rate_hz)
         while timer is None or await _deadline(timer):
@@ -227,7 +227,7 @@ class Reader(_Awaited, Generic[SampleT]):
             yield frame
 
     def __aiter__(self) -> AsyncIterator[SampleT]:
-        return self.frames()
+        return self.samples()
 
     async def request(self, *, timeout_s: float = 5.0) -> SampleT:
         """As :meth:`skinware.ServiceReader.request`; it raises the same."""
@@ -287,7 +287,7 @@ class Skin(_Awaited):
                     raise
             await self._wakeups.wait(words, remaining_s)
 
-    async def frames(
+    async def samples(
         self,
         rate_hz: float | None = None,
         *,
@@ -295,7 +295,7 @@ class Skin(_Awaited):
         align: bool = False,
         timeout_s: float | None = None,
     ) -> AsyncIterator[Snapshot]:
-        """As :meth:`skinware.Skin.frames`; it raises the same."""
+        """As :meth:`skinware.Skin.samples`; it raises the same."""
         snapshot: Snapshot | None = None
         timer = None if rate_hz is None else Periodic(rate_hz)
         while timer is None or await _deadline(timer):
@@ -304,7 +304,7 @@ class Skin(_Awaited):
             yield snapshot
 
     def __aiter__(self) -> AsyncIterator[Snapshot]:
-        return self.frames()
+        return self.samples()
 
     def _words(self) -> list[WakeWord]:
         return [wake_word_of(self.sync.reader(driver)) for driver in self.sync.layout.drivers]

@@ -175,14 +175,14 @@ class Skin:
         if self._in_c is None or self._closed or (known is not None and known is not self._latest):
             return False, None
         if known is None:
-            frames = self._in_c.next(NEWEST, 0)
+            samples = self._in_c.next(NEWEST, 0)
         else:
-            frames = self._in_c.next(NEWER, min(deadline_ns, self._drivers.next_look_ns) - now_ns())
-        if not frames:
-            if frames is None:
+            samples = self._in_c.next(NEWER, min(deadline_ns, self._drivers.next_look_ns) - now_ns())
+        if not samples:
+            if samples is None:
                 self._in_c = None
-            return frames is not None, None
-        self._latest = Snapshot(self._layout, frames)
+            return samples is not None, None
+        self._latest = Snapshot(self._layout, samples)
         return True, self._latest
 
     def _leave_to_c(self, snapshot: Snapshot) -> None:
@@ -199,17 +199,17 @@ class Skin:
         if known is not None and known.layout is self._layout and not _has_newer(readers, known):
             return None
         try:
-            frames = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
+            samples = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
         except Overrun:
             return None
-        snapshot = Snapshot(self._layout, frames)
-        return None if align and known is not None and _same_frames(snapshot, known) else snapshot
+        snapshot = Snapshot(self._layout, samples)
+        return None if align and known is not None and _same_samples(snapshot, known) else snapshot
 
     def _moved_on(self) -> bool:
         """Return whether a driver closed, or began another generation; a killed one is found by ``_discover``."""
         return any(reader.moved_on or reader.latest is None for reader in self._drivers.readers.values())
 
-    def frames(
+    def samples(
         self,
         rate_hz: float | None = None,
         *,
@@ -239,7 +239,7 @@ class Skin:
             yield self.read(max_age_s=max_age_s, align=align, timeout_s=timeout_s)
 
     def __iter__(self) -> Iterator[Snapshot]:
-        return self.frames()
+        return self.samples()
 
     def stop(self) -> None:
         """End a wait in another thread with ``Closed``, within 50 ms; that thread then closes this skin."""
@@ -313,15 +313,15 @@ def _nearest(readers: list[_SkinReader]) -> tuple[DriverSnapshot, ...]:
 
 
 def _has_newer(readers: list[_SkinReader], known: Snapshot) -> bool:
-    return any(reader.latest != frame.position for reader, frame in zip(readers, known.frames, strict=True))
+    return any(reader.latest != frame.position for reader, frame in zip(readers, known.samples, strict=True))
 
 
-def _same_frames(one: Snapshot, other: Snapshot) -> bool:
+def _same_samples(one: Snapshot, other: Snapshot) -> bool:
     return one.layout is other.layout and all(
-        a.position == b.position for a, b in zip(one.frames, other.frames, strict=True)
+        a.position == b.position for a, b in zip(one.samples, other.samples, strict=True)
     )
 
 
 def _too_old(snapshot: Snapshot, max_age_s: float) -> list[str]:
-    ages = zip(snapshot.layout.drivers, (frame.age_ns / NS_PER_S for frame in snapshot.frames), strict=True)
+    ages = zip(snapshot.layout.drivers, (frame.age_ns / NS_PER_S for frame in snapshot.samples), strict=True)
     return [f"{driver} ({age_s:.3g} s)" for driver, age_s in ages if age_s > max_age_s]

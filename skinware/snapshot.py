@@ -20,11 +20,11 @@ class Snapshot:
 
     Attributes:
         layout: which drivers; the same object as long as no driver joins, leaves or changes.
-        frames: the snapshot of each driver of ``layout``.
+        samples: the snapshot of each driver of ``layout``.
     """
 
     layout: SkinLayout
-    frames: tuple[DriverSnapshot, ...]
+    samples: tuple[DriverSnapshot, ...]
 
     def of(self, driver: str) -> DriverSnapshot:
         """Return the snapshot of one driver.
@@ -35,12 +35,12 @@ class Snapshot:
         if driver not in self.layout.drivers:
             there_are = ", ".join(self.layout.drivers) or "none"
             raise StructureError(f"no driver {driver!r} in this snapshot; it has: {there_are}")
-        return self.frames[self.layout.drivers.index(driver)]
+        return self.samples[self.layout.drivers.index(driver)]
 
     @property
     def acquired_ns(self) -> npt.NDArray[np.int64]:
         """(n_drivers,) int64: time of the newest data of each driver, CLOCK_MONOTONIC ns."""
-        return np.array([frame.acquired_ns for frame in self.frames], np.int64)
+        return np.array([frame.acquired_ns for frame in self.samples], np.int64)
 
     @property
     def spread_s(self) -> float:
@@ -55,7 +55,7 @@ class Snapshot:
         Raises:
             StructureError: no driver has such sensors; the same for all that take a type.
         """
-        return np.concatenate([frame.raw(type_name) for frame in self._frames_with(type_name)])
+        return np.concatenate([frame.raw(type_name) for frame in self._samples_with(type_name)])
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Return (n,) float32 values of all sensors of a type, in ``unit(type_name)``; float64 if raw values are int32.
@@ -64,15 +64,15 @@ class Snapshot:
             StructureError: also where drivers have different units; the message says how to choose.
         """
         self.layout.unit(type_name)
-        return np.concatenate([frame.physical(type_name) for frame in self._frames_with(type_name)])
+        return np.concatenate([frame.physical(type_name) for frame in self._samples_with(type_name)])
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
         """Return (n,) uint8 status of all sensors of a type, bits of :class:`skinware.Status`; see ``fresh``."""
-        return np.concatenate([frame.status_of(type_name) for frame in self._frames_with(type_name)])
+        return np.concatenate([frame.status_of(type_name) for frame in self._samples_with(type_name)])
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
         """Return (n,) int64: time of each sensor's data, of its update group, CLOCK_MONOTONIC ns; 0: never seen."""
-        return np.concatenate([frame.time_ns(type_name) for frame in self._frames_with(type_name)])
+        return np.concatenate([frame.time_ns(type_name) for frame in self._samples_with(type_name)])
 
     def fresh(
         self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
@@ -88,8 +88,8 @@ class Snapshot:
             at_ns: the moment at which to look, CLOCK_MONOTONIC ns; default: now.
         """
         at_ns = now_ns() if at_ns is None else at_ns
-        frames = self._frames_with(type_name)
-        return np.concatenate([frame.fresh(type_name, max_age_s=max_age_s, at_ns=at_ns) for frame in frames])
+        samples = self._samples_with(type_name)
+        return np.concatenate([frame.fresh(type_name, max_age_s=max_age_s, at_ns=at_ns) for frame in samples])
 
     def unit(self, type_name: str) -> str:
         """Return unit of ``physical(type_name)``.
@@ -107,8 +107,8 @@ class Snapshot:
         """Return (n,) int64: index into ``layout.modules``, the names of modules, of every sensor of a type."""
         return self.layout.module_of(type_name)
 
-    def _frames_with(self, type_name: str) -> list[DriverSnapshot]:
-        return [self.frames[driver] for driver, _ in self.layout.parts(type_name)]
+    def _samples_with(self, type_name: str) -> list[DriverSnapshot]:
+        return [self.samples[driver] for driver, _ in self.layout.parts(type_name)]
 
 
 class Window:
@@ -131,7 +131,7 @@ class Window:
 
     def __init__(self, type_name: str, length: int) -> None:
         if length < 1:
-            raise ConfigurationError(f"a window of {length} frames: give at least 1")
+            raise ConfigurationError(f"a window of {length} samples: give at least 1")
         self.type_name = type_name
         self.length = length
         self._of: object = None
@@ -184,4 +184,4 @@ class Window:
         return np.roll(rows, -(self._added % self.length), axis=0)
 
     def __repr__(self) -> str:
-        return f"<Window of {self.type_name}: {len(self)} of {self.length} frames>"
+        return f"<Window of {self.type_name}: {len(self)} of {self.length} samples>"

@@ -147,17 +147,17 @@ def start_reader(
         profile: how the thread is scheduled.
     """
 
-    def frames() -> Iterator[F]:
+    def samples() -> Iterator[F]:
         while True:
             try:
-                yield from reader.in_order() if in_order else reader.frames(rate_hz)
+                yield from reader.in_order() if in_order else reader.samples(rate_hz)
                 return
             except StructureChanged:
                 reader.reattach()
             except Overrun:  # the reader has counted it
                 time.sleep(_REST_AFTER_OVERRUN_S)
 
-    return Worker(f"reader of {reader.name}", reader, frames, function, profile)
+    return Worker(f"reader of {reader.name}", reader, samples, function, profile)
 
 
 def start_writer(
@@ -178,13 +178,13 @@ def start_writer(
         profile: how the thread is scheduled.
     """
 
-    def frames() -> Iterator[dict[str, npt.NDArray[Any]]]:
+    def samples() -> Iterator[dict[str, npt.NDArray[Any]]]:
         if rate_hz is None:
             return writer.on_request(from_last=from_last)
         return writer.periodic(rate_hz, from_last=from_last)
 
     writer.request_server()  # programs may ask from now on
-    return _WriterWorker(f"writer of {writer.name}", writer, frames, function, profile)
+    return _WriterWorker(f"writer of {writer.name}", writer, samples, function, profile)
 
 
 class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
@@ -236,7 +236,7 @@ class SkinReplica(Worker[Snapshot]):
                 self._news.notify_all()
             function(snapshot)
 
-        super().__init__("replica of the skin", skin, lambda: skin.frames(rate_hz), keep, profile)
+        super().__init__("replica of the skin", skin, lambda: skin.samples(rate_hz), keep, profile)
 
     @property
     def snapshot(self) -> Snapshot | None:

@@ -263,7 +263,7 @@ class Recording:
     def moments_in(self, place: ChunkPlace, services: Collection[str]) -> list[Moment]:
         """Return the moments of some services in a chunk, by time; none if it is damaged."""
         contents = self._contents(place)
-        frames = [Moment(time_s, name, frame) for name in services for time_s, frame in self[name].frames_in(contents)]
+        frames = [Moment(time_s, name, frame) for name in services for time_s, frame in self[name].samples_in(contents)]
         return sorted([*self._changes_in(contents, services), *frames], key=lambda moment: moment.time_s)
 
     def _changes_in(self, contents: ChunkContents, services: Collection[str]) -> list[Moment]:

@@ -211,7 +211,7 @@ class Track:
             raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
         return origin.context
 
-    def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedSample]:
+    def samples(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedSample]:
         """Yield every sample in order; those of a driver as driver snapshots.
 
         Args:
@@ -219,11 +219,11 @@ class Track:
             end_s: end before this time; None: after the last sample.
         """
         for contents in self._recording.chunks({self.channel}, start_s, end_s):
-            for time_s, frame in self.frames_in(contents):
+            for time_s, frame in self.samples_in(contents):
                 if time_s >= start_s and (end_s is None or time_s < end_s):
                     yield frame
 
-    def frames_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedSample]]:
+    def samples_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedSample]]:
         """Yield (time, sample) of each sample in a chunk; times in s since the recording began."""
         for part in self._decodable(contents):
             yield from zip(part.time_s.tolist(), frames_of(part.generation, part.run), strict=True)

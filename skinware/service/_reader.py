@@ -143,7 +143,7 @@ class ServiceReader(Taking[SampleT]):
                 " with read(), or give the service more slots"
             )
 
-    def frames(
+    def samples(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
     ) -> Iterator[SampleT]:
         """Newest samples, without end.
@@ -176,12 +176,12 @@ class ServiceReader(Taking[SampleT]):
             yield frame
 
     def __iter__(self) -> Iterator[SampleT]:
-        return self.frames()
+        return self.samples()
 
     def in_order(self, *, timeout_s: float | None = None) -> Iterator[SampleT]:
         """Every sample, one after the other, as long as this program keeps up within the ring's slots.
 
-        For recorders and tests; a control loop wants the newest (``frames``). Samples that were overwritten before
+        For recorders and tests; a control loop wants the newest (``samples``). Samples that were overwritten before
         their turn are counted in ``missed``. As long as the loop lives, other threads of this process keep the
         interpreter for 0.1 ms at the most.
 

@@ -282,7 +282,7 @@ def test_a_kill_costs_no_frame_that_was_written_and_little_time(tmp_path: Path, 
                 whole = tmp_path / f"{number}.whole.mcap"
                 assert exit_status(recover, [str(file), "-o", str(whole)]) == 0
                 with skinware.recording.open(whole) as opened:
-                    frames = list(opened["torso"].frames())
+                    frames = list(opened["torso"].samples())
                 wait_until(lambda frames=frames: frames[-1].position in seen)  # type: ignore[misc]
                 known = [frame for frame in frames if frame.position in seen]
                 assert len(known) > 20

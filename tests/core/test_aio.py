@@ -49,16 +49,16 @@ def test_a_skin_is_iterated_and_read() -> None:
                 task = asyncio.create_task(skin.read(newer_than=snapshot, timeout_s=None))
                 await until_asleep()
                 arm.publish()
-                assert (await soon(task)).frames[0].sequence == 2
+                assert (await soon(task)).samples[0].sequence == 2
                 seen = 0
                 async for snapshot in skin:
-                    assert snapshot.frames[0].sequence == seen + 2
+                    assert snapshot.samples[0].sequence == seen + 2
                     seen += 1
                     arm.publish()
                     if seen == 20:
                         break
                 assert (
-                    (await soon(anext(skin.frames(100, max_age_s=60, align=True))))
+                    (await soon(anext(skin.samples(100, max_age_s=60, align=True))))
                     .fresh("pressure", max_age_s=60)
                     .all()
                 )
@@ -176,11 +176,11 @@ def test_a_killed_writer_is_told_of_and_its_successor_is_found() -> None:
     async def main() -> None:
         with fake_process("fake") as process:
             async with skinware.aio.Reader(DriverReader("fake")) as reader:
-                frames = reader.frames(timeout_s=60)
+                frames = reader.samples(timeout_s=60)
                 assert not (await anext(frames)).stale
                 kill(process)
                 with pytest.raises(ServiceTimeout, match="its writer is dead"):
-                    await soon(_all(reader.frames(timeout_s=0.1)))
+                    await soon(_all(reader.samples(timeout_s=0.1)))
                 task = asyncio.create_task(reader.read(newer_than=reader.sync.latest, timeout_s=60))
                 await until_asleep()
                 with FakeSkin("fake") as fake:
@@ -190,7 +190,7 @@ def test_a_killed_writer_is_told_of_and_its_successor_is_found() -> None:
                     with pytest.raises(StructureChanged):
                         await soon(reader.read(newer_than=reader.sync.latest, timeout_s=60))
                     with pytest.raises(StructureChanged):
-                        await soon(_all(reader.frames(200)))
+                        await soon(_all(reader.samples(200)))
 
     asyncio.run(main())
 

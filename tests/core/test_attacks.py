@@ -72,7 +72,7 @@ def read_and_ask(board: Path) -> None:
             frame = reader.request(timeout_s=PATIENCE_S)
             assert (frame.column("values") == frame.sequence).all()
             mine[ANSWERS] += 1
-            for frame in itertools.islice(reader.frames(timeout_s=PATIENCE_S), 3):
+            for frame in itertools.islice(reader.samples(timeout_s=PATIENCE_S), 3):
                 mine[FRAMES] += 1
                 mine[STALE] += frame.stale
 
@@ -226,6 +226,8 @@ def fakes() -> int:
     return len(list(living_readers(place)))
 
 
+@pytest.mark.alone
+@pytest.mark.thorough
 @pytest.mark.parametrize("attack", [flood, wake_ups])
 def test_an_attacker_in_the_group_stops_nobody(users: Users, attack: Callable[[Path], int]) -> None:
     _, frames, answers = reads_on(users, attack, users.board.path)
@@ -234,6 +236,7 @@ def test_an_attacker_in_the_group_stops_nobody(users: Users, attack: Callable[[P
     assert users.board.rows[2, STALE] == 0
 
 
+@pytest.mark.alone
 @pytest.mark.thorough
 def test_garbage_on_the_socket_stops_nobody(users: Users, request: pytest.FixtureRequest) -> None:
     sent, _, answers = reads_on(users, garbage, users.board.path, seeded(request).getrandbits(32))

@@ -130,9 +130,9 @@ def survivor(name: str, board: Path, row: int, way: str) -> None:
     mine = rows[row]
     with ServiceReader[Sample](name, timeout_s=PATIENCE_S) as reader:
         frames = {
-            "asap": reader.frames(timeout_s=PATIENCE_S),
+            "asap": reader.samples(timeout_s=PATIENCE_S),
             "in order": reader.in_order(timeout_s=PATIENCE_S),
-            "periodic": reader.frames(200, timeout_s=PATIENCE_S),
+            "periodic": reader.samples(200, timeout_s=PATIENCE_S),
         }[way]
         while not rows[0, STOP]:
             frame = next(frames)

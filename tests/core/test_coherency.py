@@ -86,9 +86,9 @@ def write_on_request(board: Path, slots: int) -> None:
 
 def taker(reader: ServiceReader[Sample], way: str) -> Callable[[], Sample]:
     if way == "asap":
-        return partial(next, reader.frames(timeout_s=PATIENCE_S))
+        return partial(next, reader.samples(timeout_s=PATIENCE_S))
     if way == "periodic":
-        return partial(next, reader.frames(2000, timeout_s=PATIENCE_S))
+        return partial(next, reader.samples(2000, timeout_s=PATIENCE_S))
     if way == "in order":
         return partial(next, reader.in_order(timeout_s=PATIENCE_S))
     if way == "read":
@@ -150,7 +150,7 @@ def test_no_torn_frame_from_a_writer_flat_out(way: str, slots: int, tmp_path: Pa
 @pytest.mark.parametrize("way", ["copy", "view", "in order", "asap"])
 def test_a_slot_that_is_never_whole_is_an_overrun(way: str) -> None:
     with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Sample]("x") as reader:
-        in_order, asap = reader.in_order(timeout_s=PATIENCE_S), reader.frames(timeout_s=PATIENCE_S)
+        in_order, asap = reader.in_order(timeout_s=PATIENCE_S), reader.samples(timeout_s=PATIENCE_S)
         takes: dict[str, Callable[[], Sample]] = {
             "copy": reader.read,
             "view": reader.view().__enter__,
@@ -231,7 +231,7 @@ def sleep_in_the_loop(board: Path, row: int, way: str) -> None:
     """A reader that comes back twice a second and must know what it missed."""
     rows = Board(board).rows
     with ServiceReader[Sample]("steady1", timeout_s=PATIENCE_S) as reader:
-        frames = reader.in_order(timeout_s=PATIENCE_S) if way == "in order" else reader.frames(timeout_s=PATIENCE_S)
+        frames = reader.in_order(timeout_s=PATIENCE_S) if way == "in order" else reader.samples(timeout_s=PATIENCE_S)
         for frame in frames:
             rows[row, FIRST] = rows[row, FIRST] or frame.sequence
             rows[row, LAST], rows[row, TAKEN], rows[row, LOST] = frame.sequence, reader.statistics.frames, reader.missed

@@ -373,7 +373,7 @@ def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(name
                     partial(reader.read, timeout_s=0),
                     partial(reader.read, newer_than=(0, 0), timeout_s=0.001),
                     partial(next, reader.in_order(timeout_s=0)),
-                    partial(next, reader.frames(timeout_s=0)),
+                    partial(next, reader.samples(timeout_s=0)),
                     reader.refresh,
                 ):
                     with contextlib.suppress(SkinwareError):

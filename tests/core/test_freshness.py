@@ -99,17 +99,20 @@ def test_a_stopped_driver_does_not_look_fresh() -> None:
 
 def test_loops_wait_for_what_is_young_enough() -> None:
     with DriverWriter("a", fake_structure(1, 2)) as writer, DriverReader("a") as reader, Skin() as skin:
-        for frames in (reader.frames(max_age_s=0.5, timeout_s=0.05), reader.frames(50, max_age_s=0.5, timeout_s=0.05)):
+        for samples in (
+            reader.samples(max_age_s=0.5, timeout_s=0.05),
+            reader.samples(50, max_age_s=0.5, timeout_s=0.05),
+        ):
             publish(writer, age_ns=NS_PER_S)
             with pytest.raises(ServiceTimeout, match="no sample younger"):
-                next(frames)
-        for snapshots in (skin.frames(max_age_s=0.5, timeout_s=0.05), skin.frames(50, max_age_s=0.5, timeout_s=0.05)):
+                next(samples)
+        for snapshots in (skin.samples(max_age_s=0.5, timeout_s=0.05), skin.samples(50, max_age_s=0.5, timeout_s=0.05)):
             publish(writer, age_ns=NS_PER_S)
             with pytest.raises(ServiceTimeout, match="too old: a"):
                 next(snapshots)
         publish(writer)
-        assert next(reader.frames(max_age_s=30)).sequence == 5
-        assert next(skin.frames(max_age_s=30)).frames[0].sequence == 5
+        assert next(reader.samples(max_age_s=30)).sequence == 5
+        assert next(skin.samples(max_age_s=30)).samples[0].sequence == 5
 
 
 def test_one_late_driver_is_named_and_can_be_left_out() -> None:

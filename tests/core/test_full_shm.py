@@ -63,7 +63,7 @@ for value in (2, 3, 4):
     publish(writer, value)
     assert (old.read().values == value).all()
     assert (new.read().values == value).all()
-    assert (skin.read().frames[0].values == value).all()
+    assert (skin.read().samples[0].values == value).all()
 assert (next(DriverReader("a").in_order()).values == 4).all()
 
 served = threading.Event()

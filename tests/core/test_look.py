@@ -67,7 +67,7 @@ def clear_away(name: str) -> None:
 def seen(snapshot: Snapshot) -> list[tuple[Any, ...]]:
     return [
         (name, *frame.position, frame.acquired_ns, frame.published_ns, frame.stale, frame.structure.n_sensors)
-        for name, frame in zip(snapshot.layout.drivers, snapshot.frames, strict=True)
+        for name, frame in zip(snapshot.layout.drivers, snapshot.samples, strict=True)
     ]
 
 
@@ -76,7 +76,7 @@ def is_whole(snapshot: Snapshot) -> bool:
         (frame.values == frame.acquired_ns % 251).all()
         and (frame.status == frame.acquired_ns % 3).all()
         and len(frame.values) == frame.structure.n_sensors
-        for frame in snapshot.frames
+        for frame in snapshot.samples
     )
 
 
@@ -95,7 +95,7 @@ def test_both_ways_see_the_same_whatever_happens(seed: int, skins: dict[str, Ski
             known[path] = skin.read()
             assert is_whole(known[path])
         return all(
-            {name: frame.position for name, frame in zip(one.layout.drivers, one.frames, strict=True)} == newest
+            {name: frame.position for name, frame in zip(one.layout.drivers, one.samples, strict=True)} == newest
             for one in known.values()
         )
 
@@ -168,9 +168,9 @@ def test_what_anybody_still_has_is_never_filled_again(skins: dict[str, Skin]) ->
     keep: list[tuple[int, Any]] = []
     ways: list[Callable[[Snapshot], Any]] = [
         lambda snapshot: snapshot,
-        lambda snapshot: snapshot.frames,
-        lambda snapshot: snapshot.frames[1],
-        lambda snapshot: snapshot.frames[0].values,
+        lambda snapshot: snapshot.samples,
+        lambda snapshot: snapshot.samples[1],
+        lambda snapshot: snapshot.samples[0].values,
         lambda snapshot: snapshot.of("b").values[3:9][::2].reshape(1, -1),
         lambda snapshot: memoryview(snapshot.of("a").values.data),
         lambda snapshot: None,
@@ -181,7 +181,7 @@ def test_what_anybody_still_has_is_never_filled_again(skins: dict[str, Skin]) ->
             publish(b, value)
             keep.append((value, ways[value % len(ways)](skins["C"].read())))
     for value, thing in keep:
-        frames = thing.frames if isinstance(thing, Snapshot) else thing if isinstance(thing, tuple) else ()
+        frames = thing.samples if isinstance(thing, Snapshot) else thing if isinstance(thing, tuple) else ()
         for frame in frames:
             assert frame.sequence == value
             assert (frame.values == value).all()
@@ -198,7 +198,7 @@ def test_snapshots_that_nobody_has_are_filled_again(skins: dict[str, Skin]) -> N
             publish(a, value)
             snapshot = skins["C"].read()
             assert is_whole(snapshot)
-            seen_frames.add(id(snapshot.frames[0]))
+            seen_frames.add(id(snapshot.samples[0]))
         assert len(seen_frames) <= 4  # those of the first look, in Python, among them
 
 
@@ -214,7 +214,7 @@ def test_readers_of_single_drivers_do_not_confuse_the_skin(skins: dict[str, Skin
                 skin.read()
             publish(a, value)
             if value % 4 == 0:
-                loops = {path: skin.reader("a").frames(timeout_s=5) for path, skin in skins.items()}
+                loops = {path: skin.reader("a").samples(timeout_s=5) for path, skin in skins.items()}
                 for loop in loops.values():
                     assert next(loop).acquired_ns == value
                 publish(a, value)

@@ -44,7 +44,7 @@ def taking(reader: ServiceReader[Sample], way: str) -> Callable[[], Sample]:
     """How a loop takes its next frame."""
     if way == "read":
         return lambda: reader.read(newer_than=reader._last, timeout_s=20)
-    frames = reader.frames(timeout_s=20) if way == "asap" else reader.in_order(timeout_s=20)
+    frames = reader.samples(timeout_s=20) if way == "asap" else reader.in_order(timeout_s=20)
     return lambda: next(frames)
 
 
@@ -252,7 +252,7 @@ def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str) -> None:
     with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
 
         def frames() -> Iterator[Sample]:
-            return reader.frames(timeout_s=0.01) if way == "asap" else reader.in_order(timeout_s=0.01)
+            return reader.samples(timeout_s=0.01) if way == "asap" else reader.in_order(timeout_s=0.01)
 
         publish(writer, 1)
         loop = frames()

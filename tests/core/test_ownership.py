@@ -94,7 +94,7 @@ def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
         process = crew.start(victim_driver, "x", board.path, 0, ROUTINE, 0, until, fork_in_c)
         with ServiceReader[Sample]("x", timeout_s=PATIENCE_S) as reader:
             wait_until(lambda: board.rows[0, BEGUN] > 2, PATIENCE_S)
-            frames = reader.frames(timeout_s=PATIENCE_S)
+            frames = reader.samples(timeout_s=PATIENCE_S)
             assert not any(next(frames).stale for _ in range(5))
             assert reader.alive
             assert living_inode(namespace, "x") is not None

@@ -148,7 +148,7 @@ def test_readers_wake_on_publication_from_any_thread() -> None:
 
         def follow() -> None:
             with ServiceReader[Sample]("x") as reader:
-                for frame in reader.frames(timeout_s=30):
+                for frame in reader.samples(timeout_s=30):
                     seen.append(frame.sequence)
                     if frame.sequence >= 3:
                         return
@@ -257,7 +257,7 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
 def test_a_periodic_reader_is_told_of_another_structure() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish_one(writer)
-        frames = reader.frames(200, timeout_s=10)
+        frames = reader.samples(200, timeout_s=10)
         assert next(frames).sequence == 1
         writer.restructure({"values": ("<u2", 9)})
         publish_one(writer)

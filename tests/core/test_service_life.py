@@ -180,7 +180,7 @@ def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: N
 
     def read() -> None:
         with ServiceReader[Sample]("x", timeout_s=30) as reader:
-            for _ in reader.frames(timeout_s=30):
+            for _ in reader.samples(timeout_s=30):
                 if seen.is_set():
                     return
 

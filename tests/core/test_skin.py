@@ -123,7 +123,7 @@ def test_a_killed_driver_leaves_and_comes_back(namespace: Any) -> None:
         with fake_process("dying") as process:
             wait_until(lambda: skin.refresh().drivers == ("dying", "living"))
             before = skin.read()
-            wait_until(lambda: skin.read().frames[0].sequence > before.frames[0].sequence)
+            wait_until(lambda: skin.read().samples[0].sequence > before.samples[0].sequence)
             kill(process)
             wait_until(lambda: skin.refresh().drivers == ("living",))
         with FakeSkin("dying"):
@@ -156,7 +156,7 @@ def test_a_replica_is_whole_for_every_thread() -> None:
                 known = replica.wait(newer_than=known, timeout_s=1.0)
             except (ServiceTimeout, Closed):
                 continue
-            for frame, structure in zip(known.frames, known.layout.structures, strict=True):
+            for frame, structure in zip(known.samples, known.layout.structures, strict=True):
                 if frame.structure is not structure or len(frame.values) != structure.n_sensors:
                     torn.append("structure")
                 if len(set(frame.values.tolist())) != 1:

@@ -177,6 +177,6 @@ def test_a_silent_driver_does_not_hold_the_moment_back() -> None:
         for number in range(3):
             publish(arm, number, now + (number - 3) * MS)
         with skin_of("arm", "hung") as skin:
-            snapshot = next(skin.frames(100, align=True))
+            snapshot = next(skin.samples(100, align=True))
             assert snapshot.raw("pressure").tolist() == [2] * 10 + [1] * 10
             assert snapshot.spread_s == pytest.approx(4.999)

@@ -118,7 +118,7 @@ def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
         assert told.age.total == told.wall.count == 20  # the last one is still being looked at
         assert told.wall.worst_ns >= 30 * MS > told.wall.best_ns
         assert told.cpu.count >= 19
-        for count, _ in enumerate(reader.frames(200)):
+        for count, _ in enumerate(reader.samples(200)):
             if count == 5:
                 break
         assert told.kind == "periodic 200 Hz"
@@ -147,7 +147,7 @@ def _seen(namespace: Namespace, reader: ServiceReader[Sample]) -> int:
 
 def _read_for_ever() -> None:
     with ServiceReader[Sample]("x", timeout_s=30.0) as reader:
-        for _ in reader.frames(50):
+        for _ in reader.samples(50):
             pass
 
 

@@ -41,7 +41,7 @@ def test_turns_that_are_shorter_already_stay_so() -> None:
 
 @pytest.mark.parametrize(
     "loop",
-    [lambda reader: reader.frames(), lambda reader: reader.in_order()],
+    [lambda reader: reader.samples(), lambda reader: reader.in_order()],
     ids=["newest", "in order"],
 )
 def test_a_loop_over_frames_shortens_them_for_as_long_as_it_lives(
@@ -56,5 +56,5 @@ def test_a_loop_over_frames_shortens_them_for_as_long_as_it_lives(
             break
         assert sys.getswitchinterval() == pytest.approx(before_s, abs=WITHIN_S)
         reader.read()
-        next(reader.frames(rate_hz=100))
+        next(reader.samples(rate_hz=100))
         assert sys.getswitchinterval() == pytest.approx(before_s, abs=WITHIN_S)

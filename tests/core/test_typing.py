@@ -12,7 +12,7 @@ def programs_need_no_annotation() -> None:
     reader = ServiceReader("arm", timeout_s=10.0)
     assert_type(reader, ServiceReader[Sample])
     assert_type(reader.read(), Sample)
-    for sample in reader.frames(rate_hz=30):
+    for sample in reader.samples(rate_hz=30):
         assert_type(sample, Sample)
     assert_type(DriverReader("skin").read(), DriverSnapshot)
 

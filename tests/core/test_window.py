@@ -45,7 +45,7 @@ def test_other_sensors_begin_anew() -> None:
             pass
         window.add(skin.read())
         assert window.physical.tolist() == [[253.0] * 20]
-        assert repr(window) == "<Window of pressure: 1 of 3 frames>"
+        assert repr(window) == "<Window of pressure: 1 of 3 samples>"
         kept = window.physical
         window.add(skin.read())
         kept[:] = 0  # a copy

@@ -62,7 +62,7 @@ def frames_of(file: Path) -> Frames:
     found: Frames = {}
     with skinware.recording.open(file) as opened:
         for name in opened.services:
-            for frame in opened[name].frames():
+            for frame in opened[name].samples():
                 found[name, frame.generation, frame.sequence] = contents_of(frame)
             for part in opened[name].parts:
                 series = part.read()

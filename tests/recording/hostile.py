@@ -135,7 +135,7 @@ def _read(opened: skinware.recording.Recording) -> None:
     assert all(isinstance(event["time_s"], float) for event in [*opened.events, *opened.clock])
     for name in opened.services:
         for part in opened[name].parts:
-            list(part.frames())
+            list(part.samples())
             part.read()
     for snapshot in opened.snapshots():
         for sensor_type in {kind.name for structure in snapshot.layout.structures for kind in structure.types}:

@@ -93,7 +93,7 @@ def test_the_wall_clock_is_set(tmp_path: Path, namespace: Namespace, step_ns: in
         assert [moment.frame.sequence for moment in opened.moments() if moment.frame] == list(range(1, 62))
         assert opened.duration_s < 1800
         middle_s = float(series.time_s[40])
-        assert [frame.sequence for frame in opened["torso"].frames(start_s=middle_s - 1e-6)] == list(range(41, 62))
+        assert [frame.sequence for frame in opened["torso"].samples(start_s=middle_s - 1e-6)] == list(range(41, 62))
         assert [event["event"] for event in opened.events] == ["found", "clock_stepped"]
         walls = [clock["realtime_ns"] - clock["monotonic_ns"] for clock in opened.clock]
         assert abs(walls[-1] - walls[0] - step_ns) < NS_PER_S

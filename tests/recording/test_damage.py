@@ -76,7 +76,7 @@ def test_damage_is_told(original: Original, tmp_path: Path) -> None:
     file = tmp_path / "damaged.mcap"
     file.write_bytes(with_a_bad_chunk(tmp_path / "original.mcap"))
     with skinware.recording.open(file) as opened:
-        list(opened["torso"].frames())
+        list(opened["torso"].samples())
         assert opened.problems == ["1 chunk damaged and left out"]
     assert recover(file, tmp_path / "whole.mcap").damaged == 1
 
@@ -116,7 +116,7 @@ def test_a_chunk_that_lost_its_checksum_is_not_believed(original: Original, tmp_
             found = frames_of(file)
             assert all(original.frames[position] == contents for position, contents in found.items())
             with skinware.recording.open(file) as opened:
-                list(opened["torso"].frames())
+                list(opened["torso"].samples())
                 assert opened.problems == ["1 chunk damaged and left out"]
 
 
@@ -130,7 +130,7 @@ def test_frames_without_their_generation_are_left_out_and_told(original: Origina
                 data[place.compressed_at + 40] ^= 1
     file.write_bytes(data)
     with skinware.recording.open(file) as opened:
-        assert list(opened["torso"].frames()) == []
+        assert list(opened["torso"].samples()) == []
         assert "samples of 'torso' left out: their description is lost" in opened.problems
         with pytest.raises(BadRecording, match="the description of the samples of 'torso' is lost"):
             opened["torso"].read()

@@ -105,7 +105,7 @@ def test_generations_that_ask_for_too_much_are_left_out_and_said(
     del namespace
     of_frames(path, head(**made), 2000)
     with skinware.recording.open(path) as opened:
-        assert list(opened["big"].frames()) == []
+        assert list(opened["big"].samples()) == []
         assert [problem for problem in opened.problems if says in problem]
 
 
@@ -113,7 +113,7 @@ def test_generations_that_ask_for_too_much_are_left_out_and_said(
 def test_frames_of_a_chunk_that_become_too_much_are_left_out_and_said(path: Path) -> None:
     of_frames(path, head(30 << 20), 5)
     with skinware.recording.open(path) as opened:
-        assert sum(1 for _ in opened["big"].frames()) == LIMITS.frames_size // (30 << 20) == 4
+        assert sum(1 for _ in opened["big"].samples()) == LIMITS.frames_size // (30 << 20) == 4
         assert "become more than" in opened.problems[0]
 
 

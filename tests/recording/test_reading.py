@@ -35,7 +35,7 @@ def path(tmp_path: Path, made: dict[str, bytes]) -> Path:
 def test_columns_frames_and_snapshots_tell_the_same(path: Path) -> None:
     with skinware.recording.open(path) as opened:
         torso = opened["torso"]
-        series, frames = torso.read(), list(torso.frames())
+        series, frames = torso.read(), list(torso.samples())
         assert len(series) == len(frames) == 75
         n_pressure = int((torso.structure.sensor_type == torso.structure.type("pressure").id).sum())
         assert series.physical("pressure").shape == (75, n_pressure)
@@ -60,7 +60,7 @@ def test_columns_frames_and_snapshots_tell_the_same(path: Path) -> None:
         snapshots = list(opened.snapshots())
         assert len(snapshots) == 75 + len(opened["arm"].read())
         assert snapshots[-1].layout.drivers == ("arm", "torso")
-        both = [snapshot for snapshot in snapshots if len(snapshot.frames) == 2]
+        both = [snapshot for snapshot in snapshots if len(snapshot.samples) == 2]
         times_s = np.array([snapshot.time_s for snapshot in snapshots])
         assert (np.diff(times_s) > -0.05).all()  # across chunks, two drivers may be a look of the recorder apart
         assert both[-1].raw("pressure").shape[0] == n_pressure + opened["arm"].read().raw("pressure").shape[1]
@@ -76,7 +76,7 @@ def test_a_part_of_the_time(path: Path) -> None:
         wanted = (whole.time_s >= 0.4) & (whole.time_s < 0.8)
         assert 5 < wanted.sum() < 70
         assert np.array_equal(part.column("values"), whole.column("values")[wanted])
-        assert [f.sequence for f in opened["torso"].frames(start_s=0.4, end_s=0.8)] == whole.sequence[wanted].tolist()
+        assert [f.sequence for f in opened["torso"].samples(start_s=0.4, end_s=0.8)] == whole.sequence[wanted].tolist()
         times = [snapshot.time_s for snapshot in opened.snapshots(start_s=0.4, end_s=0.8)]
         assert 0.4 <= min(times) <= max(times) < 0.8
         assert len(opened["torso"].read(start_s=1e6)) == 0

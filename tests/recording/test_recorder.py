@@ -37,7 +37,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def recorded(opened: skinware.recording.Recording, service: str) -> Contents:
-    return {frame.position: contents_of(frame) for frame in opened[service].frames()}
+    return {frame.position: contents_of(frame) for frame in opened[service].samples()}
 
 
 def test_a_driver_and_a_service_that_come_later_are_recorded_whole(path: Path, namespace: Namespace) -> None:
@@ -58,12 +58,12 @@ def test_a_driver_and_a_service_that_come_later_are_recorded_whole(path: Path, n
         assert recorded(opened, "torso") == seen
         torso, pose_track = opened["torso"], opened["pose"]
         assert torso.structure == skin.structure
-        assert [frame.sequence for frame in pose_track.frames()] == list(range(1, 61))
+        assert [frame.sequence for frame in pose_track.samples()] == list(range(1, 61))
         series = pose_track.read()
         assert series.column("angle").shape == (60, 2, 3)
         assert series.column("joint")["name"][6].tolist() == [b"j7"] * 4
         assert series.column("count").tolist() == [-number for number in range(1, 61)]
-        assert [frame.flags for frame in pose_track.frames()] == list(range(1, 61))
+        assert [frame.flags for frame in pose_track.samples()] == list(range(1, 61))
         (generation,) = pose_track.generations
         assert generation.static()["names"].tolist() == [b"a", b"b"]
         assert recorder.messages == {**dict.fromkeys(recorder.messages, 0), **recorder.messages}

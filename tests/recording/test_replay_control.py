@@ -220,7 +220,7 @@ def test_a_frame_on_request_is_one_that_is_acquired_later(file: Path) -> None:
 
 def test_times_of_then_can_be_kept(file: Path) -> None:
     with skinware.recording.open(file) as opened:
-        first = next(opened["torso"].frames())
+        first = next(opened["torso"].samples())
     with controlling(file, keeps_times=True) as control:
         control.call("seek", time_s=0.0)
         control.call("step", frames=10)

@@ -42,7 +42,7 @@ def record_two_lives(file: Path) -> None:
 def values_of(opened: Recording, name: str) -> list[dict[str, bytes]]:
     """Contents of all frames but times; and of times the ages."""
     found = []
-    for frame in opened[name].frames():
+    for frame in opened[name].samples():
         contents = contents_of(frame)
         contents["times"] = np.array([frame.age_ns // 50_000_000, frame.flags]).tobytes()
         for column in TIMES:

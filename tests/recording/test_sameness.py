@@ -113,7 +113,7 @@ class Programs:
             self.told[f"{name}, lost"] = [reader.missed]
 
     def _skin(self) -> None:
-        tell = self._list("skin", lambda snapshot: [told_by(frame) for frame in snapshot.frames])
+        tell = self._list("skin", lambda snapshot: [told_by(frame) for frame in snapshot.samples])
         with Skin() as skin:
             while not self._stopping:
                 try:

@@ -48,7 +48,7 @@ class FingerPass:
     sigma_m: float
     seed: int
 
-    def frames(self) -> Iterator[tuple[int, npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]]:
+    def samples(self) -> Iterator[tuple[int, npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]]:
         """Time, values, touched taxels, and (2, 3) m, where the fingers are."""
         random = np.random.default_rng(
             [self.seed, round(1e4 * self.speed_m_s), round(self.lane), round(1e4 * self.sigma_m)]
@@ -98,7 +98,7 @@ def told(one: FingerPass, contacts: Contacts | None = None) -> Verdict:
     contacts = contacts or Contacts(len(FLAT), NEIGHBOURS, GEOMETRY)
     seen: set[int] = set()
     first = last = (0, 0)
-    for time_ns, value, touched, at_m in one.frames():
+    for time_ns, value, touched, at_m in one.samples():
         found = contacts.update(value, touched, time_ns)
         seen |= set(found.id.tolist())
         now = _identities(found, at_m, one.sigma_m)

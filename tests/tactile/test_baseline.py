@@ -555,7 +555,7 @@ def test_worlds_with_everything_that_goes_wrong_raise_nothing() -> None:
     world.missing(np.arange(24), 12, 14)
     world.jump(np.arange(24, 48), 30, 16, suspect_s=1)
     baseline = Baseline(world.surface.module, world.surface.patch)
-    for sample in world.frames(30):
+    for sample in world.samples(30):
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
         assert np.isfinite(calm.value).all()
         assert np.isfinite(calm.baseline[calm.usable]).all()

@@ -36,7 +36,7 @@ def contacts_in(world: World, until_s: float) -> list[tuple[float, ContactSet]]:
     contacts = Contacts(len(GEOMETRY), NEIGHBOURS, GEOMETRY)
     found = []
     first_ns = None
-    for sample in world.frames(until_s=until_s):
+    for sample in world.samples(until_s=until_s):
         first_ns = sample.time_ns if first_ns is None else first_ns
         calm = baseline.update(sample.time_ns, sample.values.astype(np.float32), sample.usable)
         found.append(((sample.time_ns - first_ns) / 1e9, contacts.update(calm.value, calm.touched, sample.time_ns)))

@@ -43,7 +43,7 @@ def test_a_skin_that_is_touched_from_the_start_begins_and_shows_every_finger(see
     places = world.surface.geometry("arm")
     baseline = Baseline(world.surface.module, world.surface.patch)
     contacts = Contacts(len(places), neighbours(places), places)
-    frames = world.frames(until_s=40)
+    frames = world.samples(until_s=40)
     for _ in range(round(5.2 * world.rate_hz)):
         sample = next(frames)
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
@@ -73,7 +73,7 @@ def test_from_the_bus_to_a_contact_that_follows_a_finger(calm_namespace: Namespa
         calm.wait_for("ready")
         places: dict[int, list[list[float]]] = {}
         with ContactsReader(namespace=calm_namespace, timeout_s=60) as contacts:
-            for frame in contacts.frames(timeout_s=60):
+            for frame in contacts.samples(timeout_s=60):
                 for contact in frame:
                     places.setdefault(contact.id, []).append(contact.cop_m.tolist())
                     assert contact.frame == "arm"

@@ -115,7 +115,7 @@ def test_a_stroke_through_noise_is_told(seed: int) -> None:
     baseline = Baseline(ROW // 4 * 5 + COLUMN // 4, SURFACE.patch, BaselineSettings(calibrate_s=1.0))
     contacts = Contacts(SIDE * SIDE, TABLE, GEOMETRY)
     told = []
-    for number, sample in enumerate(world.frames(end_s)):
+    for number, sample in enumerate(world.samples(end_s)):
         calm = baseline.update(sample.time_ns, sample.values.astype(np.float32), sample.usable)
         found = contacts.update(calm.value, calm.touched, sample.time_ns)
         if 2.0 < number / 50 < end_s - 0.1:

@@ -25,7 +25,7 @@ def test_modules_round_a_contact_are_at_rest_when_it_is_over(seed: int, seconds:
     taxel = int(np.random.default_rng(seed).integers(len(surface)))
     world.push(surface.position_m[taxel], LOAD, 10, 10 + seconds, rise_s=0.1, radius_m=0.004)
     baseline = Baseline(surface.module, surface.patch)
-    for sample in world.frames(30 + seconds):
+    for sample in world.samples(30 + seconds):
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
         time_s = (sample.time_ns - 1_000_000_000) / 1e9
         if 10.3 < time_s < 10 + seconds - 0.2:
@@ -46,7 +46,7 @@ def test_a_touch_where_the_cover_has_sunk_is_seen_and_outlives_the_contact_that_
     world.push(surface.position_m[sunk], 30, 20, 40, rise_s=0.1)
     baseline = Baseline(surface.module, surface.patch)
     seen, over = [], []
-    for sample in world.frames(60):
+    for sample in world.samples(60):
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
         time_s = (sample.time_ns - 1_000_000_000) / 1e9
         if 20.3 < time_s < 39.8:
@@ -65,7 +65,7 @@ def test_fingers_that_stroke_without_end_leave_nothing_behind_them() -> None:
         world.gestures.append(Wander(path_m=path, force=5, radius_m=0.006, begin_s=6, end_s=1e6, speed_m_s=0.02))
     baseline = Baseline(world.surface.module, world.surface.patch)
     false = idle = seen = pressed = 0
-    for sample in world.frames(90):
+    for sample in world.samples(90):
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
         if sample.time_ns < 21_000_000_000:
             continue

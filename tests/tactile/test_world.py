@@ -77,7 +77,7 @@ def test_another_seed_another_world_of_the_same_truth() -> None:
 
 def test_frames_are_the_rows_of_blocks() -> None:
     whole, count = busy().record(6), 0
-    for row, sample in enumerate(busy().frames(6)):
+    for row, sample in enumerate(busy().samples(6)):
         assert sample.time_ns == whole.time_ns[row]
         assert np.array_equal(sample.values, whole.values[row])
         assert np.array_equal(sample.usable, whole.usable[row])
@@ -307,7 +307,7 @@ def test_taxels_without_a_place_feel_no_push_and_break_nothing() -> None:
 
 
 def test_nothing_at_all() -> None:
-    assert not list(quiet().frames(0))
+    assert not list(quiet().samples(0))
     with pytest.raises(ConfigurationError, match="no frames"):
         quiet().record(0)
     empty = Surface.at(np.zeros((0, 3)))

@@ -44,7 +44,7 @@ def test_it_is_begun_and_ended_by_any_viewer(serving: Serve, page_folder: Path) 
         file = Path(told["file"])
         assert file.parent == page_folder
         with skinware.recording.open(file) as opened:
-            assert sum(1 for _ in opened["torso"].frames()) > 1
+            assert sum(1 for _ in opened["torso"].samples()) > 1
         assert one.state["problems"] == []
 
 

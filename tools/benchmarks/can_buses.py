@@ -104,7 +104,7 @@ def read_ages(namespace: str, ages: Any) -> None:
         last = first = newest_ns = taken = 0
         found: list[float] = []
         try:
-            for frame in reader.frames(timeout_s=2.5):
+            for frame in reader.samples(timeout_s=2.5):
                 taken += 1
                 if frame.acquired_ns > newest_ns:  # others tell that boards went silent
                     found.append((time.monotonic_ns() - frame.acquired_ns) / 1e6)

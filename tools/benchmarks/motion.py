@@ -141,7 +141,7 @@ def errors(seeds: range, speed_m_s: float, fingers: int) -> dict[str, Floats]:
         contacts = Contacts(len(SURFACE), TABLE, GEOMETRY)
         rules = {name: make() for name, make in OTHERS.items()}
         begun_ns = before_ns = 0
-        for sample in world.frames(done[-1][1]):
+        for sample in world.samples(done[-1][1]):
             begun_ns = begun_ns or sample.time_ns
             time_s, passed_s = (sample.time_ns - begun_ns) / 1e9, (sample.time_ns - before_ns) / 1e9
             before_ns = sample.time_ns

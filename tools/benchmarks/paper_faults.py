@@ -166,7 +166,7 @@ def _watch_skin(pipe: Connection, namespace: Namespace, drivers: int) -> None:
 def _follow(pipe: Connection, namespace: Namespace, name: str) -> None:
     with DriverReader(name, namespace=namespace, timeout_s=30) as reader:
         pipe.send(READY)
-        for _ in reader.frames(timeout_s=30):
+        for _ in reader.samples(timeout_s=30):
             if pipe.poll():
                 pipe.recv()
                 pipe.send(reader.missed)

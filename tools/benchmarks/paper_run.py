@@ -208,7 +208,7 @@ def _use(
 ) -> None:
     def attend(reader: DriverReader, rate_hz: float) -> Readings:
         use_fifo(_READER_PRIORITY if fifo else None)
-        frames = reader.frames(rate_hz if mode == "periodic" else None, timeout_s=10)
+        frames = reader.samples(rate_hz if mode == "periodic" else None, timeout_s=10)
         found = _attend(((frame,) for frame in frames), *window)
         found.lost = reader.missed if mode == "asap" else 0  # a periodic reader means to leave some out
         return found
@@ -221,7 +221,7 @@ def _use(
             pipe.send(READY)
             window = pipe.recv()
             share = CpuShare()
-            found = [_attend((snapshot.frames for snapshot in skin.frames(rates_hz[0], timeout_s=10)), *window)]
+            found = [_attend((snapshot.samples for snapshot in skin.samples(rates_hz[0], timeout_s=10)), *window)]
     else:
         readers = [DriverReader(name, namespace=namespace, timeout_s=10) for name in names]
         with ThreadPoolExecutor(len(names)) as pool:

@@ -233,7 +233,7 @@ def read(file: Path) -> None:
     with skinware.recording.open(file) as opened:
         series = opened["large"].read(["values"])
         columns_s = time.perf_counter() - begin_s
-        begin_s, frames = time.perf_counter(), sum(1 for _ in opened["large"].frames())
+        begin_s, frames = time.perf_counter(), sum(1 for _ in opened["large"].samples())
         frames_s = time.perf_counter() - begin_s
     begin_s = time.perf_counter()
     recover(file, file.with_suffix(".whole.mcap"))
@@ -270,7 +270,7 @@ def kills(number_of_kills: int, skins: list[int], folder: Path) -> None:
                 recover(file, whole)
                 columns = reader.schema.columns
                 with skinware.recording.open(whole) as opened:
-                    frames = list(opened["large"].frames())
+                    frames = list(opened["large"].samples())
                 missing.append((newest_ns - frames[-1].published_ns) / 1e9)
                 recorded.append({frame.sequence: digest(frame, columns) for frame in frames})
                 file.unlink()

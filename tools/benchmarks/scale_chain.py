@@ -94,7 +94,7 @@ def _reading(namespace: Namespace) -> Iterator[Figure]:
         yield Figure("memory of a reader with one frame", memory_mb(os.getpid()) - memory, "MB")
         yield Figure("a frame is copied", 1e3 * _median_s(reader.read), "ms")
         ages = []
-        for frame in reader.frames():
+        for frame in reader.samples():
             ages.append(now_ns() - frame.acquired_ns)
             if len(ages) == TIMES:
                 break

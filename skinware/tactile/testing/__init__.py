@@ -6,7 +6,7 @@ It gives arrays, so that an algorithm can be compared with the load that no real
 
     world = World(grid(modules=10), seed=1, drift_per_min=0.5, noise=0.8)
     world.push(world.surface.position_m[5], 25, begin_s=10, end_s=20)
-    for sample in world.frames(until_s=30):
+    for sample in world.samples(until_s=30):
         sample.values, sample.truth  # (n,) both
 """
 

@@ -241,7 +241,8 @@ class Offsets:
         self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
         quick = innovation - self.slow
         self.slow += quick * (np.float32(slowly) * taxels)
-        self.noise2 += (quick * (innovation - self.slow) - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
+        quick2 = quick * (innovation - self.slow)
+        self.noise2 += (quick2 - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, passed_s)

@@ -52,5 +52,5 @@ def test_other_sensors_begin_anew() -> None:
         assert window.physical.tolist() == [[253.0] * 20] * 2
         with pytest.raises(StructureError, match="no sensor type 'heat'"):
             Window("heat", 1).add(skin.read())
-    with pytest.raises(ConfigurationError, match="a window of 0 frames"):
+    with pytest.raises(ConfigurationError, match="a window of 0 samples"):
         Window("pressure", 0)

@@ -14,7 +14,6 @@ import pytest
 from tests.sharing import made_once
 
 ROOT = Path(__file__).parent.parent
-NO_COMPILER = {"CC": "/bin/false"}
 PATIENCE_S = 300.0
 
 

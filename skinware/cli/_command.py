@@ -77,6 +77,17 @@ def command(
     return lambda function: version_option(made(function))
 
 
+def options(*given: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
+    """Return several options as one decorator, in this order in the help."""
+
+    def decorate(command: _Decorated) -> _Decorated:
+        for option in reversed(given):
+            command = option(command)
+        return command
+
+    return decorate
+
+
 def version_option(command: _Decorated) -> _Decorated:
     # one for each command: it keeps the name of the first program that asks
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
@@ -196,6 +207,14 @@ def refuse_others(option: str, allowed: Collection[str]) -> None:
 def warn(text: str) -> None:
     """Print one line on stderr under the running command's name: a note that is no error."""
     echo(f"{click.get_current_context().info_name}: {text}", err=True)
+
+
+def echo_changes(shown: dict[str, str], states: Mapping[str, str]) -> None:
+    """Print each state by name that is another than ``shown``, and note it there."""
+    for name, state in states.items():
+        if shown.get(name) != state:
+            echo(f"{name}: {state}")
+        shown[name] = state
 
 
 def log_to_stderr(verbose: bool) -> None:

@@ -16,7 +16,7 @@ from skinware.cli._terminal import echo, print_json, terminal_width
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
-from skinware.tactile.calibration.sources import LoadSource, PoseSource
+from skinware.tactile.calibration.sources import ForceSource, LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
 from skinware.views.driver_snapshots import after, enter_pressed, frames_until
@@ -116,13 +116,13 @@ class Gathering:
         reader: DriverReader,
         session: Session,
         source: LoadSource,
-        poses: PoseSource | None,
+        poses: PoseSource | ForceSource | None,
         state_path: Path,
         *,
         fresh: bool,
         as_json: bool,
     ) -> None:
-        self._reader, self._session, self._source, self._poses = reader, session, source, poses
+        self._reader, self._session, self.source, self.poses = reader, session, source, poses
         self._state_path, self._as_json = state_path, as_json
         self.structure: Structure = reader.structure
         self.type_name: str = source.type_name
@@ -182,8 +182,8 @@ class Gathering:
         for frame in frames_until(
             self._reader, lambda: self._session.is_complete(share) or time_is_over() or enter_pressed()
         ):
-            pose = None if self._poses is None else self._poses.newest()
-            self._session.take(frame.acquired_ns, self._source.loads(frame), pose)
+            pose = None if self.poses is None else self.poses.newest()
+            self._session.take(frame.acquired_ns, self.source.loads(frame), pose)
             if report_due():
                 report_due = after(_REPORT_EVERY_S)
                 self._report_progress()
@@ -192,13 +192,13 @@ class Gathering:
                 self._save()
 
     def _wait_for_rest(self) -> None:
-        if not self._source.ready and not self._as_json:
+        if not self.source.ready and not self._as_json:
             echo("leave the skin alone for some seconds ...")
         refused = 0.0
-        for frame in frames_until(self._reader, lambda: self._source.ready):
-            self._source.loads(frame)
-            if self._source.refused_share and not refused:
-                refused = self._source.refused_share
+        for frame in frames_until(self._reader, lambda: self.source.ready):
+            self.source.loads(frame)
+            if self.source.refused_share and not refused:
+                refused = self.source.refused_share
                 cli.warn(f"{100 * refused:.0f} % of the sensors move and have no baseline yet; leave them alone")
 
     def _save(self) -> None:

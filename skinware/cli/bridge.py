@@ -119,10 +119,10 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
             guard = server.guard
             counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
             print_json({"event": "status", **counts, "services": services})
-        for name, (state, count, _) in frames.items():
-            if not as_json and shown.get(name) != state:
-                echo(f"{name}: {state}")
-            shown[name], before[name] = state, count
+        else:
+            cli.echo_changes(shown, {name: state for name, (state, _, _) in frames.items()})
+        for name, (_, count, _) in frames.items():
+            before[name] = count
 
     return report
 
@@ -214,17 +214,13 @@ def _show_event(event: dict[str, Any]) -> None:
 def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
     from skinware.bridge_state import as_data
 
-    shown: dict[str, tuple[str, str]] = {}
+    shown: dict[str, str] = {}
 
     def report(bridge: BridgeState) -> None:
         if as_json:
             print_json({"event": "status"} | as_data(bridge))
             return
-        for name, service in bridge.services.items():
-            state = service.state, service.mode
-            if shown.get(name) != state:
-                echo(f"{name}: {service.state}")
-            shown[name] = state
+        cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
 
     return report
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     "--connect",
     multiple=True,
     metavar="ENDPOINT",
-    help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/localhost:7447]",
+    help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/127.0.0.1:7447]",
 )
 @click.option(
     "--interface",
@@ -167,9 +167,6 @@ def _status(server: Ros2Server, as_json: bool) -> Callable[[], None]:
         if as_json:
             print_json({"event": "status", "drivers": {name: asdict(driver) for name, driver in drivers.items()}})
             return
-        for name, driver in drivers.items():
-            if shown.get(name) != driver.state:
-                echo(f"{name}: {driver.state}")
-            shown[name] = driver.state
+        cli.echo_changes(shown, {name: driver.state for name, driver in drivers.items()})
 
     return report

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,20 +21,11 @@ if TYPE_CHECKING:
     from skinware.tactile.calibration.placing import Placement
     from skinware.tactile.calibration.shapes import Shape
 
-_Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
 _POSES_TIMEOUT_S = 5.0
 _MM = 1e3
 _STROKE = "stroke the whole skin with one finger"
+_PUSH = "press the skin through the reference, with forces that rise, rest and fall"
 _PRESS = "press the skin at known places; hold each for a moment"
-
-
-def _options(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
-    def decorate(command: _Decorated) -> _Decorated:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return decorate
 
 
 _output = cli.output_option("File to write.", name="file", metavar="GEOMETRY", required=True)
@@ -47,7 +38,7 @@ _pitch = click.option(
     show_default=True,
     help="Distance between neighbouring sensors, metres.",
 )
-_gathering = _options(
+_gathering = cli.options(
     cli.driver_option,
     cli.type_option("Sensors.  [default: pressure, or the first type]"),
     click.option(
@@ -66,7 +57,7 @@ _gathering = _options(
     cli.json_option,
     cli.version_option,
 )
-_pressing = _options(
+_pressing = cli.options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
     click.option("--poses-namespace", metavar="NAME", help="Namespace of that service.  [default: as --namespace]"),
     click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted on each sensor."),
@@ -288,6 +279,66 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
         f"{file}: {len(found) or 'nothing'} found{'' if session.sums.frames else '; no strokes to compare it with'}",
     )
     context.exit(cli.EXIT_FAILED if found else cli.EXIT_DONE)
+
+
+@command.command(
+    epilog=cli.examples(
+        "skin-calibrate force --reference loadcell -o curves.toml          a service publishes force_n",
+        "skin-calibrate force --newtons 0.5 --newtons 1 --newtons 2 -o curves.toml    known weights",
+    )
+)
+@_output
+@click.option("--reference", metavar="SERVICE", help="Service of a load cell or force-torque sensor.")
+@click.option("--column", metavar="NAME", default="force_n", show_default=True, help="With 1 or 3 forces, N.")
+@click.option("--axes", type=click.Choice(["1", "3"]), default="1", show_default=True, help="Forces in the column.")
+@click.option("--newtons", type=click.FloatRange(0), multiple=True, metavar="N", help="A known weight, N; repeat it.")
+@click.option("--weight-s", type=click.FloatRange(0.5), default=8.0, show_default=True, help="How long each rests.")
+@_gathering
+def force(
+    file: Path,
+    reference: str | None,
+    column: str,
+    axes: str,
+    newtons: tuple[float, ...],
+    weight_s: float,
+    **options: Any,
+) -> None:
+    """Find the curves from values to newtons, from presses beside a reference.
+
+    Press each part of the skin with forces that rise, rest and fall, through the load cell, or lay known weights on it.
+    The file is for the stage "curve" of skin-calm.
+
+    Exit status: 0 the curves can be trusted, 1 they are written, and cannot.
+    """
+    from skinware.tactile.calibration.force import fit_force
+    from skinware.tactile.calibration.sources import ForceSource
+    from skinware.tactile.calibration.state import ForceSession
+    from skinware.tactile.curves import curves_to_toml
+
+    how = _How(**options)
+    if (reference is None) == (not newtons) and how.duration_s != 0:
+        raise click.UsageError("give either --reference or --newtons")
+    where = None if reference is None else (reference, how.namespace, column, (int(axes),))
+    with _opened(_beside(file, how), ForceSession, how, where) as (gathering, session):
+        source = gathering.poses = ForceSource(gathering.source, gathering.poses)
+        for weight_n in newtons:
+            click.pause(f"lay {weight_n:g} N on the skin, and press Enter ...", err=True)
+            source.weight_n = weight_n
+            gathering.run(f"{weight_n:g} N for {weight_s:g} s", 2.0, weight_s)
+        if not newtons:
+            gathering.run(_PUSH, how.share, how.duration_s)
+        structure, type_name = gathering.structure, gathering.type_name
+        fit = fit_force(session.data, type_name, structure.type(type_name).unit)
+    uid = structure.sensor_uid[structure.index(type_name)]
+    doubts = "; ".join(fit.doubts)
+    own, curve = int(sum(fit.gain == fit.gain)), fit.curve
+    error = f"{1e3 * fit.residual_n:.0f} mN of {fit.reach_n:.3g} N"
+    words = f"residual {error}; up to {curve.x[-1]:.4g} {curve.from_unit}; hysteresis {100 * fit.hysteresis:.0f} %"
+    words += f"; not trustworthy: {doubts}" if doubts else ""
+    file.write_text(curves_to_toml(fit.curves(uid), words), encoding="utf-8")
+    figures = {"residual_n": fit.residual_n, "reach_n": fit.reach_n, "held": fit.held, "doubts": fit.doubts}
+    _report_done(how.as_json, {"file": str(file), "curves": own, **figures}, f"{file}: {own} sensors; {words}")
+    click.get_current_context().exit(cli.EXIT_FAILED if doubts else cli.EXIT_DONE)
 
 
 def _beside(file: Path, how: _How) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,7 @@ def _window(text: str) -> int:
     return int(text)
 
 
-_OPTIONS = (
+_learning_options = cli.options(
     click.option(
         "--also",
         metavar="FILE",
@@ -100,12 +100,6 @@ _NAMES = (
     *("also", "fps", "task", "episode", "episodes", "gap"),
     *("window", "join", "match", "within", "at", "each_structure"),
 )
-
-
-def _learning_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
 
 
 def _asked_for() -> list[str]:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from skinware.structure import Structure
 
 _LOOK_EVERY_S = 0.1
+_CALMED = ("uncertainty", "why")
+"""Columns of drivers that skin-calm publishes."""
 
 
 def print_snapshots(
@@ -64,6 +66,7 @@ def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, 
         "values": values.tolist(),
         "status": frame.status[index].tolist(),
     }
+    data |= {name: frame.column(name)[index].tolist() for name in _CALMED if name in reader.schema.columns}
     if type_name is not None:
         data["uids"] = frame.structure.sensor_uid[index].tolist()
     return data

@@ -74,7 +74,7 @@ _LOOPBACK = (
     "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General><Discovery>"
     "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
-    "<Peers><Peer address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
+    "<Peers><Peer address='127.0.0.1'/></Peers></Discovery></Domain></CycloneDDS>"
 )
 _NETWORK = "<CycloneDDS><Domain id='any'><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>"
 

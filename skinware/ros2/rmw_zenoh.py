@@ -24,9 +24,9 @@ from skinware.errors import BridgeError
 from skinware.ros2.rmw_zenoh_keys import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token
 from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
-ROUTER = "tcp/localhost:7447"
+ROUTER = "tcp/127.0.0.1:7447"
 """The router of a machine."""
-_LISTEN = "tcp/localhost:0"
+_LISTEN = "tcp/127.0.0.1:0"
 _SETTINGS = {
     "scouting/gossip/enabled": "true",
     "scouting/gossip/target": '{ router: ["router", "peer"], peer: ["router"] }',

@@ -310,17 +310,18 @@ class Baseline:
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
             free &= ~self._falls.sagging & ~(self._falls.below & low)
-        offsets.follow_common(deviation, free, passed_s)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
         off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
+        offsets.follow_common(deviation, free, np.where(self._surroundings.held, on * on, np.float32(0)), passed_s)
         touches.follow(deviation, live, on, passed_s, settings.smooth_s)
+        rustle = np.float32(touches.noise_share) * off
         most_s = settings.maximum_hold_s or math.inf
         over = touches.judge(deviation, live, on, off, offsets, passed_s, most_s)
         if not self._all_held:
             self._let_go(over, live, on, off, deviation, passed_s)
-        held = self._surroundings.hold(touches, live, passed_s, settings.settle_s)
+        self._surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
-            self._falls.sag(touches.smooth, off, live & ~touches.touched, offsets.patches)
+            self._falls.sag(touches.smooth, rustle, live & ~touches.touched, offsets.patches, passed_s)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
             floor: Floats | np.float32 = np.float32(min(passed_s / settings.tau_s, 0.5))
@@ -329,12 +330,12 @@ class Baseline:
                 floor = np.where(touches.remainders.used > 0, quick, floor)
             learns = live & ~touches.touched & ~self._falls.sagging & touches.remainders.has_settled
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
-            calm = learns & (np.abs(touches.smooth) < np.float32(0.5) * off)
+            calm = learns & (np.abs(touches.smooth) < rustle)
             offsets.learn(deviation, learns, calm, floor, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
         if not touches.signed:
             touches.remainders.follow(deviation, touches.smooth, touches.touched, on, passed_s)
-        return self._calm(deviation, live, held, low, off)
+        return self._calm(deviation, live, low, off)
 
     @property
     def _minimum_on(self) -> float:
@@ -418,7 +419,7 @@ class Baseline:
         touches.smooth[taxels] -= by
         self._forced[taxels] = True
 
-    def _calm(self, deviation: Floats, live: Flags, held: Flags, low: Flags, off: Floats) -> Calm:
+    def _calm(self, deviation: Floats, live: Flags, low: Flags, off: Floats) -> Calm:
         offsets, touches = self._offsets, self._touches
         known = np.where(live, deviation, touches.smooth)
         touched = touches.shown(known, off)
@@ -432,7 +433,7 @@ class Baseline:
             why[live] = Why.NO_RESOLUTION
         forced, self._forced = self._forced, np.zeros(len(live), bool)
         baseline = offsets.level + touches.remainders.left
-        held = np.ones_like(held) if self._all_held else held
+        held = np.ones_like(live) if self._all_held else self._surroundings.held.copy()
         return Calm(
             value,
             touched,

@@ -28,6 +28,7 @@ The file is TOML; every key of a stage except ``stage`` is optional::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,10 +40,11 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.curves import CurveTable, read_curves
+from skinware.tactile.curves import TEMPERATURE, CurveTable, read_curves, temperature_of
 from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE, BaselineSettings
 from skinware.tactile.stages import (
     AmplifierSettings,
@@ -57,7 +59,7 @@ from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
 
-_RESTLESS = ("temperature", "acceleration_", "angular_rate_")
+_RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
 """Beginnings of the names of types that have no rest to go back to."""
 
 
@@ -153,7 +155,13 @@ class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
 
 
 class CurveStage(Stage):
-    """Applies the curves of n taxels."""
+    """Applies the curves of n taxels.
+
+    Attributes:
+        table: the curves.
+        temperature_c: of the skin in the next frame; NaN: not known.
+        error: (n,) float32, standard deviations of the newest results; NaN: not known.
+    """
 
     name = "curve"
 
@@ -162,10 +170,16 @@ class CurveStage(Stage):
             taxels.type, unit=table.unit, minimum=float(table.minimum.min()), maximum=float(table.maximum.max())
         )
         self.taxels = replace(taxels, type=meant, resolution=0.0)
-        self._table = table
+        self.table = table
+        self.temperature_c = math.nan
+        self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self._time_ns: int | None = None
 
     def step(self, signal: Signal) -> None:
-        signal.values = self._table(signal.values)
+        passed_s = 0.0 if self._time_ns is None else max(signal.time_ns - self._time_ns, 0) / NS_PER_S
+        self._time_ns, given = signal.time_ns, signal.values
+        signal.values = self.table.step(given, passed_s, self.temperature_c)
+        self.error = self.table.error(given, signal.values)
 
 
 AnySettings = BaselineStageSettings | CurveSettings | FilterSettings | ScalerSettings | AmplifierSettings
@@ -338,6 +352,11 @@ class Chain:
         return found
 
     @property
+    def curve_stages(self) -> dict[str, CurveStage]:
+        """By type, the last stage of each that is a curve."""
+        return {name: s for name, stages in self.stages.items() for s in stages if isinstance(s, CurveStage)}
+
+    @property
     def baselines(self) -> dict[str, Baseline]:
         """By type, the first baseline of each."""
         return {name: stage.baseline for name, stage in self.baseline_stages.items()}
@@ -352,6 +371,10 @@ class Chain:
                 ``NEVER_SEEN`` where a stage has no result yet.
         """
         status[:] = frame.status
+        if any(stage.table.warms for stage in self.curve_stages.values()):
+            temperature_c = temperature_of(frame)
+            for curve in self.curve_stages.values():
+                curve.temperature_c = temperature_c
         for name, stages in self.stages.items():
             index = self._before.index(name)
             of_type = status[index]

@@ -51,7 +51,7 @@ class Contact:
         area_m2: area that they stand for, m2; NaN without places.
         cop_m: (3,) m, its centre: the mean of the places, weighted by the values; NaN without places.
         normal: (3,) of length 1, outwards, weighted in the same way; NaN if it is not known.
-        force_n: pressure by area, along the normal, N; NaN unless the values are pressures in Pa at known places.
+        force_n: along the normal, N: the sum of values in N, or of values in Pa by area, at known places; else NaN.
         frame: name of the coordinate frame, empty if it is not known.
         velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
@@ -161,7 +161,7 @@ class Contacts:
         neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows; None: not known.
         geometry: places of the n taxels; None, or NaN in it: not known. Contacts then have no centre.
         module: (n,) int, module of each taxel; touched taxels without neighbours are one contact per module.
-        unit: unit of the values; forces are known where it is ``Pa``.
+        unit: unit of the values; forces are known where it is ``N`` or ``Pa``.
         tracking: settings of the tracking.
 
     Raises:
@@ -187,7 +187,7 @@ class Contacts:
         area = area_m2(geometry)
         of_taxel = [geometry.position_m, geometry.normal, area[:, None], np.isfinite(area)[:, None]]
         self._of_taxel = np.nan_to_num(np.hstack(of_taxel).astype(np.float64))  # place, normal, area, and whether known
-        self._is_pressure = unit == "Pa"
+        self._unit = unit
         self._least = 0.0  # value of a taxel that is just touched; 0: none was seen yet
         known = np.isfinite(geometry.position_m).all(axis=1)
         names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
@@ -313,11 +313,17 @@ class Contacts:
             "peak": peak,
             "n": np.bincount(contact, minlength=count),
             "area_m2": np.where(has_area, areas, np.nan),
-            "force_n": np.where(has_area & self._is_pressure, forces, np.nan),
+            "force_n": self._forces(loads, np.where(has_area, forces, np.nan)),
             "cop_m": total[:, 5:8] / np.where(weights > 0, weights, np.nan)[:, None],
             "normal": normal / np.where(length > 0, length, np.nan)[:, None],
             "frame": frame,
         }
+
+    def _forces(
+        self, of_newtons: npt.NDArray[np.float64], of_pascals: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        nothing = np.full(len(of_newtons), np.nan)
+        return {"N": of_newtons, "Pa": of_pascals}.get(self._unit, nothing)
 
     def _whole(
         self, found: dict[str, npt.NDArray[Any]], cut: npt.NDArray[np.float64], load: npt.NDArray[np.float64]

@@ -44,7 +44,7 @@ _TEXTS = {
     "load": ("", "sum of the values of its taxels"),
     "peak": ("", "the largest of them"),
     "area_m2": ("m2", "that its taxels stand for"),
-    "force_n": ("N", "pressure by area; only of pressures in Pa"),
+    "force_n": ("N", "of values in N, or of pressures in Pa by area"),
     "n": ("", "number of its taxels"),
     "cop_m": ("m", "its centre, in its frame"),
     "normal": ("", "outwards, of length 1"),

@@ -1,4 +1,4 @@
-"""Fit, read and apply force curves, which give values a unit of force or pressure, per type or per taxel.
+"""Read and apply force curves, which give values a unit of force or pressure, per type or per taxel.
 
 The file is TOML, keyed like a geometry::
 
@@ -12,26 +12,37 @@ The file is TOML, keyed like a geometry::
     unit = "Pa"
     x = [0.0, 12.0, 40.0, 180.0]        # rising, at most 8
     y = [0.0, 900.0, 4500.0, 60000.0]   # not falling; beyond its ends a curve is level
-    hysteresis = 0.08                   # for information: see Fit
+    hysteresis = 0.08                   # for information
+    play = 9.0                          # a follower with this play counts by lag: rising and falling loads differ
+    lag = 20.0
+    creep_s = 30.0                      # what creeps in this time counts by creep
+    creep = -12.0
+    temperature = -0.9                  # in the unit, for each of from_unit and kelvin above at_c
+    at_c = 25.0
+    error = [40.0, 0.03]                # standard deviation at 0, and its growth with the result
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
+from skinware.tactile.rule import UNUSABLE
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
 MOST_KNOTS = 8
+TEMPERATURE = "temperature"
+"""The sensor type of temperatures."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -48,6 +59,14 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         uid: uids of the sensors; None: all of the type that no other curve names.
         hysteresis: how far rising and falling branch are apart, as a share of the range of ``y``; None: not known.
         name: for information.
+        play: of what follows the values, in ``from_unit``.
+        lag: weight of its distance from them.
+        creep_s: time constant of the slow values, s.
+        creep: their weight.
+        temperature: weight of value times kelvin above ``at_c``.
+        at_c: temperature at which it has no influence, degrees Celsius.
+        error: standard deviation of a result: at 0, and its growth with the result; None: not known. Those of several
+            taxels add up.
 
     Raises:
         ValueError: knots that are no such curve.
@@ -61,6 +80,13 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     uid: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] | None = None
     hysteresis: float | None = None
     name: str = ""
+    play: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    lag: float = 0.0
+    creep_s: Annotated[float, msgspec.Meta(gt=0)] = 30.0
+    creep: float = 0.0
+    temperature: float = 0.0
+    at_c: float = 25.0
+    error: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 2 <= len(self.x) <= MOST_KNOTS or len(self.x) != len(self.y):
@@ -72,11 +98,30 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         if any(b < a for a, b in zip(self.y, self.y[1:], strict=False)):
             raise ValueError("y must not fall from knot to knot")
 
+    def scaled(self, gain: float, uid: tuple[int, ...]) -> Curve:
+        """Return the curve of some taxels whose results are larger by a factor."""
+        names = ("lag", "creep", "temperature")
+        terms = {name: gain * getattr(self, name) for name in names}
+        return msgspec.structs.replace(self, y=tuple(gain * y for y in self.y), uid=uid, **terms)
+
+    def toml(self) -> str:
+        """Return its entry in a file."""
+        given = {name: getattr(self, name) for name in self.__struct_fields__}
+        own = {name: value for name, value in given.items() if value not in (None, "")}
+        lists = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
+        return "\n[[curve]]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in lists.items())
+
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     version: int
     curve: tuple[Curve, ...] = ()
+
+
+def curves_to_toml(curves: Sequence[Curve], comment: str = "") -> str:
+    """Return the text of a file of curves, with a comment at its head."""
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    return f'{head}format = "{FORMAT}"\nversion = {VERSION}\n' + "".join(curve.toml() for curve in curves)
 
 
 def read_curves(path: str | Path) -> tuple[Curve, ...]:
@@ -110,6 +155,8 @@ class CurveTable:
         from_unit: unit of the values.
         minimum: (n,) float32, least result of each.
         maximum: (n,) float32, largest result of each.
+        remembers: whether results depend on values before.
+        warms: whether results depend on the temperature.
 
     Raises:
         ConfigurationError: a taxel without a curve, or curves of several units.
@@ -139,83 +186,69 @@ class CurveTable:
         self._slope = np.divide(rise, self._width, out=np.zeros_like(rise), where=self._width > 0)
         self.minimum: Floats = y[0]
         self.maximum: Floats = y[-1]
+        names = ("play", "lag", "creep_s", "creep", "temperature", "at_c")
+        of_curve = [[*(getattr(curve, name) for name in names), *(curve.error or (math.nan, 0.0))] for curve in own]
+        of_taxel = np.array(of_curve)[np.array(chosen, np.intp)].T
+        self._terms = of_taxel
+        self.remembers = bool(of_taxel[[1, 3]].any())
+        self.warms = bool(of_taxel[4].any())
+        self._memory = LoadMemory(len(uid))
+
+    def step(self, values: Floats, passed_s: float, temperature_c: float = math.nan) -> Floats:
+        """Return (n,) the results for the next (n,) values; 0 stays 0 where the past counts.
+
+        Args:
+            values: the values.
+            passed_s: since those before, s.
+            temperature_c: of the skin; NaN: not known.
+        """
+        found = self(values)
+        play, weight, creep_s, creep, warmth, at_c, *_ = self._terms
+        if self.remembers:
+            lag, slow = self._memory.step(values, passed_s, play, creep_s)
+            found += (weight * lag + creep * slow).astype(np.float32)
+        if self.warms and math.isfinite(temperature_c):
+            found += (warmth * values * (temperature_c - at_c)).astype(np.float32)
+        if self.remembers or self.warms:
+            found = np.where(values > 0, np.maximum(found, 0), np.float32(0))
+        return found
+
+    def error(self, values: Floats, results: Floats) -> Floats:
+        """Return (n,) standard deviations of (n,) results; NaN where not known, and beyond the knots."""
+        deviation = self._terms[6] + self._terms[7] * results
+        known: Floats = np.where(values <= self._x[-1], deviation, np.nan).astype(np.float32)
+        return known
 
     def __call__(self, values: Floats) -> Floats:
-        """Return (n,) the results for (n,) values; NaN stays NaN."""
+        """Return (n,) what the curves alone say of (n,) values; NaN stays NaN."""
         found = self.minimum.copy()
         for x, width, slope in zip(self._x, self._width, self._slope, strict=False):
             found += slope * np.clip(values - x, 0, width)
         return found
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A fitted curve.
-
-    Attributes:
-        x: knots, rising.
-        y: the mean of both branches there, never falling.
-        rising: the branch while the load grows; NaN without such pairs.
-        falling: the branch while the load falls; NaN without such pairs.
-        hysteresis: the largest distance of the branches, as a share of the range of ``y``; NaN without both.
-    """
-
-    x: npt.NDArray[np.float64]
-    y: npt.NDArray[np.float64]
-    rising: npt.NDArray[np.float64]
-    falling: npt.NDArray[np.float64]
-    hysteresis: float
-
-
-def fit_curve(values: npt.ArrayLike, reference: npt.ArrayLike, knots: int = MOST_KNOTS) -> Fit:
-    """Fit a monotone curve to values of a taxel and a reference, in the order of time.
-
-    Each branch is the monotone function nearest to its pairs (pool adjacent violators), cut into pieces whose knots
-    divide the values evenly by their number.
+class LoadMemory:
+    """Follows the past of n taxels, as far as their force depends on it.
 
     Args:
-        values: (m,) of the taxel.
-        reference: (m,) of the reference, in the wanted unit.
-        knots: most knots, 2 to 8.
-
-    Raises:
-        ConfigurationError: too few pairs, or values that do not vary.
+        n: number of taxels.
     """
-    pairs = np.stack([np.asarray(values, np.float64), np.asarray(reference, np.float64)])
-    shown, meant = pairs[:, np.isfinite(pairs).all(axis=0)]
-    if not 2 <= knots <= MOST_KNOTS:
-        raise ConfigurationError(f"{knots} knots: give 2 to {MOST_KNOTS}")
-    if len(shown) < knots or np.ptp(shown) == 0:
-        raise ConfigurationError(f"{len(shown)} pairs: give at least {knots}, whose values vary")
-    x = np.unique(np.quantile(shown, np.linspace(0, 1, knots)))
-    rises = np.gradient(meant) >= 0
-    rising, falling = (_branch(shown[part], meant[part], x) for part in (rises, ~rises))
-    y = np.maximum.accumulate(
-        np.where(np.isnan(falling), rising, np.where(np.isnan(rising), falling, (rising + falling) / 2))
-    )
-    span = float(y[-1] - y[0])
-    apart = float(np.abs(rising - falling).max())
-    return Fit(x, y, rising, falling, apart / span if span > 0 else math.nan)
+
+    def __init__(self, n: int) -> None:
+        self._follows, self._slow = np.zeros(n), np.zeros(n)
+
+    def step(
+        self, values: npt.NDArray[Any], passed_s: float, play: npt.ArrayLike, creep_s: npt.ArrayLike
+    ) -> npt.NDArray[np.float64]:
+        """Take the next (n,) values in; return (2, n): how far what follows with play is off, and the slow values."""
+        self._follows = np.where(values > 0, np.clip(self._follows, values - play, values + play), 0)
+        self._slow += (values - self._slow) * -np.expm1(-passed_s / np.asarray(creep_s))
+        return np.array([self._follows - values, self._slow])
 
 
-def _branch(
-    values: npt.NDArray[np.float64], reference: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    if len(values) < 2:
-        return np.full(len(x), np.nan)
-    order = np.argsort(values, kind="stable")
-    return np.interp(x, values[order], monotone(reference[order]))
-
-
-def monotone(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return (m,) the sequence that never falls and is nearest to (m,) values, in the sum of squares."""
-    means: list[float] = []
-    counts: list[int] = []
-    for value in values.tolist():
-        mean, count = value, 1
-        while means and means[-1] > mean:
-            before, pooled = means.pop(), counts.pop()
-            mean, count = (before * pooled + mean * count) / (pooled + count), pooled + count
-        means.append(mean)
-        counts.append(count)
-    return np.repeat(np.array(means), counts)
+def temperature_of(frame: DriverSnapshot) -> float:
+    """Return the mean of the temperatures that a driver measures, degrees Celsius; NaN: none."""
+    if TEMPERATURE not in [sensor_type.name for sensor_type in frame.structure.types]:
+        return math.nan
+    usable = (frame.status_of(TEMPERATURE) & UNUSABLE) == 0
+    return float(np.mean(frame.physical(TEMPERATURE)[usable])) if usable.any() else math.nan

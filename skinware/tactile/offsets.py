@@ -179,24 +179,26 @@ class Offsets:
         deviation: Floats = np.sqrt(self.variance + self.gain * self.gain * common)
         return deviation
 
-    def follow_common(self, deviation: Floats, free: Flags, passed_s: float) -> None:
+    def follow_common(self, deviation: Floats, free: Flags, hidden2: Floats, passed_s: float) -> None:
         """Move the offsets by the common mode, and take that off the deviations.
 
         Args:
             deviation: (n,) of the values from the offsets, changed in place; 0 where unknown.
             free: (n,) which taxels are at rest.
+            hidden2: (n,) square of the load that each may bear without being touched.
             passed_s: since the last frame.
         """
         if passed_s <= 0:
             return
         total = self.total()
-        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance), np.float32(0))
+        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance + hidden2), np.float32(0))
         limit = np.float32(2) * np.sqrt(total)
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)
-        reach = self.patches.sum(weight * self.gain)
-        precision = reach * reach / np.maximum(self.patches.sum(weight), 1e-30)
-        found = self.patches.sum(clipped * weight) / np.maximum(reach, 1e-30)
+        weights = np.maximum(self.patches.sum(weight), 1e-30)
+        reach = np.maximum(self.patches.sum(weight * self.gain), LEAST_GAIN * weights)
+        precision = reach * reach / weights
+        found = self.patches.sum(clipped * weight) / reach
         move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
         moved = self.patches.spread(move)
         change = self.gain * moved
@@ -237,9 +239,10 @@ class Offsets:
         keep = np.float32(1) - share
         self.cross *= keep
         self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
-        self.slow += (innovation - self.slow) * (np.float32(slowly) * taxels)
         quick = innovation - self.slow
-        self.noise2 += (quick * quick - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
+        self.slow += quick * (np.float32(slowly) * taxels)
+        quick2 = quick * (innovation - self.slow)
+        self.noise2 += (quick2 - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, passed_s)
@@ -269,8 +272,8 @@ class Offsets:
     def begin(self, taxels: Rows, level: Floats, noise2: Floats, gain: Floats, gain_variance: Floats) -> None:
         """Give k taxels what was measured of them: levels, noise and gains (k,)."""
         self.level[taxels], self.noise2[taxels] = level, noise2
-        self.gain[taxels], self.gain_variance[taxels] = gain, gain_variance
-        self._gain_before[taxels] = gain
+        self.gain[taxels] = self._gain_before[taxels] = np.clip(gain, LEAST_GAIN, MOST_GAIN)
+        self.gain_variance[taxels] = gain_variance
         self.variance[taxels], self.cross[taxels], self.slow[taxels] = noise2 / 20, 0, 0
 
     def lose_common(self) -> None:

@@ -55,8 +55,8 @@ FORGET_AFTER_S = 600.0
 
 GAIN_SPREAD = 0.3
 """Standard deviation of the gains of taxels to the common mode, around 1, before anything is known."""
-GAIN_LASTS_S = 36000.0
-"""Seconds in which a known gain becomes as uncertain as that: gains change as skins age and warm up."""
+GAIN_LASTS_S = 604800.0
+"""Seconds, a week, in which a known gain becomes as uncertain as that: gains change as skins age."""
 LEAST_GAIN, MOST_GAIN = 0.1, 3.0
 """Outside of them something else moves the taxel."""
 FEW_TAXELS = 3.0

@@ -26,6 +26,7 @@ class Surroundings:
         module, patch: as given.
         n_modules: number of modules.
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
+        held: (n,) bool, the taxels that are near a contact, or were in the last ``settle_s``.
         largest: (n_patches,) the largest load of each patch.
     """
 
@@ -34,15 +35,15 @@ class Surroundings:
         self.n_modules = int(module.max(initial=-1)) + 1
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
         self.busy: Flags = np.zeros(len(module), bool)
+        self.held: Flags = np.zeros(len(module), bool)
         self._since_s = np.full(len(self.largest), np.inf)
         self._settling_s: Floats = np.zeros(len(module), np.float32)
-        self._n_held = 0
 
-    def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> Flags:
-        """Return (n,) the taxels that are near a contact, or were in the last ``settle_s``."""
+    def hold(self, touches: Touches, live: Flags, passed_s: float, settle_s: float) -> None:
+        """Find the taxels that are near a contact."""
         active = np.flatnonzero(touches.touched & live)
-        if not len(active) and not self._n_held:
-            return np.zeros(len(live), bool)
+        if not len(active) and not (self.busy.any() or self.held.any()):
+            return
         np.maximum(self._settling_s - np.float32(passed_s), 0, out=self._settling_s)
         self._since_s += passed_s
         over = self._since_s > max(settle_s, 1e-9)
@@ -53,9 +54,7 @@ class Surroundings:
             np.maximum.at(self.largest, patch, touches.smooth[active])
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
         self.busy = (self._since_s <= settle_s)[self.patch]
-        held: Flags = self._settling_s > 0
-        self._n_held = int(np.count_nonzero(self.busy)) + int(np.count_nonzero(held))
-        return held
+        self.held = self._settling_s > 0
 
     def _near(self, active: Rows) -> Flags:
         if self._neighbours is None:
@@ -99,20 +98,23 @@ class Falls:
         """How far each fell when it got its newest offset, for a while."""
         self._dip_s: Floats = np.zeros(n, np.float32)
         self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
+        self._down_s: Floats = np.zeros(n, np.float32)
+        """How long each has been below."""
         self._before: Flags = np.zeros(n, bool)
         """Which were below before anything touched their patch."""
         self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
-    def sag(self, smooth: Floats, off: Floats, rests: Flags, patches: Grouping) -> None:
-        """Find the taxels at rest that are below their offsets, unless most of their patch is: that is common."""
-        below = rests & (smooth < np.where(self.below, np.float32(0), np.float32(-0.5) * off))
+    def sag(self, smooth: Floats, rustle: Floats, rests: Flags, patches: Grouping, passed_s: float) -> None:
+        """Find the taxels at rest that are below their offsets by more than noise, unless most of their patch is."""
+        below = rests & (smooth < np.where(self.below, np.float32(0), -rustle))
         if below.any():
             common = patches.sum(below) > 0.5 * patches.sum(rests)
             if common.any():
                 below &= ~common[self._around.patch]
         self.below = below
-        self._before = np.where(self._around.busy, self._before, below)
+        self._down_s = np.where(below, self._down_s + np.float32(passed_s), np.float32(0))
+        self._before = np.where(self._around.busy, self._before, self._down_s > SAG_RETURNS_S)
         if self._around.busy.any():
             self._before &= below | ~self._around.busy
             self.sagging = below & self._around.busy & ~self._before

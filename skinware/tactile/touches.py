@@ -41,6 +41,7 @@ class Touches:
         smooth: (n,) float32, deviation from the offset, smoothed.
         peak: (n,) float32, the highest load of the touch, slowly followed.
         contact_s: (n,) float32, how long each has been touched.
+        noise_share: share of the noise that smoothing leaves; at least a half.
         remainders: what covers keep of loads.
     """
 
@@ -51,15 +52,19 @@ class Touches:
         self._high: Flags = np.zeros(n, bool)
         self.smooth, self.peak, self.contact_s = (np.zeros(n, np.float32) for _ in range(3))
         self._modules, self._patch = Grouping(module), patch
+        self.noise_share = 0.5
         self.remainders = Remainders(self._modules, patch)
 
     def load(self, deviation: Floats) -> Floats:
         return np.abs(deviation) if self.signed else deviation
 
     def follow(self, deviation: Floats, live: Flags, on: Floats, passed_s: float, smooth_s: float) -> None:
-        """Smooth the deviations (n,)."""
-        share = np.float32(-math.expm1(-passed_s / smooth_s)) if smooth_s else np.float32(1)
-        self.smooth += (deviation - self.smooth) * (share * live)
+        """Smooth the deviations (n,); a rise above ``on`` begins at 0, however far the taxel had sunk before."""
+        if not self.signed:
+            np.maximum(self.smooth, 0, out=self.smooth, where=live & (deviation > on))
+        share = -math.expm1(-passed_s / smooth_s) if smooth_s else 1.0
+        self.noise_share = max(0.5, math.sqrt(share / (2 - share)))
+        self.smooth += (deviation - self.smooth) * (np.float32(share) * live)
         if not self.signed:
             np.minimum(self.smooth, deviation + on, out=self.smooth, where=live)
 

@@ -46,7 +46,7 @@ class Declined(SkinwareError):
     help="Name or file of the driver, if none runs on the bus.  [default: roboskin]",
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")
+@click.option("--config", metavar="FILE", type=cli.FILE, help="TOML file of that driver.")
 @click.option("-T", "timeout_s", type=cli.seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @click.option("--force", is_flag=True, help="Make changes even if something is sending on the bus.")

@@ -93,7 +93,7 @@ def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
     "skin-doctor --report report.md    a text to attach to an issue",
     "skin-doctor --json | jq '.findings[] | {severity, what, where}'",
 )
-@click.argument("file", type=click.Path(path_type=Path), required=False)
+@click.argument("file", type=cli.FILE, required=False)
 @click.option("--seconds", "watch_s", type=cli.seconds, default="3", show_default=True, help="Look for SECONDS.")
 @click.option(
     "--report",

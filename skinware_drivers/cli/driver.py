@@ -22,15 +22,12 @@ from skinware.text import plural
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
 if TYPE_CHECKING:
-    from skinware_drivers.cli.capturing import Capture
-    from skinware_drivers.running.news import PatchChange
-    from skinware_drivers.running.runner import Runner
-
-if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
 
     import msgspec
 
+    from skinware_drivers.cli.capturing import Capture
+    from skinware_drivers.running.news import PatchChange
     from skinware_drivers.running.runner import Runner
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -107,7 +104,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option(
     "--config",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="TOML file with any of these options, also for each bus.",
 )
 @click.option("--listen-only", is_flag=True, help="Send nothing; learn from the frames which devices there are.")
@@ -133,7 +130,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "--geometry",
     "geometry_file",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="TOML file with the positions of the sensors, which the driver publishes.",
 )
 @cli.group_option
@@ -142,7 +139,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option(
     "--capture",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="Record all frames on the buses, and the decoded values, into a new file, such as for a bug report.",
 )
 @click.option(

@@ -58,7 +58,7 @@ class EmulateCommand(HardwareCommand):
     "--geometry",
     "geometry_path",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="Write the places of the emulated sensors to FILE, for skin-driver --geometry FILE.",
 )
 @click.option(
@@ -66,7 +66,7 @@ class EmulateCommand(HardwareCommand):
 )
 @cli.namespace_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
-@click.option("-T", "duration_s", type=cli.seconds, metavar="SECONDS", help="End after SECONDS.")
+@cli.duration_option()
 def command(
     bus_name: str,
     driver: str,
@@ -86,7 +86,7 @@ def command(
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, PressingService, SignalWatch
+    from skinware_drivers.cli.emulation import Emulation, PressingService, SignalWatch, report_to
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus
@@ -108,7 +108,6 @@ def command(
         raise ConfigurationError(
             f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"
         )
-    report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)
     with contextlib.ExitStack() as open_things:
         log = open_things.enter_context(contextlib.closing(JsonLinesLog(log_path))) if log_path else None
         hardware = emulator(options, log=log)
@@ -119,7 +118,7 @@ def command(
         if name is not None:
             service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
             companion = open_things.enter_context(contextlib.closing(service))
-        emulation = Emulation(bus, hardware, report, companion=companion)
+        emulation = Emulation(bus, hardware, report_to(sys.stdout, as_json=as_json), companion=companion)
         signals = open_things.enter_context(SignalWatch())
         emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
 

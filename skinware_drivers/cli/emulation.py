@@ -8,7 +8,7 @@ import signal
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any, Protocol, Self, TextIO
 
@@ -20,7 +20,6 @@ from skinware.errors import BusNotAvailable, BusSendError
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
-from skinware.realtime import now_ns as clock_ns
 from skinware.service import ServiceWriter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware, Pressing, WireFrame
@@ -36,40 +35,28 @@ _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 """Pauses between attempts to open a bus that went down."""
 
 
-class EventSink(Protocol):
-    """Receives the events of an emulation."""
-
-    def event(self, name: str, **facts: Any) -> None:
-        """Receive an event: ready, status, bus_down, bus_up, stopped."""
+Report = Callable[..., None]
+"""Receives the events of an emulation: ready, status, bus_down, bus_up, stopped; with facts as keywords."""
 
 
-class JsonReport:
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+def report_to(stream: TextIO, *, as_json: bool) -> Report:
+    """Return a function that prints events: all of them for programs, without ``status`` for people."""
 
-    def event(self, name: str, **facts: Any) -> None:
-        self._stream.write(json_text({"event": name, **facts}) + "\n")
-        self._stream.flush()
+    def report(name: str, **facts: Any) -> None:
+        if as_json or name != "status":
+            stream.write((json_text({"event": name, **facts}) if as_json else shown(_in_words(name, facts))) + "\n")
+            stream.flush()
+
+    return report
 
 
-class HumanReport:
-    """Print lines for people, without the status of each second."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def event(self, name: str, **facts: Any) -> None:
-        if name == "status":
-            return
-        if name == "ready":
-            note = f" ({facts['note']})" if facts.get("note") else ""
-            text = f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
-        elif name == "stopped":
-            text = "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
-        else:
-            text = f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
-        self._stream.write(shown(text) + "\n")
-        self._stream.flush()
+def _in_words(name: str, facts: Mapping[str, Any]) -> str:
+    if name == "ready":
+        note = f" ({facts['note']})" if facts.get("note") else ""
+        return f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
+    if name == "stopped":
+        return "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
+    return f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
 
 
 class SignalWatch:
@@ -139,7 +126,7 @@ class Emulation:
         self,
         bus: Bus,
         hardware: EmulatedHardware,
-        report: EventSink,
+        report: Report,
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,
@@ -174,7 +161,7 @@ class Emulation:
         start_ns = self._clock()
         self._hardware.skip(start_ns)
         facts = {"driver": driver, "bus": bus_name, "note": self._bus.note, "options": msgspec.to_builtins(options)}
-        self._report.event("ready", **facts)
+        self._report("ready", **facts)
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
         status_ns = start_ns + _STATUS_NS
         try:
@@ -183,7 +170,7 @@ class Emulation:
                 if end_ns is not None and now_ns >= end_ns:
                     break
                 if now_ns >= status_ns:
-                    self._report.event("status", **self._totals())
+                    self._report("status", **self._totals())
                     status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
                 next_ns = self._step(now_ns)
                 companion_ns = None if self._companion is None else self._companion.step(now_ns)
@@ -191,7 +178,7 @@ class Emulation:
                 self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
-        self._report.event("stopped", **self._totals())
+        self._report("stopped", **self._totals())
 
     def _step(self, now_ns: int) -> int | None:
         """Do the work that is due, and return the time of the next."""
@@ -206,7 +193,7 @@ class Emulation:
             self.send_failures += len(self._outbox)
             self._outbox.clear()
             self._backoff_ns = _FIRST_BACKOFF_NS
-            self._report.event("bus_down", reason=str(error))
+            self._report("bus_down", reason=str(error))
             return now_ns + self._backoff_ns
 
     def _reopen(self, now_ns: int) -> int | None:
@@ -217,7 +204,7 @@ class Emulation:
             return now_ns + self._backoff_ns
         self._open = True
         self._hardware.skip(now_ns)
-        self._report.event("bus_up")
+        self._report("bus_up")
         return now_ns
 
     def _receive(self, now_ns: int) -> None:
@@ -300,7 +287,7 @@ class PressingService:
         """Publish and answer what is due, and return the next time of publishing, CLOCK_MONOTONIC ns."""
         waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
-            self._publish(clock_ns())  # later than the requests
+            self._publish(time.monotonic_ns())  # later than the requests
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ
         for request in waiting:
             request.reply(position=self._writer.position)
@@ -315,7 +302,7 @@ class PressingService:
             ValueError: the numbers make no sense, or no part of the skin would feel it.
         """
         pressing = Pressing.of(at_m, force_n, radius_m, seconds)
-        return {self._bus_name: self._hardware.press(pressing, clock_ns())}
+        return {self._bus_name: self._hardware.press(pressing, time.monotonic_ns())}
 
     def close(self) -> None:
         self._writer.close()

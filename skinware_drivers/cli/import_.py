@@ -42,7 +42,7 @@ def command() -> None:
     ),
 )
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path, exists=True))
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write files here.")
+@click.option("-o", "--output", metavar="DIR", type=cli.FILE, help="Write files here.")
 @click.option("-f", "--force", is_flag=True, help="Overwrite existing files.")
 @click.option(
     "--part", "only", multiple=True, metavar="NAME", help="Only the skin device with this name; repeat it for several."

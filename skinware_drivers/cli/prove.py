@@ -60,13 +60,13 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "--output",
     "stem",
     metavar="STEM",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="Write STEM.md, STEM.json and STEM.mcap.  [default: prove-DRIVER-DATE-TIME]",
 )
 @click.option(
     "--captured",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=cli.FILE,
     help="No device: decode a capture (skin-driver --capture FILE) again, and compare with the recorded values.",
 )
 @click.option(

@@ -16,6 +16,7 @@ from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
+from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.flow import FlowLoop
@@ -164,9 +165,8 @@ class _Control:
     def fileno(self) -> int:
         return self._event
 
-    def event(self, name: str, **facts: Any) -> None:
-        del facts
-        if name == "ready":
+    def note(self, event: str, **_facts: Any) -> None:
+        if event == "ready":
             self.ready.set()
 
     def stop(self) -> None:
@@ -184,9 +184,8 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     Args:
         emulator: class or registered name of an emulator of serial devices.
     """
-    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = PtyBus("", payload_size=_LONGEST_WRITE)
-    with emulated_on(bus, factory, **options):
+    with emulated_on(bus, emulator, **options):
         yield bus.note.removeprefix("serial port ")
 
 
@@ -197,9 +196,8 @@ def emulated_over_tcp(emulator: Any, **options: Any) -> Iterator[str]:
     Args:
         emulator: class or registered name of an emulator of serial or Modbus devices.
     """
-    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = TcpServerBus("127.0.0.1:0", payload_size=_LONGEST_WRITE)
-    with emulated_on(bus, factory, **options):
+    with emulated_on(bus, emulator, **options):
         yield bus.note.removeprefix("listens on ")
 
 
@@ -209,13 +207,27 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
 
     Args:
         bus: not opened yet.
+        emulator: class or registered name of an emulator.
     """
-    given = msgspec.convert(options, emulator.Options, strict=False)
-    hardware, control = emulator(given), _Control()
+    if isinstance(emulator, str):
+        emulator = load_emulator(emulator)
+    with carried_on(bus, emulator(msgspec.convert(options, emulator.Options, strict=False))):
+        yield
+
+
+@contextmanager
+def carried_on(bus: Bus, hardware: EmulatedHardware) -> Iterator[None]:
+    """Carry the frames of emulated devices over a bus while the block runs.
+
+    Args:
+        bus: not opened yet.
+    """
+    control = _Control()
 
     def run() -> None:
         try:
-            Emulation(bus, hardware, control).run(control, bus_name=bus.name, driver=str(emulator), options=given)
+            emulation = Emulation(bus, hardware, control.note)
+            emulation.run(control, bus_name=bus.name, driver=type(hardware).__name__, options=NoOptions())
         except BaseException as error:  # noqa: BLE001  (raised in the test)
             control.failure = error
             control.ready.set()

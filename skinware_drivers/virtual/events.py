@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -82,17 +82,6 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     ready_ns: int = -1
     code: int = -1
     boards: Sequence[int] = ()
-
-
-def spoilt_bursts(events: Iterable[Event]) -> set[tuple[int, int]]:
-    """Return (board, cycle) of the bursts of which a host cannot have received every frame intact."""
-    spoilt = {"lost", "truncated", "corrupted", "unsent"}
-    return {(e.board, e.cycle) for e in events if e.fault in spoilt}
-
-
-def damaged_cycles(events: Iterable[Event]) -> set[tuple[int, int, int]]:
-    """Return (board, triangle, cycle) of the triangles of which a host cannot have received both halves intact."""
-    return {(e.board, e.triangle, e.cycle) for e in events if e.half is not None and e.fault != "repeated"}
 
 
 class JsonLinesLog:

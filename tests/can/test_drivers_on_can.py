@@ -56,7 +56,7 @@ class Events:
 def emulating(driver: str, bus: str, **options: Any) -> Iterator[Events]:
     emulator = load_emulator(driver)
     chosen = emulator.Options(**options)
-    emulation, stop, events = Emulation(make_bus(bus), emulator(chosen), report := Events()), Stop(), report
+    emulation, stop, events = Emulation(make_bus(bus), emulator(chosen), (report := Events()).event), Stop(), report
     keywords = {"bus_name": bus, "driver": driver, "options": chosen}
     thread = threading.Thread(target=emulation.run, args=(stop,), kwargs=keywords, daemon=True)
     thread.start()

@@ -202,7 +202,7 @@ def fingertip_trial() -> tuple[list[list[int]], str]:
 def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any) -> None:
     """Fingertips of board 1 send the slices, one per cycle; the first one until somebody reads, at the end the last."""
     from skinware_drivers.can.socketcan import SocketCanBus
-    from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
+    from skinware_drivers.cli.emulation import Emulation, SignalWatch
     from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
     from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
@@ -218,9 +218,9 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
     options = EmulatedRoboskinOptions(boards=(1,))
     hardware = EmulatedRoboskin(options, source=source)
     bus = SocketCanBus(bus_name)
-    with open(os.devnull, "w") as nowhere, SignalWatch() as stop:
+    with SignalWatch() as stop:
         ready.set()
-        Emulation(bus, hardware, JsonReport(nowhere)).run(stop, bus_name=bus_name, driver="roboskin", options=options)
+        Emulation(bus, hardware, lambda *_, **__: None).run(stop, bus_name=bus_name, driver="roboskin", options=options)
 
 
 def without_repetitions(values: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:

@@ -18,8 +18,9 @@ from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command
 from skinware.geometry import Geometry, geometry_to_toml, read_geometry
 from skinware.sensor_types import PRESSURE
-from skinware.tactile.calibration.state import PressSession, StrokeSession, save_session
+from skinware.tactile.calibration.state import ForceSession, PressSession, StrokeSession, save_session
 from skinware.tactile.calibration.topology import StrokeSums
+from skinware.tactile.curves import read_curves
 from skinware.tactile.testing import Surface, triangles
 from skinware.tactile.testing.probe import Probe
 from skinware_drivers.testing.waiting import wait_until
@@ -64,7 +65,7 @@ def calm_skin(surface: Surface) -> FakeSkin:
     return skin
 
 
-def gathered(file: Path, session: PressSession | StrokeSession, structure: Structure) -> None:
+def gathered(file: Path, session: PressSession | StrokeSession | ForceSession, structure: Structure) -> None:
     """Write a state file, as an interrupted command leaves it."""
     save_session(file.with_name(f"{file.name}.state.npz"), session, "pressure", structure.sensor_uid)
 
@@ -278,3 +279,24 @@ def test_what_cannot_be_done_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
             refused(touch, 2, "has poses of a skin, not points")
         refused(["check", str(tmp_path / "none.toml")], 2, "No such file")
         refused(["topology", "-o", str(file), "--share", "2"], 2, "0<=x<=1")
+
+
+def test_forces_from_gathered_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, surface = tmp_path / "curves.toml", triangles(1)
+    with publishing(calm_skin(surface)) as skin:
+        session = ForceSession(len(surface))
+        for number in range(2400):
+            force_n = max(0.0, 3 * np.sin(number / 20) * (1 + number % 3))
+            load = np.zeros(len(surface))
+            load[number // 126 % 4] = round(40 * force_n)
+            session.take(number * 50_000_000, load, np.array([force_n, np.nan]))
+        gathered(file, session, skin.structure)
+        assert exit_status(command, ["force", "-o", str(file)]) == 2
+        capsys.readouterr()
+        assert exit_status(command, ["force", "-o", str(file), "-T", "0", "--json"]) == 0
+        *_, done = lines(capsys.readouterr().out)
+    assert (done["event"], done["curves"], done["doubts"]) == ("done", 4, [])
+    assert done["residual_n"] < 0.05
+    general, *own = read_curves(file)
+    assert (general.unit, general.uid, len(own)) == ("N", None, 4)
+    assert np.interp(40, general.x, general.y) == pytest.approx(1, rel=0.1)

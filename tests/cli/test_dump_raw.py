@@ -48,8 +48,7 @@ def test_python_can_reads_all_kinds_of_frames_back(tmp_path: Path) -> None:
         (0x123, bytes(range(64)), 0x01),
         (EXTENDED_FLAG | 0x1FFFFFFF, b"\xff", 0x04 | 0x03),
     ]
-    batch = batch_of(*frames)
-    found = frames_of(batch, 1_700_000_000_123_456_789)
+    found = frames_of(batch_of(*frames), 1_700_000_000_123_456_789)
     lines = [candump_line(at_us, "vcan0", who, flags, data) for at_us, who, flags, data in found]
     assert lines[0] == "(1700000000.123456) vcan0 473#40F0F0F0F0F0F0F0"
     assert lines[2:4] == [

@@ -31,7 +31,7 @@ from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
 from skinware_drivers.cli.doctor import command as doctor
 from skinware_drivers.cli.dump import command as dump
-from skinware_drivers.cli.emulation import Emulation, JsonReport
+from skinware_drivers.cli.emulation import Emulation, report_to
 from skinware_drivers.cli.find import command as find
 from skinware_drivers.cli.import_ import command as import_
 from skinware_drivers.cli.replay import command as replay
@@ -472,7 +472,8 @@ def test_an_emulation() -> None:
     bus = HostBus()
     stop = _Stop(bus)
     options = EmulatedRoboskinOptions(boards=(7,), streaming=True)
-    emulation = Emulation(bus, EmulatedRoboskin(options), JsonReport(out), clock=lambda: bus.time_ns, poll=stop.wait)
+    report = report_to(out, as_json=True)
+    emulation = Emulation(bus, EmulatedRoboskin(options), report, clock=lambda: bus.time_ns, poll=stop.wait)
     emulation.run(stop, bus_name="host", driver="roboskin", options=options)
     printed = [json.loads(line) for line in out.getvalue().splitlines()]
     assert {one["event"] for one in printed} == {"ready", "status", "bus_down", "bus_up", "stopped"}

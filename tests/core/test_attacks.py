@@ -226,6 +226,8 @@ def fakes() -> int:
     return len(list(living_readers(place)))
 
 
+@pytest.mark.alone
+@pytest.mark.thorough
 @pytest.mark.parametrize("attack", [flood, wake_ups])
 def test_an_attacker_in_the_group_stops_nobody(users: Users, attack: Callable[[Path], int]) -> None:
     _, frames, answers = reads_on(users, attack, users.board.path)
@@ -234,6 +236,7 @@ def test_an_attacker_in_the_group_stops_nobody(users: Users, attack: Callable[[P
     assert users.board.rows[2, STALE] == 0
 
 
+@pytest.mark.alone
 @pytest.mark.thorough
 def test_garbage_on_the_socket_stops_nobody(users: Users, request: pytest.FixtureRequest) -> None:
     sent, _, answers = reads_on(users, garbage, users.board.path, seeded(request).getrandbits(32))

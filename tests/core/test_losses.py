@@ -7,6 +7,7 @@ import pytest
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, StructureChanged
 from skinware.service import Writer
+from skinware.service._reader import Tap
 from tests.core.services import publish
 from tests.core.workers import seeded
 
@@ -103,6 +104,34 @@ def overwritten_while_viewed(reader: ServiceReader[Sample], writer: ServiceWrite
         for _ in range(3):
             publish(writer, 2)
         assert not frame.valid
+
+
+@pytest.mark.parametrize(("with_first", "first"), [(True, 1), (False, 3)])
+def test_samples_in_order_begin_with_the_first_or_the_newest(with_first: bool, first: int) -> None:
+    with ServiceWriter("x", COLUMNS) as writer, Tap[Sample]("x") as reader:
+        for _ in range(3):
+            publish(writer, 0)
+        reader.begin_in_order(with_first=with_first)
+        taken = reader.next_in_order()
+        assert taken is not None
+        assert (taken.sequence, reader.missed) == (first, 0)
+
+
+def test_a_view_counts_also_where_its_sample_was_read_before() -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
+        publish(writer, 1)
+        reader.read()
+        with reader.view():
+            pass
+        assert (reader.statistics.frames, reader.missed) == (2, 0)
+
+
+def test_statistics_have_what_was_read_so_far() -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
+        for number in range(1, 6):
+            publish(writer, 0)
+            reader.read()
+            assert reader.statistics.frames == number
 
 
 def test_a_view_that_became_invalid_was_not_taken() -> None:

@@ -45,12 +45,12 @@ def test_other_sensors_begin_anew() -> None:
             pass
         window.add(skin.read())
         assert window.physical.tolist() == [[253.0] * 20]
-        assert repr(window) == "<Window of pressure: 1 of 3 frames>"
+        assert repr(window) == "<Window of pressure: 1 of 3 samples>"
         kept = window.physical
         window.add(skin.read())
         kept[:] = 0  # a copy
         assert window.physical.tolist() == [[253.0] * 20] * 2
         with pytest.raises(StructureError, match="no sensor type 'heat'"):
             Window("heat", 1).add(skin.read())
-    with pytest.raises(ConfigurationError, match="a window of 0 frames"):
+    with pytest.raises(ConfigurationError, match="a window of 0 samples"):
         Window("pressure", 0)

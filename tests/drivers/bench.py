@@ -71,11 +71,6 @@ class Case:
         """Of each device."""
         return len(self.emulator(self.emulator.Options(**self.emulated)).places())
 
-    @property
-    def n_shown(self) -> int:
-        """Sensors of each patch."""
-        return len(self.shown([0] * self.n_values))
-
     def adapter(self) -> AnyAdapter:
         return self.driver(self.driver.Options(**self.options))
 
@@ -169,17 +164,6 @@ class Bench:
             if poll:
                 self._poll()
             self._take(lambda batch: self.bus.receive(batch, 0))
-            await asyncio.sleep(0)
-
-    async def inject(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Have frames arrive, whoever may have sent them."""
-
-        def fill(batch: FrameBatch) -> None:
-            for frame in frames:
-                batch.append(0, self.now_ns, *frame)
-
-        self._take(fill)
-        for _ in range(len(frames)):
             await asyncio.sleep(0)
 
     async def stop(self) -> None:

@@ -142,7 +142,7 @@ class _Life:
         self.stopped = False
         self._woken, self._wake = socket.socketpair()
         self._error: SkinwareError | None = None
-        emulation = Emulation(make_bus(bus, payload_size=payload_size, for_devices=True), hardware, self)
+        emulation = Emulation(make_bus(bus, payload_size=payload_size, for_devices=True), hardware, self.event)
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(emulation, bus))
         self._thread.start()

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 import struct
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +12,9 @@ from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware.realtime import now_ns
 from skinware_drivers.cli.emulate import command
-from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
+from skinware_drivers.testing.driving import carried_on
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
 from tests.openpatch import wire
@@ -109,62 +105,13 @@ def test_what_was_never_stuffed_is_nothing() -> None:
     assert unstuff(b"\x05abc") == b""
 
 
-class Stop:
-    """Ends an emulation in another thread."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-        self._reader, self._writer = socket.socketpair()
-
-    def fileno(self) -> int:
-        return self._reader.fileno()
-
-    def stop(self) -> None:
-        self.stopped = True
-        self._writer.send(b"x")
-
-    def close(self) -> None:
-        self._reader.close()
-        self._writer.close()
-
-
-class Silent:
-    def event(self, name: str, **facts: Any) -> None:
-        pass
-
-
-@contextmanager
-def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
-    bus, stop = PtyBus(str(link), payload_size=4096), Stop()
-    ready = threading.Event()
-
-    class Ready(Silent):
-        def event(self, name: str, **facts: Any) -> None:
-            ready.set()
-
-    emulation = Emulation(bus, patch, Ready())
-
-    def run() -> None:
-        emulation.run(stop, bus_name="pty", driver="openpatch", options=patch.options)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        assert ready.wait(30)
-        yield
-    finally:
-        stop.stop()
-        thread.join(30)
-        stop.close()
-
-
 def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     link = tmp_path / "port"
     devices = restarted_on_demand(EmulatedOpenPatch)
     options = EmulatedOpenPatchOptions(modules=2, serial_number="A", pattern="cycle", boot_s=0.1)
-    with running(devices(options), link):
+    with carried_on(PtyBus(str(link), payload_size=4096), devices(options)):
         driver = OpenPatchDriver(OpenPatchOptions(rate_hz=50))
         bus = SerialBus(str(link), payload_size=driver.payload_size)
         with driving_lines([(driver, bus)], "openpatch"), DriverReader("openpatch", timeout_s=30) as reader:

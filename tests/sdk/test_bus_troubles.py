@@ -14,7 +14,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
 from skinware_drivers.running import bus_line
-from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.testing.waiting import PATIENCE_S, wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
@@ -114,7 +114,8 @@ def test_a_bus_that_goes_down_while_boards_are_set_up(caplog: pytest.LogCaptureF
 # Frames that cannot be sent
 
 
-def test_a_full_queue_is_waited_for() -> None:
+def test_a_full_queue_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Link.send, "__kwdefaults__", {"timeout_s": PATIENCE_S})
     log: list[Event] = []
     bus = troubled(log, boards=(7,))
     tries: list[bytes] = []

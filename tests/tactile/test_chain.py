@@ -16,7 +16,7 @@ from skinware import DriverReader, Status, Structure
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE, PROXIMITY, TEMPERATURE, SensorType
 from skinware.tactile.chain import ChainSettings
-from skinware.tactile.curves import MOST_KNOTS, Curve, CurveTable, fit_curve, monotone, read_curves
+from skinware.tactile.curves import MOST_KNOTS, Curve, CurveTable, read_curves
 from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
@@ -132,32 +132,6 @@ def test_curves_are_what_interpolation_says(data: st.DataObject) -> None:
     values = data.draw(hnp.arrays(np.float32, 5, elements=st.floats(-2000, 2000, width=32)))
     table = CurveTable([curve], "pressure", np.arange(5, dtype=np.uint64))
     assert table(values) == pytest.approx(np.interp(values, x, y), rel=1e-4, abs=0.5)
-
-
-@given(hnp.arrays(np.float64, st.integers(1, 30), elements=st.integers(-50, 50).map(float)))
-def test_the_nearest_monotone_sequence(values: npt.NDArray[np.float64]) -> None:
-    found = monotone(values)
-    assert (np.diff(found) >= -1e-9).all()
-    assert found.sum() == pytest.approx(values.sum(), abs=1e-6)
-    up = np.linspace(0, 1, len(values))
-    for step in (np.ones_like(values), -np.ones_like(values), up, found, -found):  # none of which makes it fall
-        other = found + 1e-3 * step
-        assert ((other - values) ** 2).sum() >= ((found - values) ** 2).sum() - 1e-9
-
-
-def test_a_fit_finds_the_curve_and_its_hysteresis() -> None:
-    load = np.concatenate([np.linspace(0, 100, 300), np.linspace(100, 0, 300)])
-    falls = np.arange(600) >= 300
-    shown = 3 * load + 20 * np.sin(np.pi * load / 100) * falls  # reads more while the load goes
-    fit = fit_curve(shown, load)
-    assert len(fit.x) <= MOST_KNOTS
-    assert (np.diff(fit.y) >= 0).all()
-    assert np.abs(fit.rising - fit.x / 3).max() < 1
-    assert 0.04 < fit.hysteresis < 0.08
-    assert np.isnan(fit_curve(np.arange(20.0), np.arange(20.0)).hysteresis), "only one branch"
-    for values in ([1, 2], [5] * 20):
-        with pytest.raises(ConfigurationError, match="give at least"):
-            fit_curve(values, np.arange(len(values)))
 
 
 @pytest.mark.parametrize(

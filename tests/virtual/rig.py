@@ -19,6 +19,11 @@ def constant_source(value: int) -> WireSource:
     return lambda board, triangle, cycle, time_ns: [value] * 12
 
 
+def damaged_cycles(events: list[Event]) -> set[tuple[int, int, int]]:
+    """Return (board, triangle, cycle) of the triangles of which a host cannot have received both halves intact."""
+    return {(e.board, e.triangle, e.cycle) for e in events if e.half is not None and e.fault != "repeated"}
+
+
 class Rig:
     def __init__(self, *, source: WireSource | None = None, **options: Any) -> None:
         self.log: list[Event] = []

@@ -20,7 +20,7 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers import registry
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.cli.emulate import command
-from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch, wait_readable
+from skinware_drivers.cli.emulation import Emulation, SignalWatch, report_to, wait_readable
 from skinware_drivers.options import describe_options
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -112,9 +112,8 @@ class Run:
         self.output = io.StringIO()
 
     def __call__(self, duration_s: float | None) -> Emulation:
-        emulation = Emulation(
-            self.bus, self.hardware, JsonReport(self.output), clock=self.script.clock, poll=self.script.poll
-        )
+        report, script = report_to(self.output, as_json=True), self.script
+        emulation = Emulation(self.bus, self.hardware, report, clock=script.clock, poll=script.poll)
         emulation.run(self.script, bus_name="host", driver="roboskin", options=self.options, duration_s=duration_s)
         return emulation
 
@@ -268,12 +267,12 @@ def test_being_stopped_ends_the_run() -> None:
 
 def test_lines_for_a_person() -> None:
     stream = io.StringIO()
-    report = HumanReport(stream)
-    report.event("ready", driver="roboskin", bus="vcan0", options={})
-    report.event("status", frames=1)
-    report.event("bus_down", reason="no cable")
-    report.event("bus_up")
-    report.event("stopped", frames=2, bursts=1)
+    report = report_to(stream, as_json=False)
+    report("ready", driver="roboskin", bus="vcan0", options={})
+    report("status", frames=1)
+    report("bus_down", reason="no cable")
+    report("bus_up")
+    report("stopped", frames=2, bursts=1)
     assert stream.getvalue().splitlines() == [
         "emulating roboskin on vcan0; Ctrl-C stops",
         "bus down: no cable",

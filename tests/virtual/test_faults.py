@@ -9,12 +9,12 @@ import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.events import Event, JsonLinesLog, damaged_cycles
+from skinware_drivers.virtual.events import Event, JsonLinesLog
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
-from .rig import MS, START_NS, Rig, cycles, is_data
+from .rig import MS, START_NS, Rig, cycles, damaged_cycles, is_data
 
 Key = tuple[int, int, int]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.structure import Structure
 from skinware.tactile.chain import Chain, ChainSettings
+from skinware.tactile.curves import temperature_of
 from skinware.tactile.rule import UNUSABLE
 
 ArrayF = npt.NDArray[np.float64]
@@ -39,6 +41,7 @@ class LoadSource:
     Attributes:
         structure: structure of the driver.
         type_name: which sensors.
+        temperature_c: of the newest frame; NaN: not measured.
 
     Raises:
         StructureError: no such type here.
@@ -49,6 +52,7 @@ class LoadSource:
         names = [t.name for t in structure.types]
         self.structure = structure
         self.type_name: str = type_name or (_PREFERRED if _PREFERRED in names else names[0])
+        self.temperature_c = math.nan
         self._index = structure.index(self.type_name)
         self._chain: Chain | None = None
         if driver_type != _CALM_TYPE:
@@ -75,6 +79,7 @@ class LoadSource:
         else:
             self._chain.step(frame, self._values, self._status)
             values, status = self._values[self._index], self._status[self._index]
+        self.temperature_c = temperature_of(frame)
         usable = (status & np.uint8(UNUSABLE)) == 0
         loads: ArrayF = np.where(usable, values, np.nan).astype(np.float64)
         return loads
@@ -102,7 +107,7 @@ class PoseSource:
         found = tuple(columns[column].shape)
         self._has_count = found[1:] == shape and _COUNT in columns
         if columns[column].dtype.kind != "f" or not (found == shape or found == (1, *shape) or self._has_count):
-            raise ConfigurationError(f"column {column!r} of {reader.name!r} is {found}; poses are {shape}, of floats")
+            raise ConfigurationError(f"column {column!r} of {reader.name!r} is {found}; give {shape}, of floats")
         self._reader, self._column, self._shape = reader, column, shape
 
     def newest(self) -> ArrayF | None:
@@ -118,3 +123,26 @@ class PoseSource:
         rows = np.asarray(frame.column(self._column), np.float64).reshape(-1, *self._shape)
         pose: ArrayF = rows[0].copy()
         return pose
+
+
+class ForceSource:
+    """Pairs the force of a reference with the temperature of the skin.
+
+    Args:
+        source: the loads of the skin.
+        reference: reads the force, N: (1,), or (3,), whose length counts; None: weights are typed in.
+
+    Attributes:
+        weight_n: the known weight that presses now, N; NaN: none.
+    """
+
+    def __init__(self, source: LoadSource, reference: PoseSource | ForceSource | None) -> None:
+        self._source, self._reference = source, reference
+        self.weight_n = math.nan
+
+    def newest(self) -> ArrayF | None:
+        """Return (2,) the present force and temperature, NaN where not known; None without a force."""
+        force = np.array([self.weight_n]) if self._reference is None else self._reference.newest()
+        if force is None:
+            return None
+        return np.array([force[0] if len(force) == 1 else np.linalg.norm(force), self._source.temperature_c])

@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
 from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
+from skinware.tactile.calibration.force import ForceData
 from skinware.tactile.calibration.placing import Presses, PressFinder, PressSettings
 from skinware.tactile.calibration.topology import ENOUGH_FRAMES, StrokeSums
 
@@ -156,6 +158,56 @@ class StrokeSession(Session):
         self.sums.frames = int(arrays["frames"])
 
 
+class ForceSession(Session):
+    """Gathers loads beside a reference: a force in N, and the temperature of the skin.
+
+    Args:
+        n: number of taxels.
+    """
+
+    kind = "forces"
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._frames: list[tuple[float, ArrayF, ArrayF]] = []
+
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+        if pose is not None and np.isfinite(pose[0]):
+            self._frames.append((time_ns / NS_PER_S, np.nan_to_num(load), pose))
+
+    @property
+    def data(self) -> ForceData:
+        """All frames so far."""
+        loads = np.array([load for _, load, _ in self._frames]).reshape(-1, self._n)
+        force_n, temperature_c = np.array([pose for *_, pose in self._frames]).reshape(-1, 2).T
+        return ForceData(np.array([time_s for time_s, *_ in self._frames]), loads, force_n, temperature_c)
+
+    @property
+    def coverage(self) -> ArrayF:
+        pressed = np.zeros(self._n)
+        for _, load, _ in self._frames:
+            pressed += load > 0
+        return np.minimum(pressed / ENOUGH_PRESSED, 1.0)
+
+    @property
+    def figures(self) -> dict[str, int]:
+        return {"frames": len(self._frames)}
+
+    def arrays(self) -> Arrays:
+        data = self.data
+        row, taxel = np.nonzero(data.load)
+        sparse = {"row": row, "taxel": taxel, "load": data.load[row, taxel]}
+        return sparse | {name: getattr(data, name) for name in ("time_s", "force_n", "temperature_c")}
+
+    def restore(self, arrays: Arrays) -> None:
+        load = np.zeros((len(arrays["time_s"]), self._n))
+        load[arrays["row"], arrays["taxel"]] = arrays["load"]
+        pose = np.column_stack([arrays["force_n"], arrays["temperature_c"]])
+        self._frames = list(zip(arrays["time_s"].tolist(), load, pose, strict=True))
+
+
+ENOUGH_PRESSED = 100
+"""Frames with a load after which a taxel has enough for a curve."""
 _VERSION = 1
 _ARRAYS = "gathered/"
 

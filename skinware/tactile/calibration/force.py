@@ -1,0 +1,233 @@
+"""Fit the curves of taxels to a reference of the force on all of them: a load cell, or known weights.
+
+The force of a taxel that shows x is f(x) + lag · (p - x) + creep · q + temperature · x · (T - at): f rises in straight
+pieces, p follows x with play, which separates rising from falling loads, q is x through a low pass, for creep.
+All of it is linear but play and time constant, which are tried; the reference is the sum over the taxels. Each taxel
+has a gain, near 1 unless its own presses say otherwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.tactile.curves import MOST_KNOTS, Curve, LoadMemory
+
+ArrayF = npt.NDArray[np.float64]
+
+_PLAYS = (0.05, 0.1, 0.2, 0.4)
+"""Shares of the range that are tried as play."""
+_CREEPS_S = (3.0, 10.0, 30.0, 100.0)
+_PARTS = 10
+"""Parts of the frames that are left out in turn, for the uncertainty."""
+_GAIN_SPREAD = 0.3
+_ROUNDS = 4
+_LEAST_FRAMES = 200
+_LEAST_WARMTH_K = 2.0
+"""Kelvin by which the temperature must change, or its influence is not known."""
+_LEAST_SHARE = 0.1
+_POOR = 0.1
+"""Share of the largest force: a larger residual makes a fit worth little."""
+
+
+@dataclass(frozen=True)
+class ForceData:
+    """m frames of n taxels with a reference.
+
+    Attributes:
+        time_s: (m,) rising.
+        load: (m, n) calmed values, 0: untouched.
+        force_n: (m,) the reference, N.
+        temperature_c: (m,) of the skin; NaN: not known.
+    """
+
+    time_s: ArrayF
+    load: ArrayF
+    force_n: ArrayF
+    temperature_c: ArrayF
+
+
+@dataclass(frozen=True)
+class ForceFit:
+    """Fitted curves of n taxels.
+
+    Attributes:
+        curve: the curve of a taxel whose gain is 1.
+        gain: (n,) of each; NaN: it was not pressed.
+        residual_n: root of the mean square of the errors in frames that the fit had not seen, N.
+        reach_n: the largest force of the reference, N.
+        hysteresis: the largest part of the range by which rising and falling load differ.
+        held: share of the frames, unseen by the fit, whose error is within 1.96 standard deviations.
+    """
+
+    curve: Curve
+    gain: ArrayF
+    residual_n: float
+    reach_n: float
+    hysteresis: float
+    held: float
+
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons why the fit is not trustworthy; none: it is."""
+        doubts = []
+        if self.residual_n > _POOR * self.reach_n:
+            doubts.append(f"it misses the reference by {100 * self.residual_n / self.reach_n:.0f} % of its range")
+        if not 0.9 <= self.held <= 0.98:
+            doubts.append(f"its intervals hold {100 * self.held:.0f} % instead of 95 %")
+        return doubts
+
+    def curves(self, uid: npt.NDArray[np.uint64]) -> tuple[Curve, ...]:
+        """Return the curves of n taxels; those that were not pressed share the one with gain 1."""
+        own = [self.curve.scaled(float(self.gain[k]), (int(uid[k]),)) for k in np.flatnonzero(np.isfinite(self.gain))]
+        return (self.curve, *own)
+
+
+def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "counts") -> ForceFit:
+    """Fit curves in N to frames with a reference.
+
+    Args:
+        data: the frames; loads that rise, rest and fall, over the wanted range.
+        type_name: type of the taxels.
+        from_unit: unit of the loads.
+
+    Raises:
+        ConfigurationError: too few frames with a load, or loads that do not vary.
+    """
+    pressed = np.flatnonzero((data.load > 0).any(axis=0))
+    used = np.isfinite(data.force_n) & (data.load > 0).any(axis=1)
+    if used.sum() < _LEAST_FRAMES or np.ptp(data.force_n[used]) <= 0:
+        raise ConfigurationError(f"{used.sum()} frames with a load: give {_LEAST_FRAMES}, with forces that vary")
+    load = data.load[:, pressed]
+    knots = np.unique(np.append(0, np.quantile(load[load > 0], np.linspace(0, 1, MOST_KNOTS)[1:])))
+    warm = np.ptp(data.temperature_c[used]) >= _LEAST_WARMTH_K  # NaN: not known
+    at_c = float(np.mean(data.temperature_c[used])) if warm else 25.0
+    plays = [play * float(knots[-1]) for play in _PLAYS]
+    lived = [_lived(data.time_s, load, play, creep_s)[:, used] for play, creep_s in zip(plays, _CREEPS_S, strict=True)]
+    warmth = np.nan_to_num(data.temperature_c[used] - at_c) * bool(warm)
+    problems = [
+        _Trial(data.force_n[used], load[used], knots, plays[i], lived[i][0], _CREEPS_S[k], lived[k][1], warmth)
+        for i, k in itertools.product(range(len(plays)), range(len(lived)))
+    ]
+    ones = np.ones(len(pressed))
+    best = min(problems, key=lambda problem: problem.cost(problem.weights(ones), ones))
+    gain, weights = best.solve(best.every)
+    error, residual, held = _errors(best)
+    reach, y = float(data.force_n[used].max()), np.append(0, np.cumsum(weights[: len(knots) - 1] * np.diff(knots)))
+    lag, creep, by_warmth = weights[len(knots) - 1 :]
+    curve = Curve(
+        type=type_name,
+        from_unit=from_unit,
+        unit="N",
+        x=tuple(knots.tolist()),
+        y=tuple(y.tolist()),
+        play=best.play,
+        lag=float(lag),
+        creep_s=best.creep_s,
+        creep=float(creep),
+        temperature=float(by_warmth),
+        at_c=at_c,
+        error=error,
+        hysteresis=min(2 * best.play * abs(float(lag)) / float(y[-1]), 1.0) if y[-1] > 0 else None,
+    )
+    of_all = np.full(data.load.shape[1], np.nan)
+    of_all[pressed] = gain
+    return ForceFit(curve, of_all, residual, reach, curve.hysteresis or 0.0, held)
+
+
+def _lived(time_s: ArrayF, load: ArrayF, play: float, creep_s: float) -> ArrayF:
+    """(2, m, n): the past of taxels, as a curve needs it."""
+    memory, lived = LoadMemory(load.shape[1]), np.zeros((2, *load.shape))
+    for row, passed_s in enumerate(np.diff(time_s, prepend=time_s[0]).tolist()):
+        lived[:, row] = memory.step(load[row], passed_s, play, creep_s)
+    return lived
+
+
+class _Trial:
+    """Linear features of the frames that count, for one play and one time constant."""
+
+    def __init__(
+        self,
+        force_n: ArrayF,
+        load: ArrayF,
+        knots: ArrayF,
+        play: float,
+        lag: ArrayF,
+        creep_s: float,
+        slow: ArrayF,
+        warmth: ArrayF,
+    ) -> None:
+        self.play, self.creep_s, self.force_n = play, creep_s, force_n
+        self.every = np.ones(len(force_n), bool)
+        self.number = (load > 0).sum(axis=1)
+        pieces = [np.clip(load - low, 0, high - low) for low, high in itertools.pairwise(knots)]
+        self._rising = len(pieces)
+        touched = load > 0
+        self._terms = np.array([*pieces, lag * touched, slow * touched, load * warmth[:, None]])
+        """(terms, frames, taxels)."""
+
+    def weights(self, gain: ArrayF, rows: npt.NDArray[np.bool_] | None = None) -> ArrayF:
+        """The weights of the terms, those of the curve at least 0, by least squares."""
+        rows = self.every if rows is None else rows
+        matrix = (self._terms[:, rows] @ gain).T
+        free = np.linalg.norm(matrix, axis=0) > 0
+        while True:
+            found = np.zeros(len(free))
+            found[free] = np.linalg.lstsq(matrix[:, free], self.force_n[rows], rcond=None)[0]
+            falling = (found < 0) & (np.arange(len(free)) < self._rising)
+            if not falling.any():
+                return found
+            free &= ~falling
+
+    def cost(self, weights: ArrayF, gain: ArrayF) -> float:
+        return float(((self.force_n - self.forces(weights, gain)) ** 2).sum())
+
+    def forces(self, weights: ArrayF, gain: ArrayF) -> ArrayF:
+        forces: ArrayF = np.tensordot(weights, self._terms, 1) @ gain
+        return forces
+
+    def solve(self, rows: npt.NDArray[np.bool_]) -> tuple[ArrayF, ArrayF]:
+        """Gains of the taxels, and weights, by turns."""
+        gain = np.ones(self._terms.shape[2])
+        weights = self.weights(gain, rows)
+        for _ in range(_ROUNDS if len(gain) > 1 else 0):
+            each = np.tensordot(weights, self._terms[:, rows], 1)
+            left = self.force_n[rows] - each @ gain
+            ridge = float((left**2).mean()) / _GAIN_SPREAD**2 * np.eye(len(gain))
+            gain = np.linalg.solve(each.T @ each + ridge, each.T @ self.force_n[rows] + ridge.sum(axis=1))
+            weights = self.weights(gain, rows)
+        return gain, weights
+
+
+def _errors(problem: _Trial) -> tuple[tuple[float, float], float, float]:
+    """Standard deviation of a taxel at 0 N and its growth with the force; the whole residual; the share that it holds.
+
+    Deviations of the taxels of a contact add up to the deviation of its force.
+
+    All of it is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
+    """
+    left, expected = (np.zeros_like(problem.force_n) for _ in range(2))
+    for rows in _tenths(len(left)):
+        gain, weights = problem.solve(~rows)
+        expected[rows] = np.maximum(problem.forces(weights, gain)[rows], 0)
+    left = np.abs(problem.force_n - expected)
+    terms = np.column_stack([problem.number, expected])
+    slopes = np.maximum(np.linalg.lstsq(terms, left, rcond=None)[0], 0)
+    slopes[0] = max(slopes[0], _LEAST_SHARE * float(left.mean() / problem.number.mean()))
+    deviation = terms @ slopes
+    presses = 1 + int((np.diff((problem.force_n > problem.force_n.mean() / 2).astype(int)) > 0).sum())
+    level = min(0.95 + math.sqrt(0.05 * 0.95 / presses) / 2, 0.99)  # the fewer presses, the less sure is a quantile
+    scale = float(np.quantile(left[::2] / deviation[::2], level)) / 1.96
+    held = float((left[1::2] <= 1.96 * scale * deviation[1::2]).mean())
+    return (scale * float(slopes[0]), scale * float(slopes[1])), float(np.sqrt((left**2).mean())), held
+
+
+def _tenths(m: int) -> Iterator[npt.NDArray[np.bool_]]:
+    part = np.arange(m) * _PARTS // m
+    return (part == number for number in range(_PARTS))

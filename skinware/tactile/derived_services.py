@@ -20,9 +20,10 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
+from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
-from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
+from skinware.tactile.health_service import RATE_HZ, HealthWriter
 from skinware.tactile.motion_service import NAME, MotionWriter
 from skinware.tactile.neighbours import Table, neighbours, posed
 from skinware.tactile.onsets import Onsets
@@ -201,9 +202,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         onset = self._onsets.update(stage.given - calm.baseline, doubt, usable & calm.usable)
         same_unit = self._writer is not None and self._writer.source.unit == stage.before.type.unit
         clipped = stage.given >= stage.before.type.maximum
-        curve = None if self._chain is None else self._chain.curve_stages.get(self._type_name)
-        uncertainty = doubt if same_unit else None if curve is None else curve.error
-        return {"onset": onset, "clipped": clipped, "uncertainty": uncertainty}
+        return {"onset": onset, "clipped": clipped, "uncertainty": doubt if same_unit else None}
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""

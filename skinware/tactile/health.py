@@ -1,4 +1,4 @@
-"""Judge the health of taxels, by what they showed in use.
+"""Judge the health of taxels: which are stuck, noisy, clipped, dead or weak, by what they showed in use.
 
 ::
 
@@ -18,8 +18,10 @@ test finds out whether they feel anything.
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import msgspec
@@ -31,10 +33,7 @@ from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.tactile.baseline import Calm
-from skinware.tactile.dues import MOST_PAIRS, Dues, Pairs
-from skinware.tactile.echoes import Echoes, Steps
-from skinware.tactile.health_evidence import Drops, Noise, Use, Whole
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
+from skinware.tactile.health_evidence import Dues, Noise, Use
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
@@ -46,13 +45,6 @@ _LEAST_NOISE = 0.5
 """Steps of the values: no taxel counts as quieter."""
 _FEWEST_AROUND = 3
 """Neighbours with a known share that a comparison with neighbours needs."""
-_SURE = 5.0
-"""Standard errors: a trend is no chance."""
-_OWN = 0.4
-"""Share of the load at a place: a taxel that shows less of it is not at that place, one that shows more is."""
-_AS_ONE = 0.2
-_LEVEL = 0.06
-"""Share of a step between both sides of two neighbours: if they show less of it, they are one."""
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
 
@@ -60,18 +52,107 @@ Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
 
+class HealthKind(enum.IntEnum):
+    """The judgement of a taxel; where several apply, the highest."""
+
+    GOOD = 0
+    """Nothing is known to be wrong."""
+    NEVER_TOUCHED = 1
+    """Nothing has touched it yet, so nothing is known."""
+    WEAK = 2
+    """It shows far less of its touches than its neighbours show of theirs."""
+    DEAD = 3
+    """It shows nothing when both its sides are pressed."""
+    NOISY = 4
+    """Its noise is far above that of the typical taxel."""
+    STUCK = 5
+    """Its value does not change, whatever happens around it."""
+    CLIPPED = 6
+    """It is at an end of the range, untouched: there is no room left for a touch, or for its drift."""
+
+
+@dataclass(frozen=True, eq=False)
+class HealthReport:
+    """The health of n taxels, with the evidence. NaN: not known (yet).
+
+    Attributes:
+        kind: (n,) uint8, :class:`HealthKind`.
+        value: (n,) float32, the newest, in the unit of the type.
+        still_s: (n,) float32, for how long it has not changed, s.
+        peak: (n,) float32, the most that a touch showed, in the unit of the type.
+        noise: (n,) float32, standard deviation, in the unit of the type.
+        noise_times: (n,) float32, the same in multiples of the typical taxel's.
+        clipped: (n,) float32, share of the time at an end of the range.
+        touches: (n,) uint32, separate touches of both its sides.
+        shown: (n,) float32, the share of its due that it showed in them.
+        shown_around: (n,) float32, the share that its neighbours showed; only where that is much more.
+    """
+
+    kind: npt.NDArray[np.uint8]
+    value: Floats
+    still_s: Floats
+    peak: Floats
+    noise: Floats
+    noise_times: Floats
+    clipped: Floats
+    touches: npt.NDArray[np.uint32]
+    shown: Floats
+    shown_around: Floats
+
+    @classmethod
+    def unknown(cls, n: int) -> Self:
+        """Make a report of n taxels about which nothing is known."""
+        return cls(**{name: np.full(n, nothing, dtype) for name, (dtype, nothing) in COLUMNS.items()})
+
+    @property
+    def faulty(self) -> Flags:
+        """(n,) bool: which taxels have a fault."""
+        faulty: Flags = self.kind > HealthKind.NEVER_TOUCHED
+        return faulty
+
+    def evidence(self, taxel: int, unit: str = "") -> str:
+        """Return the reason for the kind of a taxel, in words.
+
+        Args:
+            taxel: which of the n.
+            unit: of the values.
+        """
+        kind = HealthKind(self.kind[taxel])
+        of = {field.name: getattr(self, field.name)[taxel].item() for field in fields(self)}
+        value = f"{of['value']:.4g} {unit}".strip()
+        if kind is HealthKind.CLIPPED:
+            return f"at {value}, an end of the range, for {100 * of['clipped']:.0f} % of the time"
+        if kind is HealthKind.STUCK:
+            return f"at {value} for {of['still_s']:.0f} s, while its module was touched"
+        if kind is HealthKind.NOISY:
+            noise = f"noise {of['noise']:.3g} {unit}".strip()
+            return f"{noise}, {of['noise_times']:.1f} times that of the others"
+        share = f"shows {100 * max(of['shown'], 0):.0f} % of what presses both its sides, in {of['touches']} touches"
+        if kind is HealthKind.WEAK:
+            return f"{share}; its neighbours show {100 * of['shown_around']:.0f} %"
+        return share if kind is HealthKind.DEAD else ""
+
+
+COLUMNS: dict[str, tuple[str, float]] = {
+    "kind": ("u1", 0),
+    **dict.fromkeys(("value", "still_s", "peak", "noise", "noise_times", "clipped"), ("<f4", math.nan)),
+    "touches": ("<u4", 0),
+    **dict.fromkeys(("shown", "shown_around"), ("<f4", math.nan)),
+}
+"""Arrays of a :class:`HealthReport`: dtype of each, and its value where nothing is known."""
+
+
 class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The limits beyond which a taxel counts as faulty. Times are in seconds, whatever the rate.
 
     Attributes:
         stuck_s: stuck without any change for this long, while its module was touched.
-        touches: separate touches that are needed for stuck, dead or intermittent; for weak or shorted, twice as many.
+        touches: separate touches that are needed for stuck or dead; for weak, twice as many.
         noisy: this many times the median noise of all.
         noise_s: how long one measurement of noise takes.
         clipped: at an end of the range for more than this share of that time.
         dead: it shows less than this share of its due.
         weak: its share is less than this part of its neighbours' shares (their median).
-        lost: dying if it lost this part of its share.
 
     Raises:
         ConfigurationError: a value that makes no sense; the message says which.
@@ -84,7 +165,6 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
-    lost: float = 0.3
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -122,15 +202,12 @@ class Health:
         self.settings = settings or HealthSettings()
         self._limits = limits
         self._least_noise = _LEAST_NOISE * resolution
-        geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
-        self._neighbours: Table = neighbours(geometry)
-        pairs = Pairs(geometry, self._neighbours)
+        self._neighbours: Table = np.zeros((n, 0), np.int32) if geometry is None else neighbours(geometry)
         self._begun_ns: int | None = None
         self._now_s = 0.0
         self._noise = Noise(n, self.settings.noise_s)
         self._use = Use(self._module, self.settings.touches)
-        self._dues, self._drops = Dues(pairs), Drops(self._neighbours)
-        self._echoes, self._steps = Echoes(pairs.ring), Steps(pairs)
+        self._dues = Dues(geometry, self._neighbours)
         self._clear = _CLEAR * self._least_noise
         """A touch above it is clear."""
 
@@ -162,57 +239,38 @@ class Health:
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
-        passed_s = self._now_s - before_s
         far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
         low, free = given < calm.baseline - far, calm.usable & ~calm.touched & (given <= calm.baseline + far)
-        difference = given - self._use.value
-        if self._noise.add(self._now_s, difference, self._is_at_end(given), low, free, calm):
+        if self._noise.add(self._now_s, given - self._use.value, self._is_at_end(given), low, free, calm):
             self._clear = _CLEAR * self._typical_noise()
-        self._use.add(self._now_s, passed_s, given, calm)
-        self._drops.add(self._now_s, low & (difference < -0.8 * far), low, self._use, self._module)
+        self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
-        if hard.any():
-            deviation = given - calm.baseline
-            due = self._dues.add(self._now_s, deviation, calm.usable, hard)
-            self._steps.add(self._now_s, deviation, calm.usable, hard)
-            self._echoes.add(self._now_s, deviation, self._use.touched, hard, due, self._clear)
+        self._dues.add(self._now_s, given, calm, hard)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
-        settings, use, dues = self.settings, self._use, self._dues
-        typical, noise, at_end = self._typical_noise(), self._noise.deviation, self._noise.at_end
+        settings, use = self.settings, self._use
+        shown = self._dues.share_shown(settings.touches)
+        shown_around = self._share_around(shown)
+        typical = self._typical_noise()
+        noise, at_end = self._noise.deviation, self._noise.at_end
         noise_times = noise / np.float32(typical or math.nan)
         still_s = np.where(use.seen, self._now_s - use.changed_s, math.nan)
+        weak, dead = shown < settings.weak * shown_around, shown < settings.dead
         known = at_end[np.isfinite(at_end)]
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
-        is_clipped, noisy = is_end & (at_end > settings.clipped), noise_times > settings.noisy
-        intermittent = (dues.returns >= settings.touches) | (self._drops.count >= settings.touches)
-        swapped, shorted, crosstalk, partner, echo = self._confused()
-        dues.distrusted = is_clipped | noisy | intermittent | (partner >= 0)
-        shown, touches = dues.shown(settings.touches)
-        shown_around = self._share_around(shown)
-        weak, dead = shown < settings.weak * shown_around, shown < settings.dead
-        weak &= touches >= 2 * settings.touches
-        lost, error = dues.trend()
         stuck = self._stuck(still_s, dead)
-        suspects = ((weak | dead) & ~stuck) | self._echoes.often_alone(settings.touches)
-        self._echoes.watch(np.flatnonzero(suspects))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
-            (HealthKind.WEAK, weak),
-            (HealthKind.DYING, (lost > settings.lost) & (lost > _SURE * error)),
-            (HealthKind.CROSSTALK, crosstalk),
+            (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
             (HealthKind.DEAD, dead),
-            (HealthKind.SHORTED, shorted),
-            (HealthKind.SWAPPED, swapped),
-            (HealthKind.NOISY, noisy),
+            (HealthKind.NOISY, noise_times > settings.noisy),
             (HealthKind.STUCK, stuck),
-            (HealthKind.CLIPPED, is_clipped | (is_end & stuck)),
-            (HealthKind.INTERMITTENT, intermittent),
+            (HealthKind.CLIPPED, is_end & (stuck | (at_end > settings.clipped))),
         ):
-            kind[where] = name  # of several, the last
+            kind[where] = name
         arrays: dict[str, npt.NDArray[np.generic]] = {
             "kind": kind,
             "value": use.value,
@@ -221,14 +279,9 @@ class Health:
             "noise": noise,
             "noise_times": noise_times,
             "clipped": at_end,
-            "touches": touches,
+            "touches": self._dues.touches,
             "shown": shown,
             "shown_around": shown_around,
-            "returns": dues.returns,
-            "falls": self._drops.count,
-            "lost": lost,
-            "partner": partner,
-            "echo": echo,
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
 
@@ -264,34 +317,9 @@ class Health:
 
     def _known(self) -> dict[str, npt.NDArray[Any]]:
         dues, use, noise = self._dues, self._use, self._noise
-        shares = {name: getattr(dues.shares, name).reshape(-1, MOST_PAIRS) for name in ("due", "shown", "touches")}
-        of_touches = shares | {"returns": dues.returns, "falls": self._drops.count}
+        of_touches = {"due": dues.due, "shown": dues.shown, "touches": dues.touches}
         of_values = {"value": use.value, "peak": use.peak, "usual": use.usual}
         return of_touches | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
-
-    def _confused(self) -> tuple[Flags, Flags, Flags, Whole, npt.NDArray[np.float64]]:
-        """(n,) which are swapped, shorted, feel crosstalk; their partners, or -1; and the share of them they show."""
-        n, touches = len(self._module), self.settings.touches
-        swapped, shorted, crosstalk = (np.zeros(n, bool) for _ in range(3))
-        partner, echo = np.full(n, -1, np.int64), np.full(n, math.nan)
-        shown = self._dues.shares.share(touches).reshape(-1, MOST_PAIRS)
-        dark = np.fmax.reduce(shown, axis=1) < _OWN
-        found = self._echoes.found(dark)
-        partner[found.taxel], echo[found.taxel] = found.partner, found.share
-        is_swapped = dark[found.partner] & (found.share > _OWN)
-        beside = ~is_swapped & ~dark[found.taxel]
-        is_one = beside & (np.abs(found.alike - 1) < _AS_ONE)
-        swapped[found.taxel[is_swapped]] = True
-        crosstalk[found.taxel[beside & ~is_one]] = True
-        level = self._steps.level(2 * touches, _LEVEL)
-        for pairs, kind in (
-            (np.column_stack([found.taxel, found.partner])[is_swapped], swapped),
-            (np.column_stack([found.taxel, found.partner])[is_one], shorted),
-            (level, shorted),
-        ):
-            kind[pairs] = True
-            partner[pairs[:, 0]], partner[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
-        return swapped, shorted, crosstalk, partner, echo
 
     def _typical_noise(self) -> float:
         known = self._noise.deviation[np.isfinite(self._noise.deviation)]

@@ -1,16 +1,17 @@
-"""Gather the evidence of taxels' health: their noise, their use, and their drops."""
+"""Gather the evidence of taxels' health: their noise, their use, and how they compare with the taxels around them."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.geometry import Geometry
 from skinware.tactile.baseline import Calm
-from skinware.tactile.neighbours import NONE, Table
+from skinware.tactile.neighbours import NONE, Table, pitch_m
 
-Doubles = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.int64]
@@ -19,22 +20,20 @@ _ENOUGH_FRAMES = 100
 """Frames away from touches that a measurement of noise needs; with fewer it goes on."""
 _GROWTH = 1.2
 """Times: a noise grows by at most this from one measurement to the next."""
-APART_S = 1.0
+_APART_S = 1.0
 """Seconds: touches of a taxel with less time between them count as one."""
 _MODULE_APART_S = 5.0
 """Seconds: the same for a module, of which fingers touch one part after the other."""
-KEPT = 0.95
+_KEPT = 0.95
 """Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
-
-
-_FALLS_S = 1800.0
-"""Seconds in which a fall loses its weight e-fold."""
-_SETTLED_S = 3.0
-"""Seconds after a touch in which the cover moves."""
-_SAG_REACHES = 3
-"""Neighbours of neighbours of neighbours: so far a press pulls the cover down."""
-_MOST_OF_MODULE = 0.25
-"""Share of a module: where more of it falls, the board moved its baselines."""
+_MOST_AT_ONCE = 2048
+"""Touched taxels that are compared in one frame; if there are more, each frame takes another part."""
+_NEAR_PITCHES = 1.3
+"""Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
+_OPPOSITE_COSINE = -0.9
+"""Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
+_EVEN = 1.4
+"""Times: the farther of two opposite neighbours is at most this much farther than the nearer."""
 
 
 class Noise:
@@ -132,9 +131,7 @@ class Use:
         seen: (n,) bool, which taxels have ever had a value.
         value: (n,) float32, the newest.
         changed_s: (n,) when it last changed, s.
-        usable: (n,) bool, which have a value in the newest frame.
         touched: (n,) bool, in the newest frame.
-        touched_s: (n,) when it was last touched, s.
         peak: (n,) float32, the most that a touch showed.
         usual: (n,) float32, the same, less of it with each touch.
         module_touched_s: (n_modules, touches) when each module was last touched, s, the oldest first.
@@ -146,16 +143,14 @@ class Use:
         self.seen: Flags = np.zeros(n, bool)
         self.value: Floats = np.full(n, np.nan, np.float32)
         self.changed_s: npt.NDArray[np.float64] = np.zeros(n)
-        self.usable: Flags = np.zeros(n, bool)
         self.touched: Flags = np.zeros(n, bool)
-        self.touched_s = np.full(n, -math.inf)
         self.peak: Floats = np.zeros(n, np.float32)
         self.usual: Floats = np.zeros(n, np.float32)
         self.module_touched_s = np.full((int(module.max(initial=-1)) + 1, touches), -math.inf)
 
     def add(self, now_s: float, passed_s: float, given: Floats, calm: Calm) -> None:
         """Take the next frame in; time without data does not count as time without change."""
-        usable = self.usable = calm.usable
+        usable = calm.usable
         changed = usable & (given != self.value)
         np.copyto(self.changed_s, now_s, where=changed)
         if not usable.all():
@@ -166,8 +161,7 @@ class Use:
         active = np.flatnonzero(touched)
         begun = active[~self.touched[active]]
         self.touched = touched
-        self.touched_s[active] = now_s
-        self.usual[begun] *= KEPT
+        self.usual[begun] *= _KEPT
         for most in (self.peak, self.usual):
             most[active] = np.maximum(most[active], calm.value[active])
         if len(begun):
@@ -177,49 +171,115 @@ class Use:
             self.module_touched_s[module] = np.column_stack([last[:, 1:], np.full(len(module), now_s)])
 
 
-class Drops:
-    """Counts how often taxels fall far below their baselines by themselves, at once, away from touches.
-
-    A touch nearby is known only some frames after the cover sank, so each fall is looked at a second later.
+class Dues:
+    """Compares n taxels with what is due to them: the geometric mean of both their sides, where both are touched.
 
     Args:
-        neighbours: (n, k) the neighbours of each.
+        geometry: places of the n taxels; None: not known, and nothing is due.
+        table: (n, k) their neighbours.
 
     Attributes:
-        count: (n,) float64; older ones count less.
+        due: (n,) sum of the squares of what was due in the touches so far; older ones count less.
+        shown: (n,) the same sum of due times shown.
+        touches: (n,) int64, separate touches of both sides.
     """
 
-    def __init__(self, neighbours: Table) -> None:
-        n = len(neighbours)
-        self._neighbours = neighbours
-        self.count = np.zeros(n)
-        self._fell_s, self._counted_s = np.full(n, math.inf), np.zeros(n)
+    def __init__(self, geometry: Geometry | None, table: Table) -> None:
+        n = len(table)
+        self._pairs = None if geometry is None else Pairs(geometry, table)
+        self._frames = 0
+        self.due, self.shown = np.zeros(n), np.zeros(n)
+        self.touches: Whole = np.zeros(n, np.int64)
+        self._hardest_due, self._hardest_shown = np.zeros(n), np.zeros(n)
+        self._compared_s = np.full(n, -math.inf)
 
-    def add(self, now_s: float, fell: Flags, low: Flags, use: Use, module: npt.NDArray[np.intp]) -> None:
+    def add(self, now_s: float, given: Floats, calm: Calm, hard: Flags) -> None:
         """Take the next frame in.
 
         Args:
             now_s: its time.
-            fell: (n,) which have fallen since the frame before.
-            low: (n,) which are far below their baselines.
-            use: their use.
-            module: (n,) of each.
+            given: (n,) its values.
+            calm: what the baseline made of it.
+            hard: (n,) taxels that are clearly touched.
         """
-        rows = np.flatnonzero(fell & use.usable)
-        if len(rows):
-            of_module = np.bincount(module, low)[module[rows]] / np.bincount(module)[module[rows]]
-            around = self._neighbours[rows]
-            known = around != NONE
-            alone = known.any(axis=1) & ~(low[around] & known).any(axis=1) & (of_module < _MOST_OF_MODULE)
-            self._fell_s[rows[alone & np.isinf(self._fell_s[rows])]] = now_s
-        due = np.flatnonzero(self._fell_s < now_s - APART_S)
-        if not len(due):
+        self._frames += 1
+        if self._pairs is None:
             return
-        near = due[:, None]
-        for _ in range(_SAG_REACHES):
-            near = np.where((near != NONE)[:, :, None], self._neighbours[near], NONE).reshape(len(due), -1)
-        touched_s = np.where(near != NONE, use.touched_s[near], -math.inf).max(axis=1, initial=-math.inf)
-        quiet = due[touched_s < self._fell_s[due] - _SETTLED_S]
-        self.count[quiet] = 1 + self.count[quiet] * np.exp((self._counted_s[quiet] - now_s) / _FALLS_S)
-        self._counted_s[quiet] = now_s
-        self._fell_s[due] = math.inf
+        active = np.flatnonzero(hard)
+        step = len(active) // _MOST_AT_ONCE + 1
+        middle, one, other = self._pairs.around(active[self._frames % step :: step], hard)
+        if not len(middle):
+            return
+        self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= _APART_S]))
+        self._compared_s[middle] = now_s
+        shown, left, right = (np.maximum(given[taxel] - calm.baseline[taxel], 0) for taxel in (middle, one, other))
+        due = np.sqrt(left * right)
+        harder = np.flatnonzero(calm.usable[middle] & (due > self._hardest_due[middle]))
+        harder = harder[np.argsort(due[harder], kind="stable")]  # of several pairs round a taxel the hardest stays
+        self._hardest_due[middle[harder]], self._hardest_shown[middle[harder]] = due[harder], shown[harder]
+
+    def share_shown(self, touches: int) -> npt.NDArray[np.float64]:
+        """Return (n,) the share of its due that each taxel showed; NaN after fewer touches."""
+        known = (self.touches >= touches) & (self.due > 0)
+        share: npt.NDArray[np.float64] = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
+        return share
+
+    def _end_touches(self, taxels: Whole) -> None:
+        """Add up what some taxels showed in their last touch."""
+        due, shown = self._hardest_due[taxels], self._hardest_shown[taxels]
+        self.due[taxels] = _KEPT * self.due[taxels] + due * due
+        self.shown[taxels] = _KEPT * self.shown[taxels] + due * shown
+        self.touches[taxels] += due > 0
+        self._hardest_due[taxels] = 0
+
+
+class Pairs:
+    """The pairs of taxels on opposite sides of each of n taxels, at about the same distance.
+
+    Args:
+        geometry: places of the n taxels; one whose place is not known lies between none.
+        table: (n, k) int32, which taxels lie beside each other: :func:`skinware.tactile.neighbours.neighbours`.
+    """
+
+    def __init__(self, geometry: Geometry, table: Table) -> None:
+        away_m = np.linalg.norm(geometry.position_m[table] - geometry.position_m[:, None], axis=2)
+        close = (table != NONE) & (away_m > 0) & (away_m <= _NEAR_PITCHES * pitch_m(geometry)[:, None])
+        nearest = np.argsort(~close, axis=1, kind="stable")[:, : int(close.sum(axis=1).max(initial=0))]
+        ring = np.take_along_axis(np.where(close, table, np.int32(NONE)), nearest, axis=1)
+        middle, one, other = _opposite(geometry, ring)
+        first = np.argsort(one, kind="stable")
+        count = np.bincount(one, minlength=len(geometry))
+        shape = len(geometry), int(count.max(initial=0))
+        column = np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count)
+        self._middle, self._other = np.full(shape, NONE, np.int32), np.full(shape, NONE, np.int32)
+        self._middle[one[first], column], self._other[one[first], column] = middle[first], other[first]
+
+    def around(self, taxels: Whole, touched: Flags) -> tuple[Whole, Whole, Whole]:
+        """Find taxels between two touched ones.
+
+        Args:
+            taxels: the touched ones from which pairs are looked for: all of them, or a part.
+            touched: (n,) bool.
+
+        Returns:
+            (m,) the taxels, (m,) the one side and (m,) the other; a taxel between several pairs is in several rows.
+        """
+        other = self._other[taxels]
+        row, column = np.nonzero(touched[other] & (other != NONE))
+        found = taxels[row]
+        return self._middle[found, column].astype(np.int64), found, other[row, column].astype(np.int64)
+
+
+def _opposite(geometry: Geometry, ring: Table) -> npt.NDArray[Any]:
+    """(3, m): a taxel and two of its nearest neighbours, on opposite sides, the lower number first."""
+    way_m = np.where((ring != NONE)[:, :, None], geometry.position_m[ring] - geometry.position_m[:, None], np.nan)
+    length_m = np.linalg.norm(way_m, axis=2)
+    found = [np.zeros((3, 0), np.int64)]
+    for one in range(ring.shape[1]):
+        for other in range(one + 1, ring.shape[1]):
+            product = np.einsum("ij,ij->i", way_m[:, one], way_m[:, other])
+            cosine = product / (length_m[:, one] * length_m[:, other])
+            uneven = np.maximum(length_m[:, one] / length_m[:, other], length_m[:, other] / length_m[:, one])
+            middle = np.flatnonzero((cosine <= _OPPOSITE_COSINE) & (uneven <= _EVEN))
+            found.append(np.stack([middle, ring[middle, one], ring[middle, other]]))
+    return np.concatenate(found, axis=1).astype(np.int64)

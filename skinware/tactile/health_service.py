@@ -1,4 +1,4 @@
-"""Judge all sensors of a driver, and publish and read that: the service ``health``, once a second.
+"""Publish and read the service ``health``: once a second, the health of each sensor of a calmed driver, and why.
 
 ::
 
@@ -14,7 +14,6 @@ frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self, Unpack
@@ -23,23 +22,17 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
-from skinware.errors import ConfigurationError
 from skinware.service import Column
 from skinware.structure import Structure
-from skinware.tactile.chain import BaselineStage, Chain, ChainState
-from skinware.tactile.health import Health
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
-from skinware.tactile.rule import SIGNED_TYPES
+from skinware.tactile.health import COLUMNS, HealthReport
 from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
-
-log: logging.Logger = logging.getLogger("skinware.calm")
 
 NAME = "health"
 RATE_HZ = 1.0
 """How often it is published."""
 
 _TEXTS = {
-    "kind": ("", ", ".join(f"{kind}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
+    "kind": ("", "0: good, 1: never touched, 2: weak, 3: dead, 4: noisy, 5: stuck, 6: clipped"),
     "value": ("", "the newest, in the unit of the type"),
     "still_s": ("s", "for how long it has not changed"),
     "peak": ("", "the most that a touch showed, in the unit of the type"),
@@ -49,11 +42,6 @@ _TEXTS = {
     "touches": ("", "separate touches of both its sides"),
     "shown": ("", "share of its due that it showed in them"),
     "shown_around": ("", "share that its neighbours showed; only where that is much more"),
-    "returns": ("", "how often it felt a touch again after it had missed some; older ones count less"),
-    "falls": ("", "how often it fell far below its baseline by itself; older ones count less"),
-    "lost": ("", "part of its share that it lost since the touches began to count"),
-    "partner": ("", "position of the sensor that it is confused with; -1: none"),
-    "echo": ("", "share of the load at its partner that it shows"),
 }
 
 
@@ -152,10 +140,6 @@ class HealthWriter(SourceWriter[HealthSource]):
             columns[name][:] = nothing
             for type_name, report in reports.items():
                 columns[name][self._structure.index(type_name)] = getattr(report, name)
-        for type_name, report in reports.items():
-            index = self._structure.index(type_name)
-            position = np.arange(self._structure.n_sensors)[index]
-            columns["partner"][index] = np.where(report.partner >= 0, position[report.partner], -1)
         self._service.commit(acquired_ns)
 
     def restructure(self, structure: Structure) -> None:
@@ -166,69 +150,3 @@ class HealthWriter(SourceWriter[HealthSource]):
         """
         self._restructure(HealthSource(self.source.driver, structure.sensor_uid, structure.sensor_type))
         self._structure = structure
-
-
-class ChainHealth:
-    """Follows the health of all types of a chain that have a baseline and that a touch only raises.
-
-    Args:
-        chain: the chain whose values it judges.
-        driver: name of the driver, for messages.
-    """
-
-    def __init__(self, chain: Chain, driver: str) -> None:
-        self._chain = chain
-        self._watched: dict[str, tuple[BaselineStage, Health]] = {}
-        structure = chain.structure
-        for name, stage in chain.baseline_stages.items():
-            if name.startswith(SIGNED_TYPES):
-                continue
-            taxels = stage.before
-            geometry = None if structure.geometry is None else structure.geometry[structure.index(name)]
-            limits = taxels.type.minimum, taxels.type.maximum
-            try:
-                health = Health(taxels.module, geometry, resolution=taxels.resolution, limits=limits)
-            except ConfigurationError as error:  # places without neighbours
-                log.warning("%s of %r: dead and weak sensors are not found: %s", name, driver, error)
-                health = Health(taxels.module, resolution=taxels.resolution, limits=limits)
-            self._watched[name] = stage, health
-
-    def __bool__(self) -> bool:
-        return bool(self._watched)
-
-    def update(self, time_ns: int) -> None:
-        """Take in what the chain made of the frame of this time."""
-        for stage, health in self._watched.values():
-            if stage.calm is not None:
-                health.update(time_ns, stage.given, stage.calm)
-
-    def reports(self) -> dict[str, HealthReport]:
-        """Judge the sensors of each type, in the order of ``structure.index``."""
-        return {name: health.report() for name, (_, health) in self._watched.items()}
-
-    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        """Return what is known, by type: arrays by name, and ``uid``."""
-        structure = self._chain.structure
-        return {
-            name: {"uid": structure.sensor_uid[structure.index(name)], **health.state()}
-            for name, (_, health) in self._watched.items()
-        }
-
-    def restore(self, state: ChainState) -> None:
-        """Go on with what was known of these sensors, if the baselines saw the same values then.
-
-        Raises:
-            ConfigurationError: that is no such state.
-        """
-        if self._chain.fits(state):
-            for name, (_, health) in self._watched.items():
-                if name in state.health:
-                    known = state.health[name]
-                    health.restore(known, self._chain.rows_of(name, known["uid"]))
-
-    def faulty(self, reports: dict[str, HealthReport]) -> npt.NDArray[np.bool_]:
-        """Return (n_sensors,) bool: the sensors of the driver that have a fault in ``reports``."""
-        found = np.zeros(self._chain.structure.n_sensors, bool)
-        for name, report in reports.items():
-            found[self._chain.structure.index(name)] = report.faulty
-        return found

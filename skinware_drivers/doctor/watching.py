@@ -20,7 +20,7 @@ from skinware.realtime import now_ns
 from skinware.state import life_of, rate_now_hz, status_now
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader
 from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge, taxel_faults
 from skinware_drivers.doctor.evidence import DriverSeen, DriverTiming, HealthSeen

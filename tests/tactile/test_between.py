@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from skinware.geometry import Geometry
-from skinware.tactile.dues import MOST_PAIRS, Pairs
+from skinware.tactile.health_evidence import Pairs
 from skinware.tactile.neighbours import neighbours
 from tests.tactile.skins import PITCH_M, placed, triangles
 
@@ -29,9 +29,8 @@ def reference(position_m: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> 
 
 
 def found_by(pairs: Pairs, touched: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> set[tuple[int, int, int]]:
-    cell, one, other = pairs.around(np.flatnonzero(touched), touched)
-    sides = np.sort([one, other], axis=0)
-    return {(m, a, b) for m, a, b in zip((cell // MOST_PAIRS).tolist(), *sides.tolist(), strict=True)}
+    around = pairs.around(np.flatnonzero(touched), touched)
+    return {(m, min(a, b), max(a, b)) for m, a, b in zip(*(part.tolist() for part in around), strict=True)}
 
 
 def test_all_pairs_of_a_lattice_are_found_once() -> None:

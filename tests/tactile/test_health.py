@@ -8,11 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.health import Health, HealthSettings
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
 from skinware.tactile.testing import BENCH_S, Response, World, grid
 from tests.tactile.judging import Worlds
 from tests.tactile.skins import placed
@@ -51,11 +49,9 @@ def judged(world: World, settings: HealthSettings | None = None, until_s: float 
     baseline = Baseline(MODULE, SURFACE.patch)
     geometry = placed(SURFACE.position_m, normal=SURFACE.normal)
     health = Health(MODULE, geometry, settings, limits=(world.minimum, world.maximum))
-    for number, sample in enumerate(world.samples(until_s)):
+    for sample in world.samples(until_s):
         values = sample.values.astype(np.float32)
         health.update(sample.time_ns, values, baseline.update(sample.time_ns, values, sample.usable))
-        if not number % 20:
-            health.report()
     return health.report()
 
 
@@ -376,72 +372,3 @@ def test_settings_that_make_no_sense_are_refused(name: str, value: float) -> Non
 def test_places_of_other_taxels_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="health of 3 taxels: the places are of 2"):
         Health(np.zeros(3, int), placed([[0, 0, 0], [1, 0, 0]]))
-
-
-def gaps(world: World, taxels: npt.NDArray[np.int64], value: float, seed: int) -> None:
-    """Let each taxel lose contact now and then, for 3 s of 9 on average."""
-    random = np.random.default_rng(seed)
-    for taxel in taxels.tolist():
-        at_s = 7.0
-        while at_s < END_S:
-            at_s += random.exponential(6)
-            end_s = at_s + random.exponential(3)
-            world.missing([taxel], at_s, end_s, status=Status(0), value=value)
-            at_s = end_s
-
-
-@pytest.mark.thorough
-def test_exchanged_and_connected_taxels_are_named_and_their_neighbours_are_not_blamed() -> None:
-    """In 4 minutes of strokes; longer use finds more."""
-    world, taxels = plates(1), chosen(1)
-    one, other, leaking, hearing, loose = taxels.T
-    world.swap(one, other)
-    world.leak(leaking, hearing, 0.3)
-    gaps(world, loose, 15, 1)
-    report = judged(world, QUICK)
-    swapped = taxels[:, :2].ravel()
-    assert (report.kind[swapped] == HealthKind.SWAPPED).mean() >= 0.5
-    assert report.faulty[swapped].mean() >= 0.75
-    others = np.setdiff1d(np.arange(len(report.kind)), taxels)
-    assert not report.faulty[others].any(), told(report, others[report.faulty[others]])
-
-
-@pytest.mark.thorough
-def test_shorted_taxels_are_named_and_their_neighbours_are_not_blamed() -> None:
-    world, taxels = plates(1), chosen(1)
-    far, beside = taxels[:, :2], np.column_stack([taxels[:, 2], taxels[:, 2] + 1])
-    world.short(*far.T)
-    world.short(*beside.T)
-    gaps(world, taxels[:, 4], 0, 1)
-    report = judged(world, QUICK)
-    assert (report.kind[beside] == HealthKind.SHORTED).mean() >= 0.6
-    assert (report.kind[far] == HealthKind.SHORTED).mean() >= 0.3
-    planted = np.concatenate([taxels.ravel(), beside.ravel()])
-    others = np.setdiff1d(np.arange(len(report.kind)), planted)
-    assert not report.faulty[others].any(), told(report, others[report.faulty[others]])
-
-
-def test_evidence_of_confused_taxels() -> None:
-    report = HealthReport.unknown(6)
-    kinds = ("INTERMITTENT", "DYING", "SWAPPED", "SHORTED", "CROSSTALK")
-    report.kind[:5] = [HealthKind[name] for name in kinds]
-    report.returns[0], report.falls[0], report.lost[1], report.partner[2:5] = 4, 2, 0.4, 5
-    report.echo[2], report.echo[4] = 0.9, 0.2
-    assert [report.evidence(taxel) for taxel in range(6)] == [
-        "missed touches and felt others 4 times, fell by itself 2 times",
-        "lost 40 % of its share of touches",
-        "shows 90 % of what presses sensor 5",
-        "moves as one with sensor 5",
-        "shows 20 % of what presses sensor 5",
-        "",
-    ]
-
-
-def test_without_places_nothing_is_confused() -> None:
-    health, baseline = Health(np.zeros(3, int)), Baseline(np.zeros(3, int), np.zeros(3, int))
-    for number in range(600):
-        given = 10 + np.array([50, 50, 0]) * (number % 40 > 20) + number % 2
-        health.update(number * 100_000_000, given, baseline.update(number * 100_000_000, given))
-        if not number % 10:
-            health.report()
-    assert (health.report().partner == -1).all()

@@ -127,8 +127,6 @@ class Faults:
         noise: (n,) factor on its noise.
         stuck: (n,) the value that a taxel always shows; NaN: it is not stuck.
         source: (n,) the taxel whose data arrives in each one's place.
-        fades_per_h: (n,) share of its gain that a taxel loses in an hour.
-        leaks: shares of the load of taxels that others feel as well.
         missing: gaps.
         jumps: jumps.
     """
@@ -137,23 +135,12 @@ class Faults:
     noise: ArrayF
     stuck: ArrayF
     source: ArrayI
-    fades_per_h: ArrayF
-    leaks: list[tuple[ArrayI, ArrayI, float]] = field(default_factory=list)
     missing: list[Missing] = field(default_factory=list)
     jumps: list[Jump] = field(default_factory=list)
 
     @classmethod
     def none(cls, n: int) -> Faults:
-        return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n), np.zeros(n))
-
-    def felt(self, load: ArrayF, time_s: ArrayF) -> ArrayF:
-        """Return (m, n) what taxels feel of a load (m, n), at times (m, n)."""
-        felt: ArrayF = load * self.feels
-        for taxels, others, share in self.leaks:
-            felt[:, others] += share * load[:, taxels]
-        if self.fades_per_h.any():
-            felt *= np.maximum(1 - self.fades_per_h * time_s / 3600, 0)
-        return felt
+        return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
     def jumped(self, time_s: ArrayF, patch: ArrayI) -> tuple[ArrayF | None, npt.NDArray[np.bool_] | None]:
         """Return (m, n) what jumps add to the values, and (m, n) which are suspect; None if there is no jump yet.

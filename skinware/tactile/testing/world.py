@@ -232,20 +232,6 @@ class World:
         source = self.faults.source
         source[one], source[other] = source[other].copy(), source[one].copy()
 
-    def leak(self, taxels: Taxels, others: Taxels, share: float) -> None:
-        """Let ``others`` feel a share of the load of as many taxels beside their own, as crosstalk does."""
-        self.faults.leaks.append((self.surface.taxels(taxels), self.surface.taxels(others), share))
-
-    def short(self, first: Taxels, second: Taxels) -> None:
-        """Connect two equal numbers of taxels: both of a pair show the mean of their loads."""
-        one, other = self.surface.taxels(first), self.surface.taxels(second)
-        for taxels, others in ((one, other), (other, one)):
-            self.faults.leaks += [(taxels, others, 0.5), (taxels, taxels, -0.5)]
-
-    def fade(self, taxels: Taxels, per_h: float) -> None:
-        """Let taxels lose a share of their gain in each hour."""
-        self.faults.fades_per_h[self.surface.taxels(taxels)] = per_h
-
     def missing(
         self,
         taxels: Taxels,
@@ -379,7 +365,7 @@ class _State:
         load, missing = world.loads(time_s)
         signal = self._signal(time_s, load)
         if world.response.sag:
-            signal -= world.faults.felt(missing, time_s[:, surface.patch])
+            signal -= missing * world.faults.feels
         jumped, suspect = world.faults.jumped(time_s, surface.patch)
         if jumped is not None:
             signal += jumped
@@ -398,7 +384,7 @@ class _State:
         world, faults = self._world, self._world.faults
         m, n = load.shape
         signal: ArrayF = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
-        felt = faults.felt(load, time_s[:, world.surface.patch])
+        felt = load * faults.feels
         signal += felt
         if world.response.creep or world.response.remainder:
             moved = np.flatnonzero(felt.any(axis=0) | (self._crept > 1e-3))

@@ -264,7 +264,7 @@ def test_what_cannot_be_done_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
             assert not file.exists()
 
         with ServiceWriter("robot", {"point": ("<f8", 3), "point_m": ("<f8", 2), "count": ("<i8", 3)}):
-            refused(touch, 2, "'point_m' of 'robot' is (2,); poses are (3,)")
+            refused(touch, 2, "'point_m' of 'robot' is (2,); give (3,)")
             refused([*touch, "--column", "nose"], 2, "no column 'nose'; there are: point, point_m, count")
             refused([*touch, "--column", "count"], 2, "of floats")
             touch += ["--column", "point"]
@@ -281,16 +281,21 @@ def test_what_cannot_be_done_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
         refused(["topology", "-o", str(file), "--share", "2"], 2, "0<=x<=1")
 
 
+def force_session(n: int, *, follows: bool = True) -> ForceSession:
+    """Two minutes of presses on four of n taxels, which the reference follows or not."""
+    session = ForceSession(n)
+    for number in range(2400):
+        force_n = max(0.0, 3 * np.sin(number / 20) * (1 + number % 3))
+        load = np.zeros(n)
+        load[number // 126 % 4] = round(40 * force_n)
+        session.take(number * 50_000_000, load, np.array([force_n if follows else number % 7, np.nan]))
+    return session
+
+
 def test_forces_from_gathered_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, surface = tmp_path / "curves.toml", triangles(1)
     with publishing(calm_skin(surface)) as skin:
-        session = ForceSession(len(surface))
-        for number in range(2400):
-            force_n = max(0.0, 3 * np.sin(number / 20) * (1 + number % 3))
-            load = np.zeros(len(surface))
-            load[number // 126 % 4] = round(40 * force_n)
-            session.take(number * 50_000_000, load, np.array([force_n, np.nan]))
-        gathered(file, session, skin.structure)
+        gathered(file, force_session(len(surface)), skin.structure)
         assert exit_status(command, ["force", "-o", str(file)]) == 2
         capsys.readouterr()
         assert exit_status(command, ["force", "-o", str(file), "-T", "0", "--json"]) == 0

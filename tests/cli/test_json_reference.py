@@ -42,7 +42,7 @@ from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
-from tests.cli.test_calibrate import calm_skin, finger_presses, stroked_state, strokes
+from tests.cli.test_calibrate import calm_skin, finger_presses, force_session, gathered, stroked_state, strokes
 from tests.cli.test_contacts import touched_skin
 from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
 from tests.cli.test_sensor_health import looked_after
@@ -193,16 +193,16 @@ def test_a_driver_and_those_that_look_at_it(
             (namespace.path / "broken.ring").unlink()
         (rows,) = printing(info, "roboskin", "--sensors")
         check("`skin-info NAME --sensors`", rows)
-        check(
-            "`skin-dump`",
-            *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--counts"),
-            *printing(dump, "roboskin", "-n", "1"),
-        )
         with running(
             "skin-calm", "roboskin", "--into", calm_namespace.name, "--state", str(tmp_path / "state.npz")
         ) as calm:
             check("`ready` of a calmed driver", calm.wait_for("ready"))
             status = calm.wait_for("status", lambda status: bool(status["touched"]))
+            check(
+                "`skin-dump`",
+                *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--counts"),
+                *printing(dump, "roboskin", "-n", "1", "--namespace", calm_namespace.name),
+            )
             check("`status`, `stopped` of a calmed driver", status, calm.stop())
         check("`skin-wipe`", *wiping())
         check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
@@ -417,6 +417,11 @@ def test_calibrate(printing: Print, tmp_path: Path) -> None:
         live = [topology.wait_for("ready"), topology.wait_for("progress"), topology.stop()]
         stroked_state(file, skin.structure)
         live += printing(calibrate, "topology", "-o", str(file), "-T", "0")
+        for follows in (True, False):
+            gathered(tmp_path / "curves.toml", force_session(len(surface), follows=follows), skin.structure)
+            live += printing(
+                calibrate, "force", "-o", str(tmp_path / "curves.toml"), "-T", "0", status=int(not follows)
+            )
         wrong = skin.structure.geometry
         assert wrong is not None
         wrong.position_m[:] = np.roll(wrong.position_m, len(surface) // 2, axis=0)  # exchanged patches

@@ -241,17 +241,17 @@ def test_two_drivers_on_one_bus_are_told_apart(recording: Callable[..., Recordin
 
 
 @pytest.mark.thorough
-def test_what_is_cut_or_lost_is_told(recording: Callable[..., Recording], tmp_path: Path) -> None:
+def test_what_is_cut_or_missed_is_told(recording: Callable[..., Recording], tmp_path: Path) -> None:
     def fill(taps: dict[tuple[str, str], WireTap]) -> None:
         keep(taps, "torso", "can0", [Sent(0, 0x100, bytes(8), flags=0x84)])
         for _ in range(60_000):
             taps["torso", "can0"].keep_frame(MONOTONIC_NS, 0x123, b"abc")
 
     told = export_candump(recording(fill), tmp_path / "wire.log")
-    lost = 60_001 - told.counts["can0"]
-    assert lost > 0
+    missed = 60_001 - told.counts["can0"]
+    assert missed > 0
     assert told.notes == [
-        f"can0 of torso: {lost} lost while it was recorded",
+        f"can0 of torso: {missed} missed while it was recorded",
         "1 CAN FD frames without their end: their driver knows none that are so long",
     ]
 

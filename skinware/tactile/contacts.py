@@ -197,7 +197,6 @@ class Contacts:
         pitch = pitch_m(geometry)
         median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
         self._tracker = Tracker(self._of_taxel[:, :3], median_m, tracking)
-        self._nothing = {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in COLUMNS.items()}
 
     @classmethod
     def of(
@@ -255,7 +254,7 @@ class Contacts:
         taxels = np.flatnonzero(touched if onset is None else touched | onset)
         contact_of = np.full(self._n, NO_CONTACT, np.int16)
         if not len(taxels) and self._tracker.rests(time_ns):
-            nothing = {name: column.copy() for name, column in self._nothing.items()}
+            nothing = {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in COLUMNS.items()}
             return ContactSet(contact_of=contact_of, beyond=0, frames=self.frames, **nothing)
         contact, count = self._components.of(taxels)
         load = value[taxels].astype(np.float64)

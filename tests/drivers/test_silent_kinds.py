@@ -20,7 +20,7 @@ _LEAST_S, _PERIODS = 2.0, 20
 
 
 class Row(NamedTuple):
-    """What a silent kind makes stale, the state of that patch, and the counter that shows it."""
+    """Effects of a silent kind: what becomes stale, the state of the patch, and the counter that shows it."""
 
     driver: str
     kind: str

@@ -55,11 +55,13 @@ export class Names {
     const placed = [];
     for (const part of this.#parts) {
       const depth = stage.project(...part.middle)[2];
+      const pixels = depth > 0 ? (part.diameter * stage.pixels) / depth : 0;
+      const times = isNumbered(part.name) && !part.size ? NUMBERED : 1;
+      if (pixels <= FADED * times * widthOf(part.name) || part.isAway(eye)) continue; // most, where there are many
       const text = part.total ? `${part.name}  ${measure(part.total, part.sheet.unit)}` : part.name;
       const label = { text, width: widthOf(text), alpha: 0 };
-      const room = label.width * (isNumbered(part.name) && !part.size ? NUMBERED : 1);
-      const share = depth > 0 ? (part.diameter * stage.pixels) / depth / room : 0;
-      if (share <= FADED || part.isAway(eye)) continue;
+      const share = pixels / (times * label.width);
+      if (share <= FADED) continue;
       const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
       label.x = seen.reduce((sum, at) => sum + at[0], 0) / 8;
       label.y = Math.min(...seen.map((at) => at[1])) - LINE / 2;

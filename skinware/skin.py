@@ -13,7 +13,7 @@ from skinware.errors import Closed, ConfigurationError, Overrun, ServiceNotFound
 from skinware.geometry import Geometry
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
-from skinware.memory.take import NEWER, NEWEST, Take, take_of
+from skinware.memory.ring_reader import NEWER, NEWEST, Take
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._reader import Tap
 from skinware.skin_layout import SkinLayout
@@ -189,7 +189,7 @@ class Skin:
         """Leave the looks after this one to C until something else happens than samples."""
         rings = [reader.ring_in_c() for reader in self._drivers.readers.values()]
         if self._in_c is None or self._in_c.rings != rings:
-            self._in_c = take_of(rings)
+            self._in_c = Take(rings, is_loop=False) if 1 <= len(rings) <= futex.MAX_WORDS else None
         self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> Snapshot | None:

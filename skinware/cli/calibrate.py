@@ -358,7 +358,7 @@ def _opened(
     from skinware.memory.namespace import Namespace
     from skinware.service import ServiceReader
     from skinware.tactile.calibration.sources import LoadSource, PoseSource
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     with ExitStack() as stack:
         reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))

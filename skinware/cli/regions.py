@@ -90,7 +90,7 @@ def paint(
     """
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Region, put_region, read_regions
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
@@ -126,8 +126,8 @@ class _Painter:
         import numpy as np
 
         from skinware.tactile.neighbours import neighbours, without_holes
-        from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
+        from skinware.views.live import after, enter_pressed, frames_until
 
         for frame in frames_until(self._reader, after(SETTLING_S)):
             self._touched(frame)

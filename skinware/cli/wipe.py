@@ -52,7 +52,7 @@ def command(
     Exit status: 0 every sensor answered, 1 some never did or the driver failed, 2 wrong usage.
     """
     from skinware.memory.namespace import Namespace
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     with reader_of(Namespace(namespace), name, "skin-wipe NAME") as reader:
         wipe = _Wipe(reader, type_name, as_json)
@@ -77,8 +77,8 @@ class _Wipe:
         self._is_redrawing = not as_json and sys.stdout.isatty()
 
     def go_on(self, duration_s: float | None) -> None:
-        from skinware.views.driver_snapshots import after
         from skinware.views.history import SETTLING_S, threshold
+        from skinware.views.live import after
 
         resting = None
         for frame, physical in self._frames(SETTLING_S):
@@ -144,7 +144,7 @@ class _Wipe:
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Yield snapshots with their (n_sensors,) physical values."""
-        from skinware.views.driver_snapshots import after, frames_until
+        from skinware.views.live import after, frames_until
         from skinware.views.quantities import physical_values
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):

@@ -18,7 +18,7 @@ from skinware.ros2.topics import DriverTopics, Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service import ServiceReader
 from skinware.service._reader import wake_word_of
-from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, bus_state_name, life_of
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, WITHOUT_NEWS, life_of
 from skinware.status import BusState
 from skinware.views.live import LiveDriver, LiveDrivers
 
@@ -30,9 +30,9 @@ _TARE_S = 10.0
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 _LEVEL_OF_LIFE = {SILENT: DiagnosticLevel.STALE, PAUSED: DiagnosticLevel.WARN, DEAD: DiagnosticLevel.ERROR}
 _LEVEL_OF_BUS = {
-    bus_state_name(BusState.LIVE): DiagnosticLevel.OK,
-    bus_state_name(BusState.CONNECTING): DiagnosticLevel.WARN,
-    bus_state_name(BusState.SILENT): DiagnosticLevel.WARN,
+    BusState.LIVE.name.lower(): DiagnosticLevel.OK,
+    BusState.CONNECTING.name.lower(): DiagnosticLevel.WARN,
+    BusState.SILENT.name.lower(): DiagnosticLevel.WARN,
 }
 
 

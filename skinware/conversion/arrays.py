@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import h5py
-from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, sensor_table
+from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, package, sensor_table
 
 FORMAT, VERSION = "skinware-arrays", 1
 
@@ -137,9 +136,9 @@ def write_hdf5(source: TableSource, path: Path) -> None:
         MissingExtra: h5py is not installed.
         OSError: it cannot be written.
     """
-    package = h5py()
+    hdf5 = package("h5py", "HDF5")
     with contextlib.closing(_GuardedFile(path)) as stream:
-        with package.File(stream, "w") as file:
+        with hdf5.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
             file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))
         stream.check()

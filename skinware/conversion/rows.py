@@ -13,7 +13,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import pyarrow
 from skinware.conversion.arrays import description
 from skinware.conversion.tables import (
     COLUMNS,
@@ -25,6 +24,7 @@ from skinware.conversion.tables import (
     TableSource,
     check_distinct,
     outputs,
+    pyarrow,
     sensor_table,
 )
 from skinware.realtime import NS_PER_S

@@ -22,6 +22,7 @@ from skinware.matrices import rows_and_columns
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
+from skinware.state import state_name
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
@@ -104,13 +105,13 @@ class Showing:
             "sequence": frame.sequence,
             "age_ms": (frame.published_ns - frame.acquired_ns) / 1e6,
             "patches": [
-                {"name": name, "state": _name(PatchState, state), "fresh": count}
+                {"name": name, "state": state_name(PatchState, state), "fresh": count}
                 for name, state, count in zip(
                     structure.patch_names, frame.patch_state.tolist(), fresh.tolist(), strict=True
                 )
             ],
             "buses": [
-                {"name": name, "state": _name(BusState, state), "load": load / 1000}
+                {"name": name, "state": state_name(BusState, state), "load": load / 1000}
                 for name, state, load in zip(
                     structure.buses, frame.bus_state.tolist(), frame.bus_load.tolist(), strict=True
                 )
@@ -126,13 +127,6 @@ def in_topic(text: str) -> str:
     """A text as a part of a ROS topic: letters, digits and underscores, no digit first."""
     plain = _NOT_IN_TOPICS.sub("_", text)
     return f"_{plain}" if not plain or plain[0].isdigit() else plain
-
-
-def _name(kind: Any, number: int) -> str:
-    try:
-        return str(kind(number).name.lower())
-    except ValueError:
-        return str(number)
 
 
 class _Cloud:

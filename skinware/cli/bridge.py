@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli import bridge_ros2, bridge_yarp
+from skinware.cli._middlewares import ros2, yarp
 from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json
 
@@ -36,7 +36,7 @@ def command() -> None:
     """
 
 
-for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
+for _each in (route, list_robots, ros2, yarp):
     command.add_command(_each)
 
 

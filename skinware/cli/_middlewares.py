@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import echo, print_json, say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -130,10 +130,8 @@ def ros2(
         )
         with contextlib.closing(server), cli.signals_end(server.stop):
             where = f"{identity.prefix}/{identity.name}"
-            if as_json:
-                print_json({"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name})
-            else:
-                echo(f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
+            ready = {"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
+            say(as_json, ready, f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
             server.run(_topics_status(server, as_json))
 
 
@@ -245,13 +243,10 @@ def yarp(
     place, known_by = Namespace(namespace), _name_server(server)
     yarp_server = YarpServer(place, settings, known_by, print_json if as_json else _show_port)
     with contextlib.closing(yarp_server), cli.signals_end(yarp_server.stop):
-        if as_json:
-            address = f"{known_by.host}:{known_by.port}"
-            print_json({"event": "ready", "namespace": place.name, "server": address, "listen": host})
-            yarp_server.run(_ports_status(yarp_server))
-        else:
-            echo(f"namespace {place.name!r} as ports {settings.prefix}/..., {known_by} (Ctrl-C ends)")
-            yarp_server.run()
+        address = f"{known_by.host}:{known_by.port}"
+        ready = {"event": "ready", "namespace": place.name, "server": address, "listen": host}
+        say(as_json, ready, f"namespace {place.name!r} as ports {settings.prefix}/..., {known_by} (Ctrl-C ends)")
+        yarp_server.run(_ports_status(yarp_server) if as_json else lambda: None)
 
 
 def _name_server(text: str | None) -> NameServer:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, overwrite, print_json, terminal_width
+from skinware.cli._terminal import echo, overwrite, print_json, say, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
 if TYPE_CHECKING:
@@ -192,12 +192,10 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
 
 def _ready(recording: Recording, names: Sequence[str], namespace: str, as_json: bool) -> None:
     published = list(names or recording.services)
-    if as_json:
-        ready = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
-        print_json({**ready, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
-    else:
-        what = ", ".join(published) or "nothing"
-        echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
+    ready: dict[str, Any] = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
+    ready |= {"duration_s": recording.duration_s, "is_whole": recording.is_whole}
+    text = f"{recording.path}, {recording.duration_s:.1f} s: {', '.join(published) or 'nothing'} in"
+    say(as_json, ready, f"{text} namespace {namespace!r} (Ctrl-C ends)")
 
 
 def _report(event: str, replayer: Replayer, as_json: bool) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, overwrite, print_json
+from skinware.cli._terminal import echo, overwrite, print_json, say
 from skinware.text import count_text, figure_text, plural, status_text
 
 if TYPE_CHECKING:
@@ -87,13 +87,11 @@ class _Wipe:
         if resting is not None:
             self._test.follow(*resting)  # the first press may be there before the next snapshot
         needed = threshold(self._rest.noise(self._type.name))
-        if self._as_json:
-            what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
-            print_json({"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())})
-        else:
-            more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
-            tested = plural(len(self._tested()), f"{self._type.name} sensor")
-            echo(f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
+        what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
+        more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
+        tested = plural(len(self._tested()), f"{self._type.name} sensor")
+        ready = {"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())}
+        say(self._as_json, ready, f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
         is_due = after(_REPORT_EVERY_S)
         for frame, physical in self._frames(duration_s):
             self._test.follow(physical, frame.status == 0)

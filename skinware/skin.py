@@ -196,14 +196,18 @@ class Skin:
         readers = list(self._drivers.readers.values())
         if not readers or self._moved_on():
             return None  # no driver, or between two lives of one
-        if known is not None and known.layout is self._layout and not _has_newer(readers, known):
+        known_at = None
+        if known is not None and known.layout is self._layout:
+            known_at = [frame.position for frame in known.samples]
+        if known_at == [reader.latest for reader in readers]:
             return None
         try:
             samples = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
         except Overrun:
             return None
-        snapshot = Snapshot(self._layout, samples)
-        return None if align and known is not None and _same_samples(snapshot, known) else snapshot
+        if align and known_at == [frame.position for frame in samples]:
+            return None
+        return Snapshot(self._layout, samples)
 
     def _moved_on(self) -> bool:
         """Return whether a driver closed, or began another generation; a killed one is found by ``_discover``."""
@@ -310,16 +314,6 @@ def _nearest(readers: list[_SkinReader]) -> tuple[DriverSnapshot, ...]:
     ]
     moment_ns = min(reached_ns or newest_ns)
     return tuple(reader.nearest(moment_ns) for reader in readers)
-
-
-def _has_newer(readers: list[_SkinReader], known: Snapshot) -> bool:
-    return any(reader.latest != frame.position for reader, frame in zip(readers, known.samples, strict=True))
-
-
-def _same_samples(one: Snapshot, other: Snapshot) -> bool:
-    return one.layout is other.layout and all(
-        a.position == b.position for a, b in zip(one.samples, other.samples, strict=True)
-    )
 
 
 def _too_old(snapshot: Snapshot, max_age_s: float) -> list[str]:

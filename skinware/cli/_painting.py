@@ -83,6 +83,7 @@ def _ansi(numbers: Sequence[int]) -> Colours:
 
 _GROUND = ColorTriplet(18, 18, 18)
 """Colour of the screen."""
+_BLACK, _WHITE = ColorTriplet(0, 0, 0), ColorTriplet(255, 255, 255)
 _VIRIDIS = _between(
     (
         "#482475",
@@ -214,7 +215,9 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
         return " ", Style.null()
     ground = colour_of(upper, palette)
     mark, level = divmod(upper, LEVELS)
-    ink = palette.ramp[level] if mark == heat.STALE else _ink(ground)
+    red, green, blue = ground
+    readable = _BLACK if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else _WHITE
+    ink = palette.ramp[level] if mark == heat.STALE else readable
     return _character(upper, palette), Style(color=_colour(ink), bgcolor=_colour(ground))
 
 
@@ -223,12 +226,6 @@ def _character(code: int, palette: Palette) -> str:
         return " "
     mark, level = divmod(code, LEVELS)
     return palette.characters[level] if palette.characters and mark == heat.FRESH else MARK_CHARACTERS.get(mark, "?")
-
-
-def _ink(colour: ColorTriplet) -> ColorTriplet:
-    """Return black or white, whichever can be read on a colour."""
-    red, green, blue = colour
-    return ColorTriplet(0, 0, 0) if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else ColorTriplet(255, 255, 255)
 
 
 def _colour(triplet: ColorTriplet) -> Color:

@@ -145,21 +145,14 @@ class _Cloud:
         self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
     ) -> ViewerMessage:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
-        self.points["age"] = _ages_s(frame)[frame.structure.sensor_group[self._index]]
+        seen_ns = frame.group_time_ns[frame.structure.sensor_group[self._index]]
+        self.points["age"] = np.where(seen_ns, (frame.published_ns - seen_ns) / NS_PER_S, np.nan)
         cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
         for number, (name, kind) in enumerate(_FIELDS):
             cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
         cdr.numbers("?", False).numbers("I", _POINT.itemsize, self.points.nbytes).array(self.points)
         is_dense = bool(np.isfinite(self.points["intensity"]).all())
         return ViewerMessage(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
-
-
-def _ages_s(frame: DriverSnapshot) -> npt.NDArray[np.float32]:
-    """(n_groups,) how old the data of each was when the frame was published, s; NaN: never seen."""
-    seen_ns = frame.group_time_ns
-    ages_s: npt.NDArray[np.float32] = ((frame.published_ns - seen_ns) / NS_PER_S).astype(np.float32)
-    ages_s[seen_ns == 0] = np.nan
-    return ages_s
 
 
 def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:

@@ -117,15 +117,10 @@ class _Piece:
     """
 
     def __init__(self, size: int, starts: Sequence[int]) -> None:
-        self._bytes = np.zeros(size, np.uint8).view(_Memory)
-        self.in_c = (ctypes.c_char * size).from_buffer(self._bytes.data)
-        self.headers = [self._bytes.data[start:].cast("Q") for start in starts]
+        self.bytes = np.zeros(size, np.uint8).view(_Memory)
+        self.in_c = (ctypes.c_char * size).from_buffer(self.bytes.data)
+        self.headers = [self.bytes.data[start:].cast("Q") for start in starts]
         self.lease: Callable[[], object] = lambda: None
-
-    def lend(self) -> Any:
-        lent = self._bytes.view()
-        self.lease = weakref.ref(lent)
-        return lent
 
 
 class Take(Generic[SampleT]):
@@ -168,7 +163,8 @@ class Take(Generic[SampleT]):
 
     def samples_in(self, piece: _Piece) -> tuple[SampleT, ...]:
         """Return the samples that C has written into a piece of memory, one of each ring."""
-        lent, ring = piece.lend(), self.rings[0]
+        lent: Any = piece.bytes.view()
+        piece.lease, ring = weakref.ref(lent), self.rings[0]
         first = ring.frame_class(ring, lent, 0, None, piece.headers[0])
         if len(self.rings) == 1:
             return (first,)

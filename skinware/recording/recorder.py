@@ -284,7 +284,7 @@ class _Coder(threading.Thread):
             about = {**wires.about, "buses": dict(zip(wires.buses, wires.about.get("buses", ()), strict=False))}
             self._abouts += 1
             channel, schema = self.channels.of_about(wires.driver)
-            self._pending.add_head(Head(channel, schema, self._abouts, json.dumps(about).encode()))
+            self._pending.heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
     def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
         channel, schema = self.channels.of_service(service, FRAME)

@@ -119,7 +119,9 @@ class Viewer:
         if self._exact:
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         self._asked = False
-        for question in self._next_questions():
+        firsts = {type(question): question for question in reversed(self._questions)}.values()  # one of each kind
+        self._questions = [question for question in self._questions if question not in firsts]
+        for question in firsts:
             header |= self._answer(question, blobs)
         if self._error is not None:
             header["error"], self._error = self._error, None
@@ -246,12 +248,6 @@ class Viewer:
             "status": int(driver.status[position]),
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
-
-    def _next_questions(self) -> list[looks.Names | looks.Series]:
-        """Take the first question of each kind from those that wait."""
-        firsts = list({type(question): question for question in reversed(self._questions)}.values())
-        self._questions = [question for question in self._questions if question not in firsts]
-        return firsts
 
     def _answer(self, question: looks.Names | looks.Series, blobs: Blobs) -> dict[str, Any]:
         driver = self._follower.get(question.driver)

@@ -178,7 +178,10 @@ class Joined:
     def __init__(self, join: Join) -> None:
         self.name, self.path = join.feature, join.path
         columns = _read(join.path)
-        self._time = self._time_column(columns)
+        found = [name for name in TIMES if name in columns]
+        if len(found) != 1:
+            raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
+        self._time = found[0]
         self._times = columns[self._time]
         if self._times.dtype.kind not in "iuf" or not np.isfinite(self._times.astype(np.float64)).all():
             raise ConfigurationError(f"{self.path}: {self._time} is not numbers")
@@ -234,12 +237,6 @@ class Joined:
         at = np.maximum(np.searchsorted(wall, wall_ns, side="right") - 1, 0)
         on_axis: npt.NDArray[np.int64] = wall_ns + (axis - wall)[at]
         return on_axis
-
-    def _time_column(self, columns: Columns) -> str:
-        found = [name for name in TIMES if name in columns]
-        if len(found) != 1:
-            raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
-        return found[0]
 
     def _joined(self, columns: Columns) -> tuple[list[str], npt.NDArray[Any]]:
         if len(columns) == 1:

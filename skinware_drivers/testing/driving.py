@@ -23,8 +23,7 @@ from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.streams.tcp import TcpServerBus
-from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.waiting import SLOWER
+from skinware_drivers.testing.waiting import SLOWER, defect, require
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 

@@ -298,7 +298,7 @@ def emulated_skin(
             line = make_bus(bus, payload_size=adapter.payload_size)
         else:
             hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))
-            line = VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
+            line = VirtualCanBus("", hardware=hardware, payload_size=adapter.payload_size)
         driving = running.enter_context(driving_lines([(adapter, line)], name))
         reader = running.enter_context(DriverReader(name, timeout_s=_LONGEST_S))
         yield EmulatedSkin(driving, reader, line, hardware)

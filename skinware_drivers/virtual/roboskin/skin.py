@@ -54,7 +54,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         self, options: EmulatedRoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
     ) -> None:
         super().__init__(options, log=log)
-        self.source = cycle_pattern if source is None and options.pattern == "cycle" else source
+        self._source = cycle_pattern if source is None and options.pattern == "cycle" else source
         self.skin = PressedSkin(options)
         n_boards = len(options.boards)
         self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
@@ -113,7 +113,8 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
 
     def make_device(self, number: int, now_ns: int) -> EmulatedBoard:
         kind = Mtb3 if number in self.options.mtb3 else Mtb4
-        return kind(number, self, self.wire.attach(), now_ns, self._phases[self.options.boards.index(number)])
+        phase = self._phases[self.options.boards.index(number)]
+        return kind(number, self, self.wire.attach(), now_ns, phase=phase, skin=self.skin, source=self._source)
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
         options = self.options

@@ -72,7 +72,7 @@ class Scheduled(NamedTuple):
     action: Callable[[int], object]
 
 
-class Care(Protocol):
+class TimerOwner(Protocol):
     """The emulator of a device, as its timers call it."""
 
     @property
@@ -98,7 +98,7 @@ class Device:
         random: source of the faults of its frames.
     """
 
-    def __init__(self, number: int, stage: Care, transmitter: Transmitter, now_ns: int) -> None:
+    def __init__(self, number: int, stage: TimerOwner, transmitter: Transmitter, now_ns: int) -> None:
         self.number = number
         self.stage = stage
         self.transmitter = transmitter

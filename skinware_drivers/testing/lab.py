@@ -4,10 +4,11 @@
     python -m skinware_drivers.testing.lab packages               list the Debian packages that it needs
     python -m skinware_drivers.testing.lab run [-T S] -- COMMAND  run COMMAND in this folder, and exit with its status
     python -m skinware_drivers.testing.lab --kernel rt ...        the same with a PREEMPT_RT kernel
+    python -m skinware_drivers.testing.lab --kernel user ...      the same with User-Mode Linux
 
 The guest reads this machine's files; its own files end with it. It has vcan, and two emulated CAN controllers on one
 wire: can0 and can1. SKINWARE_CAN_LAB is 1 inside, and SKINWARE_CAN_LAB_KERNEL names the kernel. The processor is
-emulated, so that times mean nothing.
+emulated, so that times mean nothing. User-Mode Linux emulates no processor, boots in three seconds and has vcan alone.
 """
 
 from __future__ import annotations
@@ -36,11 +37,15 @@ BOOT_S = 300.0
 """Time for a boot, ten times the usual."""
 UP = b"CAN lab: up\n"
 """Printed by the guest after its boot."""
-PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
-COMMANDS = ("ip", "modprobe", "file")
-"""Commands that are needed here or in the guest, beside those of every machine; virtme-ng uses ``file``."""
-IMAGES = {"plain": "linux-image-amd64", "rt": "linux-image-rt-amd64"}
-"""Kernels to choose from, and their Debian packages."""
+MACHINE = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
+PACKAGES = {
+    "plain": MACHINE.format(image="linux-image-amd64"),
+    "rt": MACHINE.format(image="linux-image-rt-amd64"),
+    "user": "user-mode-linux iproute2 kmod",
+}
+"""Kernels to choose from, and the Debian packages that the lab needs with them."""
+USER_KERNEL = "linux.uml"
+USER_MODULES = Path("/usr/lib/uml/modules")
 
 
 def find_kernel(flavour: str) -> Path | None:
@@ -76,13 +81,15 @@ def find_busybox() -> str | None:
 
 def missing(flavour: str) -> list[str]:
     """Return what this machine lacks, a line each; empty if the lab can run."""
-    lacks = []
+    commands = ("ip", "modprobe") if flavour == "user" else ("ip", "modprobe", "file")  # virtme-ng uses the last
+    lacks = [f"the command {name}" for name in commands if _which(name) is None]
+    if flavour == "user":
+        return lacks + ([] if _which(USER_KERNEL) and USER_MODULES.is_dir() else ["User-Mode Linux"])
     if _which("qemu-system-x86_64") is None:
         lacks.append("qemu-system-x86_64")
     if find_kernel(flavour) is None:
         kind = "a PREEMPT_RT kernel" if flavour == "rt" else "a kernel"
         lacks.append(f"{kind} with CAN modules in /boot and /lib/modules")
-    lacks += [f"the command {name}" for name in COMMANDS if _which(name) is None]
     if _which("file") is None or find_busybox() is None:
         lacks.append("a statically linked busybox")
     if find_vng() is None:
@@ -100,20 +107,42 @@ def _path() -> str:
 
 def guest_script(flavour: str, command: list[str], folder: Path) -> str:
     """Return the script that the guest runs."""
-    return f"""
-        set -e
-        echo CAN lab: up
-        export PATH={shlex.quote(_path())} SKINWARE_CAN_LAB=1 SKINWARE_CAN_LAB_KERNEL={flavour}
-        export PYTHONDONTWRITEBYTECODE=1 HOME=/tmp HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
-        modprobe -a {MODULES}
-        echo 100000 >/proc/sys/net/core/netdev_max_backlog
-        ip link set lo up
+    modules = MODULES
+    mount_files = """
         mountpoint -q /dev/shm || mount -t tmpfs tmpfs /dev/shm
         mkdir /run/lab && mount -t tmpfs tmpfs /run/lab && cd /run/lab && mkdir files new work all
         mount -t 9p -o ro,trans=virtio,version=9p2000.L,cache=loose,msize=512000 lab-files files
         mount -t overlay -o lowerdir=files,upperdir=new,workdir=work overlay all
         for folder in proc sys dev run; do mount --rbind /$folder all/$folder; done
-        exec chroot all bash -c {shlex.quote(f"cd {shlex.quote(str(folder))} && exec {shlex.join(command)}")}
+    """
+    if flavour == "user":
+        modules = MODULES.replace(" kvaser_pci", "")
+        mount_files = f"""
+        mount -t proc proc /proc && mount -t sysfs sys /sys && mount -t tmpfs tmpfs /run
+        modules={USER_MODULES}/$(uname -r)
+        insmod $modules/kernel/fs/overlayfs/overlay.ko
+        cd /run && mkdir new work all
+        mount -t overlay -o lowerdir=/,upperdir=new,workdir=work overlay all
+        mount -t devtmpfs dev all/dev && mkdir -p all/dev/shm all/dev/pts all/lib/modules/$(uname -r)
+        mount --bind $modules all/lib/modules/$(uname -r)
+        mount -t devpts -o ptmxmode=666 devpts all/dev/pts
+        for folder in dev/shm run tmp; do mount -t tmpfs tmpfs all/$folder; done
+        for folder in proc sys; do mount --rbind /$folder all/$folder; done
+    """
+    within = f"""
+        set -e
+        modprobe -a {modules}
+        echo 100000 >/proc/sys/net/core/netdev_max_backlog
+        ip link set lo up
+        cd {shlex.quote(str(folder))} && exec {shlex.join(command)}
+    """
+    return f"""
+        set -e
+        export PATH={shlex.quote(_path())} SKINWARE_CAN_LAB=1 SKINWARE_CAN_LAB_KERNEL={flavour}
+        export PYTHONDONTWRITEBYTECODE=1 HOME=/tmp HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
+        {mount_files}
+        echo CAN lab: up
+        exec chroot all bash -c {shlex.quote(within)}
     """
 
 
@@ -128,18 +157,47 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
         The command's exit status; 1 if the lab cannot run here; 124 after the timeout, or if the guest does not boot.
     """
     lacks = missing(flavour)
-    kernel, vng = find_kernel(flavour), find_vng()
-    if lacks or kernel is None or vng is None:
+    if lacks:
         return report(flavour, lacks)
-    # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
-    arguments = [vng, "--run", str(kernel), "--disable-kvm", "--force-9p", "--disable-microvm", "--cpus", "2"]
-    arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
-    environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
-    with tempfile.NamedTemporaryFile("w", prefix="skinware-lab-") as script:
+    with tempfile.TemporaryDirectory(prefix="skinware-lab-") as place:
         # in a file: a kernel takes 2,048 characters from its command line, and hangs without the rest
-        script.write(guest_script(flavour, command, folder))
-        script.flush()
-        return boot([*arguments, "--exec", f"bash {shlex.quote(script.name)}"], environment, timeout_s)
+        script = Path(place) / "guest"
+        script.write_text(guest_script(flavour, command, folder))
+        if flavour == "user":
+            return _run_in_user_mode(script, timeout_s)
+        return _run_in_machine(flavour, script, timeout_s)
+
+
+def _run_in_machine(flavour: str, script: Path, timeout_s: float) -> int:
+    vng = find_vng() or ""
+    # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
+    arguments = [vng, "--run", str(find_kernel(flavour)), "--disable-kvm", "--force-9p", "--disable-microvm"]
+    arguments += ["--cpus", "2", "--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
+    environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
+    return boot([*arguments, "--exec", f"bash {shlex.quote(str(script))}"], environment, timeout_s)
+
+
+def _run_in_user_mode(script: Path, timeout_s: float) -> int:
+    """Boot User-Mode Linux, whose own exit status says nothing: the guest writes the command's into a file."""
+    status = script.with_name("status")
+    first = script.with_name("init")
+    first.write_text(f"""#!/bin/bash
+        exec >/dev/console 2>&1
+        stty -onlcr </dev/console
+        PATH={shlex.quote(_path())}
+        bash {script}
+        code=$?
+        mount -t hostfs -o {script.parent} none /mnt && echo $code >/mnt/{status.name}
+        echo 1 >/proc/sys/kernel/printk
+        echo o >/proc/sysrq-trigger
+        sleep 60
+    """)
+    first.chmod(0o755)
+    kernel = [_which(USER_KERNEL) or "", "rootfstype=hostfs", "rootflags=/", "ro", "mem=2G", f"init={first}"]
+    booted = boot(
+        [*kernel, "con=null", "con0=null,fd:1", "quiet"], {**os.environ, "TMPDIR": str(script.parent)}, timeout_s
+    )
+    return int(status.read_text()) if status.exists() else booted or 1
 
 
 def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) -> int:
@@ -189,24 +247,19 @@ def copy_output(process: subprocess.Popen[bytes], is_up: threading.Event) -> Non
 def report(flavour: str, lacks: list[str]) -> int:
     """Print what is missing and how to install it; return the exit status."""
     if not lacks:
-        sys.stdout.write(f"the CAN lab can run: {find_kernel(flavour)}\n")
+        sys.stdout.write(f"the CAN lab can run: {USER_KERNEL if flavour == 'user' else find_kernel(flavour)}\n")
         return 0
     sys.stderr.write(
         f"the CAN lab cannot run here; missing: {', '.join(lacks)}\n"
-        f"install: apt-get install --no-install-recommends {packages(flavour)}\n"
+        f"install: apt-get install --no-install-recommends {PACKAGES[flavour]}\n"
     )
     return 1
-
-
-def packages(flavour: str) -> str:
-    """Return the Debian packages that the lab needs, for the command line of apt-get."""
-    return PACKAGES.format(image=IMAGES[flavour])
 
 
 def main(folder: Path) -> int:
     """Run the command line; commands run in ``folder``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kernel", choices=IMAGES, default="plain", help="which kernel to boot (default: plain)")
+    parser.add_argument("--kernel", choices=PACKAGES, default="plain", help="which kernel to boot (default: plain)")
     actions = parser.add_subparsers(dest="action", required=True)
     actions.add_parser("check")
     actions.add_parser("packages")
@@ -217,7 +270,7 @@ def main(folder: Path) -> int:
     if arguments.action == "check":
         return report(arguments.kernel, missing(arguments.kernel))
     if arguments.action == "packages":
-        sys.stdout.write(f"{packages(arguments.kernel)}\n")
+        sys.stdout.write(f"{PACKAGES[arguments.kernel]}\n")
         return 0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # the guest ends with us
     return run(arguments.kernel, arguments.command, arguments.timeout, folder)

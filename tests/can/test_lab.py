@@ -29,7 +29,6 @@ def test_vcan_carries_a_frame(vcan: Callable[[], str]) -> None:
         assert receiver.recv(16) == frame
 
 
-@pytest.mark.quick
 def test_controllers_carry_frames_at_1_mbit(can_pair: tuple[str, str]) -> None:
     frame = struct.pack("=IB3x8s", 0x207, 2, bytes.fromhex("0700"))
     with open_can(can_pair[0]) as sender, open_can(can_pair[1]) as receiver:

@@ -19,6 +19,7 @@ pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 FOREIGN = (0x000, 0x472, 0x7FF, EXTENDED_FLAG | TIP_IDENTIFIER, EXTENDED_FLAG | 0x1FFF_FFFF)
 
 
+@pytest.mark.quick
 def test_the_kernel_leaves_out_what_the_layout_does_not_know(vcan: Callable[[], str]) -> None:
     name = vcan()
     with skin(name, options={"filter": "on"}) as (driver, _), DriverReader("tip") as reader:

@@ -41,13 +41,35 @@ def test_a_machine_that_has_all_can_run_it(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().out == "the CAN lab can run: /boot/vmlinuz-plain\n"
 
 
+def test_user_mode_linux_needs_no_machine(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in set(NEEDED) - {"ip", "modprobe"}:
+        (machine / name).unlink()
+    monkeypatch.setattr(lab, "USER_MODULES", machine)
+    assert lab.report("user", lab.missing("user")) == 1
+    assert "missing: User-Mode Linux\ninstall: apt-get install" in capsys.readouterr().err
+    put(machine / lab.USER_KERNEL, "")
+    assert lab.report("user", lab.missing("user")) == 0
+    assert capsys.readouterr().out == "the CAN lab can run: linux.uml\n"
+
+
+def test_the_status_of_a_command_in_user_mode_linux_is_its_own(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lab, "USER_MODULES", machine)
+    find_init = 'for word in "$@"; do case $word in init=*) place=${word#init=} ;; esac; done'
+    put(machine / lab.USER_KERNEL, f"{find_init}; echo CAN lab: up; echo 3 >${{place%init}}status")
+    assert lab.run("user", ["false"], 60.0, machine) == 3
+    put(machine / lab.USER_KERNEL, "echo CAN lab: up; exit 0")
+    assert lab.run("user", ["false"], 60.0, machine) == 1
+
+
 @pytest.mark.parametrize("name", NEEDED)
 def test_whatever_is_missing_is_named(machine: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     (machine / name).unlink()
     assert lab.report("rt", lab.missing("rt")) == 1
     said = capsys.readouterr().err
     assert {"vng": "virtme-ng"}.get(name, name) in said.splitlines()[0]
-    assert said.splitlines()[1] == f"install: apt-get install --no-install-recommends {lab.packages('rt')}"
+    assert said.splitlines()[1] == f"install: apt-get install --no-install-recommends {lab.PACKAGES['rt']}"
 
 
 def test_a_dynamically_linked_busybox_is_none(machine: Path) -> None:

@@ -41,11 +41,11 @@ def json_fields(name: str, *words: str) -> list[str]:
 
 
 def _rows(cls: type, prefix: str) -> Iterator[tuple[str, str, str, str]]:
-    meanings = _meanings(cls)
+    texts = meanings(cls)
     for field, hint in get_type_hints(cls, include_extras=False).items():
         key, kind, inner = _json_type(prefix + field, hint)
         if inner is None or kind:
-            yield field, key, kind, meanings.get(field, "")
+            yield field, key, kind, texts.get(field, "")
         if inner is not None:
             yield from ((field, *row[1:]) for row in _rows(inner, f"{key}."))
 
@@ -69,16 +69,17 @@ def _json_type(key: str, hint: Any) -> tuple[str, str, type | None]:
     return key, _PLAIN.get(hint, "string"), None
 
 
-def _meanings(cls: type) -> dict[str, str]:
-    """Return the texts of a class' fields, from the section of its docstring or from their own docstrings."""
+def meanings(cls: type) -> dict[str, str]:
+    """Return the texts of a class' fields or members, from its docstring's section or their own docstrings."""
     found: dict[str, str] = {}
     section = inspect.getdoc(cls).partition("Attributes:\n")[2].partition("\n\n")[0]  # type: ignore[union-attr]
     for names, text in re.findall(r"^([\w, ]+): (.*(?:\n +.*)*)", textwrap.dedent(section), re.MULTILINE):
         found |= dict.fromkeys(names.split(", "), text)
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
     for field, text in pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            found[ast.unparse(field.target)] = ast.literal_eval(text.value)
+        if isinstance(field, ast.AnnAssign | ast.Assign) and isinstance(text, ast.Expr):
+            target = field.target if isinstance(field, ast.AnnAssign) else field.targets[0]
+            found[ast.unparse(target)] = ast.literal_eval(text.value)
     return {field: _as_markdown(text) for field, text in found.items()}
 
 

@@ -174,6 +174,21 @@ class _Awaited:
             self._closed = True
             self._wakeups.leave()
 
+    async def _read(self, timeout_s: float | None, **how: Any) -> Any:
+        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        while True:
+            words = self._words()
+            try:
+                return self.sync.read(timeout_s=0, **how)
+            except ServiceTimeout:
+                remaining_ns = WAIT_SLICE_NS if deadline_ns is None else min(WAIT_SLICE_NS, deadline_ns - now_ns())
+                if remaining_ns <= 0:
+                    raise
+            await self._wakeups.wait(words, remaining_ns / NS_PER_S)
+
+    def _words(self) -> list[WakeWord]:
+        raise NotImplementedError
+
     async def __aenter__(self) -> Self:
         return self
 
@@ -203,17 +218,8 @@ class Reader(_Awaited, Generic[SampleT]):
         timeout_s: float | None = 5.0,
     ) -> SampleT:
         """As :meth:`skinware.ServiceReader.read`; it raises the same."""
-        deadline_ns = _deadline_ns(timeout_s)
-        while True:
-            word = wake_word_of(self.sync)
-            try:
-                return self.sync.read(newer_than=newer_than, max_age_s=max_age_s, timeout_s=0)
-            except ServiceTimeout:
-                remaining_s = _remaining_s(deadline_ns)
-                if remaining_s <= 0:
-                    raise
-            await self._wakeups.wait([word], remaining_s)
-            self.sync.refresh()
+        frame: SampleT = await self._read(timeout_s, newer_than=newer_than, max_age_s=max_age_s)
+        return frame
 
     async def samples(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
@@ -228,6 +234,10 @@ class Reader(_Awaited, Generic[SampleT]):
 
     def __aiter__(self) -> AsyncIterator[SampleT]:
         return self.samples()
+
+    def _words(self) -> list[WakeWord]:
+        self.sync.refresh()
+        return [wake_word_of(self.sync)]
 
     async def request(self, *, timeout_s: float = 5.0) -> SampleT:
         """As :meth:`skinware.ServiceReader.request`; it raises the same."""
@@ -276,16 +286,8 @@ class Skin(_Awaited):
         timeout_s: float | None = 5.0,
     ) -> Snapshot:
         """As :meth:`skinware.Skin.read`; it raises the same."""
-        deadline_ns = _deadline_ns(timeout_s)
-        while True:
-            words = self._words()
-            try:
-                return self.sync.read(newer_than=newer_than, max_age_s=max_age_s, align=align, timeout_s=0)
-            except ServiceTimeout:
-                remaining_s = _remaining_s(deadline_ns)
-                if remaining_s <= 0:
-                    raise
-            await self._wakeups.wait(words, remaining_s)
+        snapshot: Snapshot = await self._read(timeout_s, newer_than=newer_than, max_age_s=max_age_s, align=align)
+        return snapshot
 
     async def samples(
         self,
@@ -308,16 +310,6 @@ class Skin(_Awaited):
 
     def _words(self) -> list[WakeWord]:
         return [wake_word_of(self.sync.reader(driver)) for driver in self.sync.layout.drivers]
-
-
-def _deadline_ns(timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-
-
-def _remaining_s(deadline_ns: int | None) -> float:
-    """Until the deadline, and at most until the next look around."""
-    remaining_ns = WAIT_SLICE_NS if deadline_ns is None else min(WAIT_SLICE_NS, deadline_ns - now_ns())
-    return remaining_ns / NS_PER_S
 
 
 async def _deadline(timer: Periodic) -> bool:

@@ -210,7 +210,10 @@ class BridgeStateWriter:
         columns["count"][...] = len(told)
         columns["services"][:] = np.zeros(MOST, _ROW)
         for row, (name, service) in enumerate(told):
-            columns["services"][row] = _row_of(name, service)
+            ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
+            enums = STATES.index(service.state), MODES.index(service.mode), 0
+            rates = service.rate_hz, service.gap_hz, service.bytes_per_s
+            columns["services"][row] = (name.encode(), *enums, service.gap, *rates, *ages)
         self._service.commit(at_ns)
 
     def close(self) -> None:
@@ -221,13 +224,6 @@ class BridgeStateWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _row_of(name: str, service: ServiceState) -> tuple[Any, ...]:
-    ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
-    state, mode = STATES.index(service.state), MODES.index(service.mode)
-    rates = service.rate_hz, service.gap_hz, service.bytes_per_s
-    return name.encode(), state, mode, 0, service.gap, *rates, *ages
 
 
 def _state_of(row: npt.NDArray[Any]) -> ServiceState:

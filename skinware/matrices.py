@@ -80,7 +80,10 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
             raise _NotHere(self._which(key, known))
         (one,) = known
         if one not in self._matrices:
-            raise _NotHere(self._why_no_matrix(key, self._kind_of[one]))
+            kind = self._kind_of[one]
+            if rows_and_columns(kind) is None:
+                raise _NotHere(f"module {key!r} is no matrix but {kind!r}; its geometry has the places of its sensors")
+            raise _NotHere(f"module {key!r} is {kind}, but does not have a {self._type_name} sensor at each place")
         return self._matrices[one]
 
     def __iter__(self) -> Iterator[Key]:
@@ -95,8 +98,3 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
         more = f" ... ({len(self)} in all)" if len(self) > _MOST_NAMES else ""
         there_are = ", ".join(map(repr, list(self)[:_MOST_NAMES])) or "none"
         return f"no module {key!r} here; matrices of {self._type_name}: {there_are}{more}"
-
-    def _why_no_matrix(self, key: Key | str, kind: str) -> str:
-        if rows_and_columns(kind) is None:
-            return f"module {key!r} is no matrix but {kind!r}; its geometry has the places of its sensors"
-        return f"module {key!r} is {kind}, but does not have a {self._type_name} sensor at each place"

@@ -165,11 +165,6 @@ class Refusal:
         return f"{self.what} refused: {self.why}; {self.remedy}"
 
 
-def is_fifo() -> bool:
-    """Return whether this thread runs under SCHED_FIFO."""
-    return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
-
-
 def set_policy(priority: int) -> Refusal | None:
     """SCHED_FIFO of a priority for this thread, or ordinary scheduling for 0."""
     policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
@@ -383,7 +378,7 @@ class Profile:
             gc.freeze()
         answers.append(lock_memory() if self.lock_memory else None)
         answers.append(set_policy(self.priority))
-        if not is_fifo():
+        if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:  # which has none in any case
             set_timer_slack(self.timer_slack_ns)  # after the policy, whose change resets it
         refusals = tuple(answer for answer in answers if answer is not None)
         if refusals and strict:

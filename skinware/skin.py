@@ -13,7 +13,7 @@ from skinware.errors import Closed, ConfigurationError, Overrun, ServiceNotFound
 from skinware.geometry import Geometry
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
-from skinware.memory.take import NEWER, NEWEST, Take, take_of
+from skinware.memory.ring_reader import NEWER, NEWEST, Take
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._reader import Tap
 from skinware.skin_layout import SkinLayout
@@ -189,21 +189,25 @@ class Skin:
         """Leave the looks after this one to C until something else happens than samples."""
         rings = [reader.ring_in_c() for reader in self._drivers.readers.values()]
         if self._in_c is None or self._in_c.rings != rings:
-            self._in_c = take_of(rings)
+            self._in_c = Take(rings, is_loop=False) if 1 <= len(rings) <= futex.MAX_WORDS else None
         self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> Snapshot | None:
         readers = list(self._drivers.readers.values())
         if not readers or self._moved_on():
             return None  # no driver, or between two lives of one
-        if known is not None and known.layout is self._layout and not _has_newer(readers, known):
+        known_at = None
+        if known is not None and known.layout is self._layout:
+            known_at = [frame.position for frame in known.samples]
+        if known_at == [reader.latest for reader in readers]:
             return None
         try:
             samples = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
         except Overrun:
             return None
-        snapshot = Snapshot(self._layout, samples)
-        return None if align and known is not None and _same_samples(snapshot, known) else snapshot
+        if align and known_at == [frame.position for frame in samples]:
+            return None
+        return Snapshot(self._layout, samples)
 
     def _moved_on(self) -> bool:
         """Return whether a driver closed, or began another generation; a killed one is found by ``_discover``."""
@@ -310,16 +314,6 @@ def _nearest(readers: list[_SkinReader]) -> tuple[DriverSnapshot, ...]:
     ]
     moment_ns = min(reached_ns or newest_ns)
     return tuple(reader.nearest(moment_ns) for reader in readers)
-
-
-def _has_newer(readers: list[_SkinReader], known: Snapshot) -> bool:
-    return any(reader.latest != frame.position for reader, frame in zip(readers, known.samples, strict=True))
-
-
-def _same_samples(one: Snapshot, other: Snapshot) -> bool:
-    return one.layout is other.layout and all(
-        a.position == b.position for a, b in zip(one.samples, other.samples, strict=True)
-    )
 
 
 def _too_old(snapshot: Snapshot, max_age_s: float) -> list[str]:

@@ -5,6 +5,7 @@ This is the one model of a driver that commands, the terminal, the page and ROS 
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -28,9 +29,6 @@ WITHOUT_NEWS = (SILENT, PAUSED, DEAD)
 
 _LEAST_SILENCE_NS = NS_PER_S
 _SILENT_PERIODS = 5
-_PATCH_STATES = {int(state): state.name.lower() for state in PatchState}
-_BUS_STATES = {int(state): state.name.lower() for state in BusState}
-_BUS_REASONS = {int(reason): reason.name.lower() for reason in BusReason}
 
 
 @dataclass(frozen=True)
@@ -150,8 +148,8 @@ def report_of(
     buses = tuple(
         BusReport(
             structure.buses[bus],
-            bus_state_name(int(frame.bus_state[bus])),
-            bus_reason_name(int(frame.bus_reason[bus])),
+            state_name(BusState, int(frame.bus_state[bus])),
+            state_name(BusReason, int(frame.bus_reason[bus])) if frame.bus_reason[bus] else None,
             None if load in (LOAD_UNKNOWN, LOAD_FILTERED) else load / 1000,
             counters,
         )
@@ -171,7 +169,7 @@ def report_of(
         PatchReport(
             name=structure.patch_names[patch],
             bus=patch_buses[patch],
-            state=patch_state_name(int(frame.patch_state[patch])),
+            state=state_name(PatchState, int(frame.patch_state[patch])),
             sensors=sensors[patch],
             fresh=fresh[patch],
             untouched=dark[patch],
@@ -244,16 +242,9 @@ def patch_ages_ns(frame: DriverSnapshot) -> list[int | None]:
     return [time_ns - newest if newest else None for newest in newest_ns.tolist()]
 
 
-def patch_state_name(state: int) -> str:
-    """Return the name of a :class:`PatchState`; a number that this version does not know stays a number."""
-    return _PATCH_STATES.get(state, str(state))
-
-
-def bus_state_name(state: int) -> str:
-    """Return the name of a :class:`BusState`; a number that this version does not know stays a number."""
-    return _BUS_STATES.get(state, str(state))
-
-
-def bus_reason_name(reason: int) -> str | None:
-    """Return the name of a :class:`BusReason`, None for ``NONE``; an unknown number stays a number."""
-    return _BUS_REASONS.get(reason, str(reason)) if reason else None
+def state_name(states: type[enum.IntEnum], number: int) -> str:
+    """Return the name of a state of a patch or bus, or of a reason; an unknown number stays a number."""
+    try:
+        return states(number).name.lower()
+    except ValueError:
+        return str(number)

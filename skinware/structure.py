@@ -431,7 +431,10 @@ class Structure:
         if self.dtype != other.dtype:
             return False
         mine, theirs = self.to_columns(), other.to_columns()
-        return mine.keys() == theirs.keys() and all(_equal(mine[name], theirs[name]) for name in mine)
+        return mine.keys() == theirs.keys() and all(
+            np.array_equal(mine[name], theirs[name], equal_nan=mine[name].dtype.kind == theirs[name].dtype.kind == "f")
+            for name in mine
+        )
 
     __hash__: ClassVar[None]  # type: ignore[assignment]
 
@@ -484,7 +487,3 @@ class Structure:
         if foreign.any():
             row = int(np.argmax(foreign))
             raise StructureError(f"sensor {row} is in a group of another module")
-
-
-def _equal(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> bool:
-    return np.array_equal(one, other, equal_nan=one.dtype.kind == other.dtype.kind == "f")

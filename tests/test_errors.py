@@ -261,7 +261,7 @@ def BusNotAvailable(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def BusSendError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    bus = VirtualCanBus.with_hardware(Chatter(), listen_only=True)
+    bus = VirtualCanBus("", hardware=Chatter(), listen_only=True)
     bus.open()
     try:
         bus.send(0x207, b"\x07\x00")
@@ -272,7 +272,7 @@ def BusSendError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def HandshakeTimeout(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    bus = VirtualCanBus.with_hardware(Chatter())
+    bus = VirtualCanBus("", hardware=Chatter())
     bus.open()
     try:
         return asyncio.run(Link(bus).request(0x207, b"\x1c\x02\x00", Match(0x270), timeout_s=0.01))

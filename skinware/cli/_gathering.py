@@ -19,7 +19,7 @@ from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED
 from skinware.tactile.calibration.sources import ForceSource, LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
-from skinware.views.driver_snapshots import after, enter_pressed, frames_until
+from skinware.views.live import after, enter_pressed, frames_until
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Signs of sensors from nothing to all that is wanted."""

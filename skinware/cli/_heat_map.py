@@ -19,9 +19,9 @@ from skinware.structure import Structure
 from skinware.views.scene import ModuleShape, rows_of, shape_of
 
 LEVELS = 16
-FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(10)
+FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED = range(9)
 FIRST_WITHOUT_VALUE = NO_ACK
-"""From this mark on, the level means nothing and is not drawn. ``UNMOVED``: never moved in a wipe test."""
+"""From this mark on, the level means nothing and is not drawn."""
 BACKGROUND = 255
 """Code of a pixel without a sensor."""
 

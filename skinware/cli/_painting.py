@@ -36,14 +36,12 @@ class Palette:
         ramp: one colour for each level.
         stale: the same for stale values: darker, or grey.
         no_value: colour of a sensor without a value.
-        unmoved: colour of a sensor that never moved in a wipe test; no level has it.
         characters: one for each level where colours are not wanted, otherwise empty.
     """
 
     ramp: Colours
     stale: Colours
     no_value: ColorTriplet
-    unmoved: ColorTriplet
     characters: str = ""
 
 
@@ -85,7 +83,7 @@ def _ansi(numbers: Sequence[int]) -> Colours:
 
 _GROUND = ColorTriplet(18, 18, 18)
 """Colour of the screen."""
-_WHITE = ColorTriplet(255, 255, 255)
+_BLACK, _WHITE = ColorTriplet(0, 0, 0), ColorTriplet(255, 255, 255)
 _VIRIDIS = _between(
     (
         "#482475",
@@ -119,25 +117,21 @@ TRUE_COLOURS = Palette(
     ramp=_VIRIDIS,
     stale=tuple(mixed(colour, _GROUND, 0.6) for colour in _VIRIDIS),
     no_value=ColorTriplet(74, 16, 16),
-    unmoved=_WHITE,
 )
 COLOURS_256 = Palette(
     ramp=_spread(_ansi((54, 24, 30, 36, 42, 149, 191, 227))),
     stale=_spread(_ansi((236, 238, 240, 242))),
     no_value=_ansi((52,))[0],
-    unmoved=_WHITE,
 )
 COLOURS_16 = Palette(
     ramp=_spread([_BASIC[name] for name in ("blue", "bright blue", "cyan", "bright green", "bright yellow")]),
     stale=_spread([_BASIC["grey"], _BASIC["light grey"]]),
     no_value=_BASIC["red"],
-    unmoved=_WHITE,
 )
 CHARACTERS = Palette(
     ramp=TRUE_COLOURS.ramp,
     stale=TRUE_COLOURS.stale,
     no_value=TRUE_COLOURS.no_value,
-    unmoved=_WHITE,
     characters="".join(_spread("▁▂▃▄▅▆▇█")),
 )
 
@@ -152,7 +146,6 @@ MARK_CHARACTERS = {
     heat.MASKED: "-",
     heat.NEVER_SEEN: "·",
     heat.NOT_CONNECTED: "x",
-    heat.UNMOVED: "□",
 }
 MARK_NAMES = {
     heat.STALE: "stale",
@@ -163,15 +156,12 @@ MARK_NAMES = {
     heat.MASKED: "switched off",
     heat.NEVER_SEEN: "never seen",
     heat.NOT_CONNECTED: "not connected",
-    heat.UNMOVED: "never moved",
 }
 
 
 def colour_of(code: int, palette: Palette) -> ColorTriplet:
     """Return the colour of a sensor with this code where there is no room for its character."""
     mark, level = divmod(code, LEVELS)
-    if mark == heat.UNMOVED:
-        return palette.unmoved
     if mark >= heat.FIRST_WITHOUT_VALUE:
         return palette.no_value
     return palette.stale[level] if mark == heat.STALE else palette.ramp[level]
@@ -225,7 +215,9 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
         return " ", Style.null()
     ground = colour_of(upper, palette)
     mark, level = divmod(upper, LEVELS)
-    ink = palette.ramp[level] if mark == heat.STALE else _ink(ground)
+    red, green, blue = ground
+    readable = _BLACK if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else _WHITE
+    ink = palette.ramp[level] if mark == heat.STALE else readable
     return _character(upper, palette), Style(color=_colour(ink), bgcolor=_colour(ground))
 
 
@@ -234,12 +226,6 @@ def _character(code: int, palette: Palette) -> str:
         return " "
     mark, level = divmod(code, LEVELS)
     return palette.characters[level] if palette.characters and mark == heat.FRESH else MARK_CHARACTERS.get(mark, "?")
-
-
-def _ink(colour: ColorTriplet) -> ColorTriplet:
-    """Return black or white, whichever can be read on a colour."""
-    red, green, blue = colour
-    return ColorTriplet(0, 0, 0) if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else ColorTriplet(255, 255, 255)
 
 
 def _colour(triplet: ColorTriplet) -> Color:
@@ -273,8 +259,7 @@ def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
         marks: (n,) uint8, marks of all sensors that are drawn.
     """
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
-    fresh = counts[heat.FRESH] + counts[heat.UNMOVED]  # a stuck sensor is fresh, too
-    text = Text(f"{fresh} fresh", no_wrap=True, overflow="ellipsis")
+    text = Text(f"{counts[heat.FRESH]} fresh", no_wrap=True, overflow="ellipsis")
     for mark, name in MARK_NAMES.items():
         if counts[mark]:
             level = LEVELS // 2 if mark < heat.FIRST_WITHOUT_VALUE else 0

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from rich.text import Text
 
-from skinware.cli._heat_map import FRESH, UNMOVED, Arrangement, arrange, codes_of, levels_of, marks_of
+from skinware.cli._heat_map import Arrangement, arrange, codes_of, levels_of, marks_of
 from skinware.cli._painting import TRUE_COLOURS, Palette, marks_text, scale_text
 from skinware.cli._top_rows import RowKey, patches_of, title_of
 from skinware.driver_snapshot import DriverSnapshot
@@ -19,7 +18,7 @@ from skinware.state import status_now
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
 from skinware.text import figure_text, status_text
-from skinware.views.history import Memory, WipeTest
+from skinware.views.history import Memory
 from skinware.views.quantities import physical_values
 
 Levels = npt.NDArray[np.uint8]
@@ -27,7 +26,6 @@ Levels = npt.NDArray[np.uint8]
 CHANGE, RANGE, RAW = "change", "range", "raw"
 SCALES = (CHANGE, RANGE, RAW)
 """Names of the scales, in the order in which a person goes through them."""
-_PEAK = "peak"
 _EVERYTHING = (-math.inf, math.inf)
 
 
@@ -71,7 +69,7 @@ class Picture:
         region: str | None = None,
     ) -> None:
         self.scale_name = scale_name
-        self._regions, self._region = regions, region
+        self.regions, self._region = regions, region
         self.arrangement: Arrangement | None = None
         self.pixels: npt.NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self.title = ""
@@ -80,14 +78,9 @@ class Picture:
         self._wanted = type_name
         self._palette = palette
         self._memories: dict[str, Memory] = {}
-        self._wiping = False
         self._layouts: dict[str, SkinLayout] = {}
         self._levels: Levels | None = None
         self._made_for: tuple[object, ...] = ()
-
-    @property
-    def has_regions(self) -> bool:
-        return self._regions is not None
 
     def next_type(self, structure: Structure) -> None:
         names = [t.name for t in structure.types]
@@ -99,7 +92,7 @@ class Picture:
 
     def next_region(self) -> None:
         """Go on to the next region; after the last one to all sensors."""
-        names = [None, *(region.name for region in self._regions or ())]
+        names = [None, *(region.name for region in self.regions or ())]
         self._region = names[(names.index(self._region) + 1) % len(names)]
 
     def regions_of(self, driver: str, position: int) -> list[str]:
@@ -112,38 +105,6 @@ class Picture:
         for memory in self._memories.values():
             memory.rest.begin()
         self._levels = None
-
-    def wipe_test(self) -> None:
-        """Begin a wipe test, or end it."""
-        self._wiping = not self._wiping
-        for memory in self._memories.values():
-            memory.wipe = None
-        self._levels = None
-
-    def wipe_text(self, driver: str) -> str | None:
-        """Return the progress of the wipe test for people; None without one."""
-        memory = self._memories.get(driver)
-        if memory is None or memory.wipe is None:
-            return None
-        sensors = self.arrangement.sensors if self.arrangement is not None else np.zeros(0, np.int64)
-        unmoved = sensors[self._never_moved(memory, memory.wipe, sensors)]
-        count = len(unmoved)
-        if not count:
-            return "wipe test: every sensor has moved"
-        first = memory.structure.sensor_name(int(unmoved.min()))
-        return f"wipe test: {count} never moved (l saves the list): {first}{' ...' * (count > 1)}"
-
-    def save_wipe(self, driver: str, folder: Path) -> Path | None:
-        """Save the list of the sensors that never moved, and return its file; None without a wipe test.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        memory = self._memories.get(driver)
-        if memory is None or memory.wipe is None:
-            return None
-        name = self.type_in(memory.structure).name
-        return memory.wipe.save(folder, driver, name, memory.rest.noise(name))
 
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
         """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts.
@@ -161,8 +122,6 @@ class Picture:
         sensors = self.arrangement.sensors
         name, self._levels, values = self._scaled(memory, frame, physical, sensors, sensor_type)
         marks = marks_of(status_now(life, frame)[sensors])
-        if memory.wipe is not None:
-            marks[(marks == FRESH) & self._never_moved(memory, memory.wipe, sensors)] = UNMOVED
         self.pixels = self.arrangement.draw(codes_of(self._levels, marks))
         unit = "" if name == RAW else sensor_type.unit
         self.scale = Text(f"{name} ", no_wrap=True).append_text(scale_text(values, unit, self._palette))
@@ -171,18 +130,13 @@ class Picture:
     def type_in(self, structure: Structure) -> SensorType:
         return next((t for t in structure.types if t.name == self._wanted), structure.types[0])
 
-    def _never_moved(self, memory: Memory, wipe: WipeTest, sensors: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Return (k,) bool: which of these sensors never moved in the wipe test."""
-        name = self.type_in(memory.structure).name
-        return np.isin(sensors, wipe.never_moved(name, memory.rest.noise(name)))
-
     def _in_regions(self, driver: str, structure: Structure, type_name: str) -> dict[str, npt.NDArray[np.bool_]]:
         """Return (n_sensors,) bool for each region: the sensors of a type in it."""
-        if self._regions is None:
+        if self.regions is None:
             return {}
         sensors = np.arange(structure.n_sensors)[structure.index(type_name)]
-        found = self._regions.of(self._layouts[driver], type_name)
-        inside = {region.name: np.zeros(structure.n_sensors, bool) for region in self._regions}
+        found = self.regions.of(self._layouts[driver], type_name)
+        inside = {region.name: np.zeros(structure.n_sensors, bool) for region in self.regions}
         for name, index in found.items():
             inside[name][sensors[index]] = True
         return inside
@@ -204,12 +158,7 @@ class Picture:
         if memory is None or memory.structure is not frame.structure:
             memory = self._memories[driver] = Memory(frame.structure)
             self._layouts[driver] = SkinLayout((driver,), (frame.structure,))
-        if self._wiping and memory.wipe is None:
-            memory.wipe = WipeTest(frame.structure)
-        fresh = frame.status == 0
-        memory.rest.follow(physical, fresh, frame.published_ns)
-        if memory.wipe is not None:
-            memory.wipe.follow(physical, fresh)
+        memory.rest.follow(physical, frame.status == 0, frame.published_ns)
         return memory
 
     def _scaled(
@@ -222,17 +171,16 @@ class Picture:
     ) -> tuple[str, Levels, tuple[float, ...]]:
         """Return the name of the scale, (k,) levels of the sensors, and the values that the scale shows."""
         fresh, name = frame.status[sensors] == 0, sensor_type.name
-        if memory.wipe is None and self.scale_name != CHANGE:
+        if self.scale_name != CHANGE:
             in_range = self.scale_name == RANGE
             values = (physical if in_range else frame.values.astype(np.float32))[sensors]
             known = (sensor_type.minimum, sensor_type.maximum) if in_range else _EVERYTHING
             limits = memory.limits((self.scale_name, name), values[fresh], known)
             return self.scale_name, levels_of(values, *limits, self._levels), limits
         noise = memory.rest.noise(name)
-        scale = CHANGE if memory.wipe is None else _PEAK
-        change = memory.rest.change(physical) if memory.wipe is None else memory.wipe.travel()
-        span = memory.span((scale, name), change[sensors][fresh], noise, frame.published_ns)
-        return scale, *change_levels(change[sensors], noise, span, self._levels)
+        change = memory.rest.change(physical)[sensors]
+        span = memory.span((CHANGE, name), change[fresh], noise, frame.published_ns)
+        return CHANGE, *change_levels(change, noise, span, self._levels)
 
 
 def _type_of(structure: Structure, position: int) -> SensorType:

@@ -13,7 +13,7 @@ import click
 import msgspec
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
+from skinware.cli._terminal import echo, print_json, redraw, say, style, terminal_width
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.text import NO_VALUE, age_text_ms, count_text, plural, rate_text, state_shown, table
@@ -90,10 +90,8 @@ def route(
     with contextlib.closing(Link(places)) as link:
         watcher = Watcher(link, asks=False)
         with cli.signals_end(watcher.stop):
-            if as_json:
-                print_json({"event": "ready", "listen": list(places.listen), "connect": list(places.connect)})
-            else:
-                echo(f"router: {places} (Ctrl-C ends)")
+            ready = {"event": "ready", "listen": list(places.listen), "connect": list(places.connect)}
+            say(as_json, ready, f"router: {places} (Ctrl-C ends)")
             watcher.run(_Routed(watcher, as_json).tell)
 
 

@@ -229,6 +229,14 @@ def print_json(data: object) -> None:
     click.echo(json_text(data))
 
 
+def say(as_json: bool, data: object, text: str) -> None:
+    """Print one object for programs, or else one text for people."""
+    if as_json:
+        print_json(data)
+    else:
+        echo(text)
+
+
 def json_text(data: object) -> str:
     """Return an object as JSON, in which characters that cannot be printed are escaped."""
     text = msgspec.json.encode(data).decode()

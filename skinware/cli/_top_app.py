@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-from pathlib import Path
 from typing import ClassVar
 
 from rich.console import JustifyMethod
@@ -16,10 +15,9 @@ from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
 from skinware.bridge_state import as_data, summary
-from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._painting import HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
-from skinware.cli._top_rows import COLUMNS, ListRow, RowKey, rows_of
+from skinware.cli._top_rows import COLUMNS, ListRow, RowKey, labels_of, lines_of, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.state import LIVE, life_of
@@ -103,8 +101,6 @@ class SkinTop(App[None]):
         Binding("s", "next_scale", "Scale"),
         Binding("r", "next_region", "Region"),
         Binding("b", "take_baselines", "Baseline"),
-        Binding("w", "wipe_test", "Wipe test"),
-        Binding("l", "save_list", "Save list", show=False),
         Binding("pagedown", "scroll(1)", "Scroll", key_display="PgUp/PgDn"),
         Binding("pageup", "scroll(-1)", show=False),
     ]
@@ -184,7 +180,7 @@ class SkinTop(App[None]):
             self._must_draw = True
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
-        return self._picture.has_regions or action != "next_region"
+        return self._picture.regions is not None or action != "next_region"
 
     def action_next_scale(self) -> None:
         self._picture.next_scale()
@@ -197,20 +193,6 @@ class SkinTop(App[None]):
     def action_take_baselines(self) -> None:
         self._picture.take_baselines()
         self._must_draw = True
-
-    def action_wipe_test(self) -> None:
-        self._picture.wipe_test()
-        self._must_draw = True
-
-    def action_save_list(self) -> None:
-        row = self._chosen
-        try:
-            path = self._picture.save_wipe(row.key.driver, Path.cwd()) if row else None
-        except OSError as error:
-            self.notify(f"{error.filename}: {error.strerror}", severity="error", markup=False)
-            return
-        if path is not None:
-            self.notify(f"saved: {path}", markup=False)
 
     def on_data_table_row_highlighted(self) -> None:
         self._pointed = None
@@ -310,7 +292,7 @@ class SkinTop(App[None]):
             regions = picture.regions_of(driver.name, self._pointed)
             self._say("detail", describe_sensor(frame, self._pointed) + f"; in {', '.join(regions)}" * bool(regions))
         else:
-            self._say("detail", picture.wipe_text(driver.name) or counters_text(row.counters))
+            self._say("detail", counters_text(row.counters))
 
     def _show_contacts(self, driver: LiveDriver) -> None:
         """Show the picture with the contacts over it, and a line for each contact."""

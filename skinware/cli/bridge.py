@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli import bridge_ros2, bridge_yarp
+from skinware.cli._middlewares import ros2, yarp
 from skinware.cli._robots import list_robots, route
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import echo, print_json, say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +36,7 @@ def command() -> None:
     """
 
 
-for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
+for _each in (route, list_robots, ros2, yarp):
     command.add_command(_each)
 
 
@@ -97,11 +97,9 @@ def serve(
     with contextlib.closing(Link(places)) as link:
         server = Server(robot, link, place, names or None, callers=callers)
         with contextlib.closing(server), cli.signals_end(server.stop):
-            if as_json:
-                where = {"listen": list(places.listen), "connect": list(places.connect)}
-                print_json({"event": "ready", "robot": robot, "namespace": place.name, **where})
-            else:
-                echo(f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
+            ready = {"event": "ready", "robot": robot, "namespace": place.name}
+            where = {"listen": list(places.listen), "connect": list(places.connect)}
+            say(as_json, ready | where, f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
             server.run(_serving_status(server, as_json))
 
 
@@ -195,10 +193,8 @@ def join(
             on_event=print_json if as_json else _show_event,
         )
         with contextlib.closing(joiner), cli.signals_end(joiner.stop):
-            if as_json:
-                print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
-            else:
-                echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
+            ready = {"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)}
+            say(as_json, ready, f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
             joiner.run(_joined_status(as_json))
 
 

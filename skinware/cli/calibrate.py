@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -113,15 +113,15 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     from skinware.text import plural
 
     how = _How(**options)
-    with _opened(_beside(file, how), StrokeSession, how) as (gathering, session):
+    with _opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         found = topology_of(session.sums, pitch_m)
         groups = unrolled_groups(gathering.structure, gathering.type_name, found)
         file.write_text(geometry_to_toml(groups, unrolled_comment(found)), encoding="utf-8")
     pieces = np.bincount(found.piece[found.piece >= 0]).tolist()
-    _report_done(
+    say(
         how.as_json,
-        {"file": str(file), "placed": sum(pieces), "pieces": pieces, "neighbours": len(found.pairs)},
+        {"event": "done", "file": str(file), "placed": sum(pieces), "pieces": pieces, "neighbours": len(found.pairs)},
         f"{file}: {sum(pieces)} sensors in {plural(len(pieces), 'piece')}, {len(found.pairs)} pairs of neighbours",
     )
 
@@ -171,7 +171,7 @@ def touch(
         raise click.UsageError("--offset needs --layout, which has the normals")
     session_of = partial(PressSession, wanted=touches)
     where = (service, poses_namespace, column, (3,))
-    with _opened(_beside(file, how), session_of, how, where) as (gathering, session):
+    with _opened(file, session_of, how, where) as (gathering, session):
         shapes = None if layout is None else _shapes(gathering.structure, gathering.type_name, layout)
         gathering.run(_PRESS, how.share, how.duration_s)
         placement = place(session.presses, shapes, offset_m=offset_m)
@@ -224,7 +224,7 @@ def finger(
     how = _How(**options)
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
     where = (service, poses_namespace, column, (4, 4))
-    with _opened(_beside(file, how), session_of, how, where) as (gathering, session):
+    with _opened(file, session_of, how, where) as (gathering, session):
         shapes = _shapes(gathering.structure, gathering.type_name, layout)
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
@@ -260,7 +260,7 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 
     geometry = read_geometry(file)
     how = _How(**options)
-    with _opened(_beside(file, how), StrokeSession, how) as (gathering, session):
+    with _opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         structure, type_name = gathering.structure, gathering.type_name
     places, module = geometry.of(structure, type_name), structure.module_of(type_name)
@@ -269,13 +269,11 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
         topology = topology_of(session.sums, pitch_m)
         found += check_strokes(places, module, structure.patch_of(type_name), topology)
     for finding in found:
-        if how.as_json:
-            print_json({"event": "finding", **finding_data(finding, structure, type_name)})
-        else:
-            echo(finding_text(finding, structure, type_name))
-    _report_done(
+        data = {"event": "finding", **finding_data(finding, structure, type_name)}
+        say(how.as_json, data, finding_text(finding, structure, type_name))
+    say(
         how.as_json,
-        {"file": str(file), "findings": len(found), "compared": session.sums.frames > 0},
+        {"event": "done", "file": str(file), "findings": len(found), "compared": session.sums.frames > 0},
         f"{file}: {len(found) or 'nothing'} found{'' if session.sums.frames else '; no strokes to compare it with'}",
     )
     context.exit(cli.EXIT_FAILED if found else cli.EXIT_DONE)
@@ -319,7 +317,7 @@ def force(
     if (reference is None) == (not newtons) and how.duration_s != 0:
         raise click.UsageError("give either --reference or --newtons")
     where = None if reference is None else (reference, how.namespace, column, (int(axes),))
-    with _opened(_beside(file, how), ForceSession, how, where) as (gathering, session):
+    with _opened(file, ForceSession, how, where) as (gathering, session):
         source = gathering.poses = ForceSource(gathering.source, gathering.poses)
         for weight_n in newtons:
             click.pause(f"lay {weight_n:g} N on the skin, and press Enter ...", err=True)
@@ -337,18 +335,14 @@ def force(
     words += f"; not trustworthy: {doubts}" if doubts else ""
     file.write_text(curves_to_toml(fit.curves(uid), words), encoding="utf-8")
     figures = {"residual_n": fit.residual_n, "reach_n": fit.reach_n, "held": fit.held, "doubts": fit.doubts}
-    _report_done(how.as_json, {"file": str(file), "curves": own, **figures}, f"{file}: {own} sensors; {words}")
+    done = {"event": "done", "file": str(file), "curves": own, **figures}
+    say(how.as_json, done, f"{file}: {own} sensors; {words}")
     click.get_current_context().exit(cli.EXIT_FAILED if doubts else cli.EXIT_DONE)
-
-
-def _beside(file: Path, how: _How) -> Path:
-    """Return the state file: the given one, or one beside the geometry."""
-    return how.state or file.with_name(f"{file.name}.state.npz")
 
 
 @contextmanager
 def _opened(
-    state_path: Path,
+    file: Path,
     session_of: Callable[[int], Any],
     how: _How,
     poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
@@ -358,7 +352,7 @@ def _opened(
     from skinware.memory.namespace import Namespace
     from skinware.service import ServiceReader
     from skinware.tactile.calibration.sources import LoadSource, PoseSource
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     with ExitStack() as stack:
         reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
@@ -369,6 +363,7 @@ def _opened(
             place = Namespace(poses_namespace or how.namespace)
             pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
             pose_source = PoseSource(pose_reader, column, shape)
+        state_path = how.state or file.with_name(f"{file.name}.state.npz")
         session = session_of(len(reader.structure.module_of(source.type_name)))
         gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
         yield gathering, session
@@ -403,14 +398,7 @@ def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mappin
     text = (
         f"{file}: {known} sensors placed, {wrong} presses left out, residual {_MM * placement.spread_m:.1f} mm{words}"
     )
-    _report_done(as_json, {"file": str(file), **figures, **also}, text)
-
-
-def _report_done(as_json: bool, result: Mapping[str, Any], words: str) -> None:
-    if as_json:
-        print_json({"event": "done", **result})
-    else:
-        echo(words)
+    say(as_json, {"event": "done", "file": str(file), **figures, **also}, text)
 
 
 def main() -> None:

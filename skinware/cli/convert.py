@@ -102,12 +102,6 @@ _NAMES = (
 )
 
 
-def _asked_for() -> list[str]:
-    context = click.get_current_context()
-    given = [name for name in _NAMES if context.get_parameter_source(name) is not ParameterSource.DEFAULT]
-    return ["--" + name.replace("_", "-") for name in given]
-
-
 def _learning_set(options: Mapping[str, Any]) -> tuple[list[Path], LearningSet]:
     """Return further recordings, and the set to make of all of them.
 
@@ -196,9 +190,10 @@ def command(
     selection = Selection(names, types, patches, cli.regions_asked_for(in_regions, region_files), in_regions)
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
-    asked = _asked_for()
-    if asked and format_name not in _LEARNING_FORMATS:
-        raise click.UsageError(f"{asked[0]} is for --to {', '.join(_LEARNING_FORMATS)}")
+    source_of = click.get_current_context().get_parameter_source
+    given = [name for name in _NAMES if source_of(name) is not ParameterSource.DEFAULT]
+    if given and format_name not in _LEARNING_FORMATS:
+        raise click.UsageError(f"--{given[0].replace('_', '-')} is for --to {', '.join(_LEARNING_FORMATS)}")
     stop = Event()
     with cli.signals_end(stop.set):  # not inside a library
         converted = _written(

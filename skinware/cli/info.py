@@ -12,7 +12,7 @@ import click
 
 from skinware.bridge_state import as_lines
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json, redraw, style, terminal_width
+from skinware.cli._terminal import echo, print_json, redraw, say, style, terminal_width
 from skinware.text import (
     NO_VALUE,
     NOT_FRESH,
@@ -89,10 +89,7 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
         from skinware.cli._report import report
 
         found = report(place, name)
-        if as_json:
-            print_json(found)
-        else:
-            echo("\n".join(as_text(found)))
+        say(as_json, found, "\n".join(as_text(found)))
 
 
 def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -29,15 +30,7 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
     target = output or file.with_name(f"{file.stem}.recovered.mcap")
     recovered = recover(file, target)
     if as_json:
-        print_json(
-            {
-                "event": "recovered",
-                "file": str(target),
-                "messages": recovered.messages,
-                "damaged": recovered.damaged,
-                "was_whole": recovered.was_whole,
-            }
-        )
+        print_json({"event": "recovered", "file": str(target), **asdict(recovered)})
         return
     for channel, count in recovered.messages.items():
         echo(f"{channel}: {count} messages")

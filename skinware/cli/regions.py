@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -52,11 +52,8 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
         for name, index in regions.of(layout, type_name).items():
             counts[name][type_name] = len(range(n)[index]) if isinstance(index, slice) else len(index)
     for name, of_type in counts.items():
-        if as_json:
-            print_json({"region": name, "sensors": of_type})
-        else:
-            found = ", ".join(plural(count, f"{type_name} sensor") for type_name, count in of_type.items() if count)
-            echo(f"{name}: {found or 'nothing in the drivers that run'}")
+        found = ", ".join(plural(count, f"{type_name} sensor") for type_name, count in of_type.items() if count)
+        say(as_json, {"region": name, "sensors": of_type}, f"{name}: {found or 'nothing in the drivers that run'}")
 
 
 @command.command(
@@ -90,7 +87,7 @@ def paint(
     """
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Region, put_region, read_regions
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
@@ -103,11 +100,9 @@ def paint(
     if not len(uid):
         raise click.ClickException("nothing was touched; nothing is written")
     put_region(file, Region(name, painter.type_name, (reader.name,), tuple(uid.tolist())), replace=force)
-    if as_json:
-        print_json({"event": "done", "region": name, "file": str(file), "touched": stroked, "sensors": len(uid)})
-    else:
-        holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
-        echo(f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
+    holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
+    done = {"event": "done", "region": name, "file": str(file), "touched": stroked, "sensors": len(uid)}
+    say(as_json, done, f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
 
 
 class _Painter:
@@ -126,8 +121,8 @@ class _Painter:
         import numpy as np
 
         from skinware.tactile.neighbours import neighbours, without_holes
-        from skinware.views.driver_snapshots import after, enter_pressed, frames_until
         from skinware.views.history import SETTLING_S
+        from skinware.views.live import after, enter_pressed, frames_until
 
         for frame in frames_until(self._reader, after(SETTLING_S)):
             self._touched(frame)
@@ -157,11 +152,8 @@ class _Painter:
         return touched
 
     def _say(self, event: str, text: str, stroked: npt.NDArray[np.bool_]) -> None:
-        if self._as_json:
-            what = {"driver": self._reader.name, "type": self.type_name} if event == "ready" else {}
-            print_json({"event": event, **what, "touched": int(stroked.sum())})
-        else:
-            echo(text)
+        what = {"driver": self._reader.name, "type": self.type_name} if event == "ready" else {}
+        say(self._as_json, {"event": event, **what, "touched": int(stroked.sum())}, text)
 
 
 def main() -> None:

@@ -10,11 +10,12 @@ import sys
 import termios
 import tty
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, overwrite, print_json, terminal_width
+from skinware.cli._terminal import echo, overwrite, print_json, say, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Terminal:
         self._replayer = replayer
         self._before: list[object] | None = None
         self._calls: dict[bytes, Callable[[], object]] = {
-            b" ": self._toggle_pause,
+            b" ": lambda: (replayer.resume if replayer.replay()["paused"] else replayer.pause)(),
             b".": lambda: replayer.step(1),
             b",": lambda: replayer.step(-1),
             b"\x1b[C": lambda: replayer.seek(replayer.time_s + 5),
@@ -114,9 +115,6 @@ class Terminal:
             self._calls.get(key.replace(b"\x1bO", b"\x1b["), lambda: None)()
         self.draw()
 
-    def _toggle_pause(self) -> None:
-        (self._replayer.resume if self._replayer.replay()["paused"] else self._replayer.pause)()
-
 
 def clock(time_s: float) -> str:
     """Return a time as ``1:02.3`` or ``1:00:02.3``."""
@@ -130,20 +128,20 @@ NAMESPACE = "replay"
 _DRAW_EVERY_S = 0.1
 
 
-def publish_again(
-    file: Path,
-    names: Sequence[str],
-    namespace: str | None,
-    *,
-    speed: float,
-    start_s: float,
-    end_s: float | None,
-    loop: bool,
-    paused: bool,
-    stay: bool,
-    times: str,
-    as_json: bool,
-) -> None:
+@dataclass(frozen=True)
+class Pace:
+    """The part of a recording to publish, and how: options of ``skin-replay``, arguments of a ``Replayer``."""
+
+    speed: float
+    start_s: float
+    end_s: float | None
+    loop: bool
+    paused: bool
+    stays: bool
+    keeps_times: bool
+
+
+def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace: Pace, as_json: bool) -> None:
     """Publish the services of a recording until its end; the arguments are the options of ``skin-replay``."""
     import skinware.recording
     from skinware.memory.namespace import Namespace
@@ -152,18 +150,7 @@ def publish_again(
     place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or NAMESPACE)
     _heed_others(place, is_chosen=bool(namespace))
     with skinware.recording.open(file) as recording:
-        replayer = Replayer(
-            recording,
-            names=names or None,
-            namespace=place,
-            speed=speed,
-            start_s=start_s,
-            end_s=end_s,
-            loop=loop,
-            paused=paused,
-            stays=stay,
-            keeps_times=times == "recorded",
-        )
+        replayer = Replayer(recording, names=names or None, namespace=place, **vars(pace))
         terminal = Terminal(replayer)
         has_keys = not as_json and terminal.is_ours
         continued = {signal.SIGCONT: terminal.take} if has_keys else {}
@@ -205,12 +192,10 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
 
 def _ready(recording: Recording, names: Sequence[str], namespace: str, as_json: bool) -> None:
     published = list(names or recording.services)
-    if as_json:
-        ready = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
-        print_json({**ready, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
-    else:
-        what = ", ".join(published) or "nothing"
-        echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
+    ready: dict[str, Any] = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
+    ready |= {"duration_s": recording.duration_s, "is_whole": recording.is_whole}
+    text = f"{recording.path}, {recording.duration_s:.1f} s: {', '.join(published) or 'nothing'} in"
+    say(as_json, ready, f"{text} namespace {namespace!r} (Ctrl-C ends)")
 
 
 def _report(event: str, replayer: Replayer, as_json: bool) -> None:

@@ -110,15 +110,14 @@ def _on_terminal() -> bool:
 
 def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
     from skinware import bridge_state
-    from skinware.cli import _contacts
-    from skinware.cli._top_rows import as_data, plain_line
+    from skinware.cli._top_rows import as_data, contact_data, contact_text, plain_line
 
     for driver in drivers:
         places = overview.contacts_on(driver) or []
         if as_json:
-            print_json(as_data(driver.report(), [_contacts.as_data(place) for place in places]))
+            print_json(as_data(driver.report(), [contact_data(place) for place in places]))
         else:
-            for line in (plain_line(driver.report()), *map(_contacts.plain_text, places)):
+            for line in (plain_line(driver.report()), *map(contact_text, places)):
                 echo(line)
     if as_json:
         return

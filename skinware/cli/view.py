@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import echo, say
 from skinware.errors import MissingExtra
 
 if TYPE_CHECKING:
@@ -116,12 +116,11 @@ def command(
 
     def ready(found: int) -> None:
         url = _address(host, found) + (f"?token={token}" if token else "")
-        if as_json:
-            print_json({"event": "ready", "url": url, "namespace": place.name, "names": list(names)})
-        else:
-            what = ", ".join(names) or f"all drivers of namespace {place.name!r}"
-            echo(f"{url} shows {what} (Ctrl-C ends)")
-        if not no_browser and _has_screen():
+        what = ", ".join(names) or f"all drivers of namespace {place.name!r}"
+        ready = {"event": "ready", "url": url, "namespace": place.name, "names": list(names)}
+        say(as_json, ready, f"{url} shows {what} (Ctrl-C ends)")
+        has_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")  # not a text browser in here
+        if not no_browser and has_screen:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
     try:
@@ -160,11 +159,6 @@ def _why(error: OSError) -> str:
 def _address(host: str, port: int) -> str:
     name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
     return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
-
-
-def _has_screen() -> bool:
-    """Return whether a browser with a window can be opened, not a text browser in this terminal."""
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, overwrite, print_json
+from skinware.cli._terminal import echo, overwrite, print_json, say
 from skinware.text import count_text, figure_text, plural, status_text
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def command(
     Exit status: 0 every sensor answered, 1 some never did or the driver failed, 2 wrong usage.
     """
     from skinware.memory.namespace import Namespace
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
 
     with reader_of(Namespace(namespace), name, "skin-wipe NAME") as reader:
         wipe = _Wipe(reader, type_name, as_json)
@@ -77,8 +77,8 @@ class _Wipe:
         self._is_redrawing = not as_json and sys.stdout.isatty()
 
     def go_on(self, duration_s: float | None) -> None:
-        from skinware.views.driver_snapshots import after
         from skinware.views.history import SETTLING_S, threshold
+        from skinware.views.live import after
 
         resting = None
         for frame, physical in self._frames(SETTLING_S):
@@ -87,13 +87,11 @@ class _Wipe:
         if resting is not None:
             self._test.follow(*resting)  # the first press may be there before the next snapshot
         needed = threshold(self._rest.noise(self._type.name))
-        if self._as_json:
-            what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
-            print_json({"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())})
-        else:
-            more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
-            tested = plural(len(self._tested()), f"{self._type.name} sensor")
-            echo(f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
+        what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
+        more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
+        tested = plural(len(self._tested()), f"{self._type.name} sensor")
+        ready = {"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())}
+        say(self._as_json, ready, f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
         is_due = after(_REPORT_EVERY_S)
         for frame, physical in self._frames(duration_s):
             self._test.follow(physical, frame.status == 0)
@@ -144,7 +142,7 @@ class _Wipe:
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Yield snapshots with their (n_sensors,) physical values."""
-        from skinware.views.driver_snapshots import after, frames_until
+        from skinware.views.live import after, frames_until
         from skinware.views.quantities import physical_values
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):

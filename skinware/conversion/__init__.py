@@ -7,6 +7,6 @@ time; each format writes these rows, in little memory.
 from __future__ import annotations
 
 from skinware.conversion.converting import FORMATS, WIRE_FORMATS, Converted, convert, convert_wires
-from skinware.conversion.selection import Selection
+from skinware.conversion.tables import Selection
 
 __all__ = ["FORMATS", "WIRE_FORMATS", "Converted", "Selection", "convert", "convert_wires"]

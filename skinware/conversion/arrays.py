@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import h5py
-from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, sensor_table
+from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, package, sensor_table
 
 FORMAT, VERSION = "skinware-arrays", 1
 
@@ -137,9 +136,9 @@ def write_hdf5(source: TableSource, path: Path) -> None:
         MissingExtra: h5py is not installed.
         OSError: it cannot be written.
     """
-    package = h5py()
+    hdf5 = package("h5py", "HDF5")
     with contextlib.closing(_GuardedFile(path)) as stream:
-        with package.File(stream, "w") as file:
+        with hdf5.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
             file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))
         stream.check()
@@ -147,7 +146,10 @@ def write_hdf5(source: TableSource, path: Path) -> None:
 
 def _write_table(group: Any, table: Table, stream: _GuardedFile) -> dict[str, str]:
     made = outputs(table)
-    _check_names(table, made)
+    for output in made:
+        _, _, name = output.name.partition("/")
+        if "/" in name or name == ".":  # a path in HDF5
+            raise cannot_hold("HDF5", table, f"a column {name!r}")
     datasets = {output.name: _dataset(group, output) for output in made}
     needed = tuple(dict.fromkeys(name for output in made for name in output.needs))
     for block in table.blocks(needed):
@@ -161,14 +163,6 @@ def _write_table(group: Any, table: Table, stream: _GuardedFile) -> dict[str, st
         texts = array.dtype.kind == "U"
         group.create_dataset(f"sensors/{name}", data=np.char.encode(array, "utf-8") if texts else array)
     return {output.name: output.unit for output in made if output.unit}
-
-
-def _check_names(table: Table, made: Sequence[Output]) -> None:
-    """Refuse names that are paths in HDF5."""
-    for output in made:
-        _, _, name = output.name.partition("/")
-        if "/" in name or name == ".":
-            raise cannot_hold("HDF5", table, f"a column {name!r}")
 
 
 def _dataset(group: Any, output: Output) -> Any:

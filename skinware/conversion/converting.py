@@ -7,7 +7,7 @@ import errno
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -15,9 +15,8 @@ from typing import NamedTuple, Protocol
 from skinware.conversion.arrays import write_hdf5, write_npz
 from skinware.conversion.mcap_files import ros2_without, viewers_without, write_foxglove, write_recording, write_ros2
 from skinware.conversion.rows import csv_without, write_csv, write_parquet
-from skinware.conversion.selection import Selection
-from skinware.conversion.tables import TIME, Block, DerivedSource, RecordedSource, Table, TableSource
-from skinware.errors import BadRecording, ConfigurationError
+from skinware.conversion.tables import RecordedSource, Selection, TableSource
+from skinware.errors import ConfigurationError
 from skinware.recording import Recording
 from skinware.recording.wire import Chosen, Exported, export_candump, export_pcapng
 
@@ -92,10 +91,7 @@ def convert(
     """
     form = FORMATS[format_name]
     target = new_target(path, target, form.suffix)
-    with contextlib.closing(RecordedSource(path, start_s, end_s)) as whole:
-        if not whole.tables:
-            raise BadRecording(f"{path}: no frames in it that can be used")
-        source = Watched((selection or Selection()).of(whole), is_stopped)
+    with contextlib.closing(RecordedSource(path, start_s, end_s, selection, is_stopped)) as source:
         with begun_beside(target) as begun:
             form.write(source, begun)
             if not source.frames.total():
@@ -129,31 +125,6 @@ def begun_beside(target: Path) -> Iterator[Path]:
         else:
             begun.unlink(missing_ok=True)
         raise
-
-
-class Watched(DerivedSource):
-    """A source that counts its samples as they are written, and ends when it is stopped."""
-
-    def __init__(self, source: TableSource, is_stopped: Callable[[], bool]) -> None:
-        self.frames: Counter[str] = Counter()
-        super().__init__(source, [_WatchedTable(table, self.frames, is_stopped) for table in source.tables])
-
-
-class _WatchedTable(Table):
-    """A table that counts the samples of its last pass."""
-
-    def __init__(self, table: Table, frames: Counter[str], is_stopped: Callable[[], bool]) -> None:
-        super().__init__(table.name, table.service, table.generations)
-        self.sensor_names = table.sensor_names
-        self._table, self._frames, self._is_stopped = table, frames, is_stopped
-
-    def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        self._frames[self.name] = 0
-        for block in self._table.blocks(names):
-            if self._is_stopped():
-                raise KeyboardInterrupt
-            self._frames[self.name] += len(block[TIME])
-            yield block
 
 
 class _Export(Protocol):

@@ -205,7 +205,9 @@ def write_ros2(source: TableSource, folder: Path) -> None:
             if timed.generation not in described:
                 described.add(timed.generation)
                 writer.add(_sensors(timed, tables[timed.generation]), timed.time_ns)
-            writer.add(_skin_frame(timed), timed.time_ns)
+            data = ros_messages.skin_frame(DriverSnapshot(timed.generation, timed.frame.slot), timed.time_ns)
+            topic = f"/skin/{in_topic(timed.service)}/frame"
+            writer.add(ViewerMessage(topic, "cdr", ros_messages.SKIN_FRAME, data), timed.time_ns)
             for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
                 writer.add(message, timed.time_ns)
     finally:
@@ -222,11 +224,6 @@ def _drivers(source: TableSource) -> list[Table]:
     if not drivers:
         raise ConfigurationError(f"{source.path}: no driver is in it, and nothing else can be shown")
     return drivers
-
-
-def _skin_frame(timed: TimedFrame) -> ViewerMessage:
-    data = ros_messages.skin_frame(DriverSnapshot(timed.generation, timed.frame.slot), timed.time_ns)
-    return ViewerMessage(f"/skin/{in_topic(timed.service)}/frame", "cdr", ros_messages.SKIN_FRAME, data)
 
 
 def _sensors(timed: TimedFrame, table: Table) -> ViewerMessage:

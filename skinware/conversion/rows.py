@@ -13,7 +13,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import pyarrow
 from skinware.conversion.arrays import description
 from skinware.conversion.tables import (
     COLUMNS,
@@ -25,6 +24,7 @@ from skinware.conversion.tables import (
     TableSource,
     check_distinct,
     outputs,
+    pyarrow,
     sensor_table,
 )
 from skinware.realtime import NS_PER_S
@@ -76,9 +76,8 @@ def _opened(leaf: Leaf) -> list[Leaf]:
     return opened
 
 
-_OF_DRIVERS = (
-    "values", "status", "module_time_ns", "group_time_ns", "patch_state", "bus_state", "bus_reason", "bus_load",
-)  # fmt: skip
+_STATES = ("patch_state", "bus_state", "bus_reason", "bus_load")
+_OF_DRIVERS = {COLUMNS + name for name in ("values", "status", "module_time_ns", "group_time_ns", *_STATES)}
 """Columns of a driver in text files; counters and histograms would fill most of the file."""
 
 
@@ -103,7 +102,8 @@ def csv_without(_: TableSource) -> list[str]:
 
 
 def _write_csv_table(table: Table, folder: Path, open_files: ExitStack, start_ns: int) -> None:
-    wanted = [output for output in outputs(table) if _is_wanted(table, output)]
+    left_out = () if table.structure is None else {COLUMNS + name for name in table.origin.columns} - _OF_DRIVERS
+    wanted = [output for output in outputs(table) if output.name not in left_out]
     of_frames = [output for output in wanted if output.name.startswith(FRAMES)]
     check_distinct(["frames", "sensors", *map(_file_part, wanted[len(of_frames) :])], "CSV", table)
     texts = [
@@ -120,11 +120,6 @@ def _write_csv_table(table: Table, folder: Path, open_files: ExitStack, start_ns
         frames.writelines(_line(row) for row in rows)
         for text in texts:
             text.add(times, text.output.of(block))
-
-
-def _is_wanted(table: Table, output: Output) -> bool:
-    column = output.name.removeprefix(COLUMNS)
-    return table.structure is None or column == output.name or column in _OF_DRIVERS
 
 
 def _file_part(output: Output) -> str:

@@ -22,6 +22,7 @@ from skinware.matrices import rows_and_columns
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
+from skinware.state import state_name
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
@@ -104,13 +105,13 @@ class Showing:
             "sequence": frame.sequence,
             "age_ms": (frame.published_ns - frame.acquired_ns) / 1e6,
             "patches": [
-                {"name": name, "state": _name(PatchState, state), "fresh": count}
+                {"name": name, "state": state_name(PatchState, state), "fresh": count}
                 for name, state, count in zip(
                     structure.patch_names, frame.patch_state.tolist(), fresh.tolist(), strict=True
                 )
             ],
             "buses": [
-                {"name": name, "state": _name(BusState, state), "load": load / 1000}
+                {"name": name, "state": state_name(BusState, state), "load": load / 1000}
                 for name, state, load in zip(
                     structure.buses, frame.bus_state.tolist(), frame.bus_load.tolist(), strict=True
                 )
@@ -126,13 +127,6 @@ def in_topic(text: str) -> str:
     """A text as a part of a ROS topic: letters, digits and underscores, no digit first."""
     plain = _NOT_IN_TOPICS.sub("_", text)
     return f"_{plain}" if not plain or plain[0].isdigit() else plain
-
-
-def _name(kind: Any, number: int) -> str:
-    try:
-        return str(kind(number).name.lower())
-    except ValueError:
-        return str(number)
 
 
 class _Cloud:
@@ -151,21 +145,14 @@ class _Cloud:
         self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
     ) -> ViewerMessage:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
-        self.points["age"] = _ages_s(frame)[frame.structure.sensor_group[self._index]]
+        seen_ns = frame.group_time_ns[frame.structure.sensor_group[self._index]]
+        self.points["age"] = np.where(seen_ns, (frame.published_ns - seen_ns) / NS_PER_S, np.nan)
         cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
         for number, (name, kind) in enumerate(_FIELDS):
             cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
         cdr.numbers("?", False).numbers("I", _POINT.itemsize, self.points.nbytes).array(self.points)
         is_dense = bool(np.isfinite(self.points["intensity"]).all())
         return ViewerMessage(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
-
-
-def _ages_s(frame: DriverSnapshot) -> npt.NDArray[np.float32]:
-    """(n_groups,) how old the data of each was when the frame was published, s; NaN: never seen."""
-    seen_ns = frame.group_time_ns
-    ages_s: npt.NDArray[np.float32] = ((frame.published_ns - seen_ns) / NS_PER_S).astype(np.float32)
-    ages_s[seen_ns == 0] = np.nan
-    return ages_s
 
 
 def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:

@@ -6,8 +6,9 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -15,12 +16,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
+from skinware._columns import as_index
+from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 from skinware.realtime import NS_PER_S
 from skinware.recording.reading import Recording
 from skinware.recording.tracks import Track
 from skinware.structure import Structure
-from skinware.transfer.generation import Generation
+from skinware.tactile.regions import Regions, SensorChoice, unknown
+from skinware.transfer.generation import PER_SENSOR, Generation
 
 FRAMES, COLUMNS, PHYSICAL = "frames/", "columns/", "physical/"
 """Prefixes of array names: headers of samples, columns of the service, values in their unit."""
@@ -40,29 +43,22 @@ Block = dict[str, npt.NDArray[Any]]
 """m rows of arrays, by name."""
 
 
-class Span(NamedTuple):
-    """A part of the time of a recording.
+def package(name: str, what: str) -> Any:
+    """Return a package of the extra ``convert``, imported when it is needed.
 
-    Attributes:
-        begin_ns, end_ns: on the axis of the recording; the end is not in it.
+    Raises:
+        MissingExtra: it is not installed; ``what`` needs it.
     """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise MissingExtra(f"{what} needs a package that is not installed: pip install 'skinware[convert]'") from None
 
-    begin_ns: int
-    end_ns: int
 
-    @staticmethod
-    def of(recording_begin_ns: int, start_s: float, end_s: float | None) -> Span:
-        """Return the span of seconds since a recording began; None: to its end."""
-        begin_ns = recording_begin_ns + round(start_s * NS_PER_S)
-        return Span(begin_ns, 1 << 63 if end_s is None else recording_begin_ns + round(end_s * NS_PER_S))
-
-    def has(self, time_ns: int) -> bool:
-        return self.begin_ns <= time_ns < self.end_ns
-
-    def rows_of(self, block: Block) -> Block:
-        wanted = np.flatnonzero((block[TIME] >= self.begin_ns) & (block[TIME] < min(self.end_ns, (1 << 63) - 1)))
-        rows = slice(int(wanted[0]), int(wanted[-1]) + 1) if len(wanted) else slice(0)
-        return {name: array[rows] for name, array in block.items()}
+def pyarrow() -> Any:
+    """Return the package pyarrow with its module ``parquet``, or raise MissingExtra."""
+    package("pyarrow.parquet", "Parquet")
+    return package("pyarrow", "Parquet")
 
 
 class ArrayFormat(NamedTuple):
@@ -151,31 +147,6 @@ class TableSource(Protocol):
         """Close the file. Idempotent."""
 
 
-class DerivedSource:
-    """A source with other tables than the one that it stands for."""
-
-    def __init__(self, source: TableSource, tables: Sequence[Table]) -> None:
-        self._source = source
-        self.path: Path = source.path
-        self.start_ns: int = source.start_ns
-        self.tables: Sequence[Table] = tables
-
-    @property
-    def events(self) -> list[dict[str, Any]]:
-        return self._source.events
-
-    @property
-    def clock(self) -> list[dict[str, Any]]:
-        return self._source.clock
-
-    @property
-    def problems(self) -> list[str]:
-        return self._source.problems
-
-    def close(self) -> None:
-        self._source.close()
-
-
 @dataclass(frozen=True)
 class Output:
     """An array to write: one of a table's, or computed from them.
@@ -236,9 +207,9 @@ def sensor_table(table: Table) -> dict[str, npt.NDArray[Any]]:
     row_of = {sensor_type.id: row for row, sensor_type in enumerate(structure.types)}
     rows = np.array([row_of[type_id] for type_id in structure.sensor_type.tolist()])
     columns: dict[str, npt.NDArray[Any]] = {"name": np.array(table.sensor_names)}
-    for field in ("name", "unit", "scale", "offset", "minimum", "maximum"):
-        of_types = np.array([getattr(sensor_type, field) for sensor_type in structure.types])
-        columns["type" if field == "name" else field] = of_types[rows]
+    for name in ("name", "unit", "scale", "offset", "minimum", "maximum"):
+        of_types = np.array([getattr(sensor_type, name) for sensor_type in structure.types])
+        columns["type" if name == "name" else name] = of_types[rows]
     module = structure.sensor_module.astype(np.int64)
     patch = structure.sensor_patch.astype(np.int64)
     columns |= {
@@ -270,21 +241,54 @@ def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDA
     return lambda block: structure.physical(block[COLUMNS + "values"], type_name)
 
 
-class RecordedTable(Table):
-    """A track, read as a table."""
+@dataclass(frozen=True)
+class Selection:
+    """The services and sensors to convert. A choice of sensors leaves out services without sensors.
 
-    def __init__(self, name: str, part: Track, recording: Recording, span: Span) -> None:
+    Attributes:
+        services: names; empty: all.
+        types: names of sensor types; empty: all.
+        patches: names of patches; empty: all.
+        regions: definitions of the regions in ``in_regions``.
+        in_regions: names of regions: only sensors in one of them; empty: all.
+    """
+
+    services: Collection[str] = ()
+    types: Collection[str] = ()
+    patches: Collection[str] = ()
+    regions: Regions = field(default_factory=lambda: Regions(()))
+    in_regions: Collection[str] = ()
+
+    @property
+    def sensors(self) -> SensorChoice:
+        """The choice of sensors."""
+        return SensorChoice(self.types, self.patches, self.regions, self.in_regions)
+
+
+class RecordedTable(Table):
+    """A track, or some of its sensors, read as a table, whose samples its source counts."""
+
+    def __init__(
+        self, name: str, part: Track, source: RecordedSource, positions: npt.NDArray[np.int64] | None = None
+    ) -> None:
         super().__init__(name, part.name, part.generations)
-        self._part, self._start_ns, self._span = part, recording.start_ns, span
+        self._part, self._source, self._index = part, source, None if positions is None else as_index(positions)
+        if self._index is not None and positions is not None:
+            names = self.sensor_names
+            self.generations = tuple(generation.only(self._index) for generation in part.generations)
+            self.sensor_names = [names[position] for position in positions.tolist()]
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
         columns = [name.removeprefix(COLUMNS) for name in names if name.startswith(COLUMNS)]
-        start_s = (self._span.begin_ns - self._start_ns) / NS_PER_S
-        end_s = (self._span.end_ns - self._start_ns) / NS_PER_S
-        for series in self._part.blocks(columns, start_s=start_s, end_s=end_s):
+        source = self._source
+        source.frames[self.name] = 0
+        for series in self._part.blocks(columns, start_s=source.start_s, end_s=source.end_s):
+            if source.is_stopped():
+                raise KeyboardInterrupt
             if len(series):
-                yield {
-                    "frames/time_ns": self._start_ns + np.rint(series.time_s * NS_PER_S).astype(np.int64),
+                source.frames[self.name] += len(series)
+                block = {
+                    "frames/time_ns": source.start_ns + np.rint(series.time_s * NS_PER_S).astype(np.int64),
                     "frames/generation": series.generation,
                     "frames/sequence": series.sequence,
                     "frames/acquired_ns": series.acquired_ns,
@@ -292,43 +296,86 @@ class RecordedTable(Table):
                     "frames/flags": series.flags,
                     **{COLUMNS + name: series.column(name) for name in columns},
                 }
+                if self._index is not None:
+                    block |= {
+                        COLUMNS + name: block[COLUMNS + name][:, self._index] for name in PER_SENSOR if name in columns
+                    }
+                yield block
 
 
 class RecordedSource:
-    """A recording.
+    """A recording, or a part of it.
 
     Args:
         start_s, end_s: part of its time, s since it began; None: to its end.
+        selection: the services and sensors to read; None: all.
+        is_stopped: called now and then; True ends a pass over a table with :class:`KeyboardInterrupt`.
+
+    Attributes:
+        frames: samples in the last pass over each table, by its name.
 
     Raises:
-        BadRecording: it is not a recording, or needs a newer version.
+        BadRecording: it is not a recording, needs a newer version, or has no sample that can be used.
+        ConfigurationError: it has no service, type or patch of a name, or none of the chosen sensors.
         OSError: it cannot be read.
     """
 
-    def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+        selection: Selection | None = None,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.path, self.start_s, self.end_s, self.is_stopped = path, start_s, end_s, is_stopped
+        self.frames: Counter[str] = Counter()
         self._recording = Recording(path)
         self.start_ns: int = self._recording.start_ns
-        self._span = Span.of(self.start_ns, start_s, end_s)
-        self.tables: Sequence[Table] = [
-            table for name in self._recording.services for table in self._tables_of(self._recording[name])
-        ]
+        try:
+            self.tables: Sequence[Table] = self._chosen(selection or Selection())
+        except BaseException:
+            self.close()
+            raise
 
-    def _tables_of(self, track: Track) -> list[Table]:
+    def _chosen(self, selection: Selection) -> list[Table]:
+        whole = [table for name in self._recording.services for table in self._tables_of(self._recording[name])]
+        if not whole:
+            raise BadRecording(f"{self.path}: no frames in it that can be used")
+        sensors = selection.sensors
+        structures = [table.structure for table, _ in whole if table.structure is not None]
+        services = unknown("service", selection.services, [table.service for table, _ in whole])
+        for why in (*services, *sensors.unknown(structures)):
+            raise ConfigurationError(f"{self.path}: {why}")
+        chosen: list[Table] = []
+        for table, part in whole:
+            if selection.services and table.service not in selection.services:
+                continue
+            if not sensors:
+                chosen.append(table)
+            elif table.structure is not None:
+                positions = np.flatnonzero(sensors.of(table.service, table.structure))
+                chosen += [RecordedTable(table.name, part, self, positions)] if len(positions) else []
+        if not chosen:
+            raise ConfigurationError(f"{self.path}: no sensor in it is selected")
+        self._left_out = {table.service for table, _ in whole} - {table.service for table in chosen}
+        return chosen
+
+    def _tables_of(self, track: Track) -> list[tuple[Table, Track]]:
         parts = track.parts
         if not parts:
             self._recording.note(f"samples of {track.name!r} left out: their description is lost")
         names = [track.name if not number else f"{track.name}@{number + 1}" for number in range(len(parts))]
-        return [RecordedTable(*each, self._recording, self._span) for each in zip(names, parts, strict=True)]
+        return [(RecordedTable(name, part, self), part) for name, part in zip(names, parts, strict=True)]
 
     @property
     def events(self) -> list[dict[str, Any]]:
         """See :class:`skinware.conversion.tables.TableSource`."""
-        return self._in_span(self._recording.events)
+        return [event for event in self._in_time(self._recording.events) if event.get("service") not in self._left_out]
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        return self._in_span(self._recording.clock)
+        return self._in_time(self._recording.clock)
 
     @property
     def problems(self) -> list[str]:
@@ -339,10 +386,10 @@ class RecordedSource:
     def close(self) -> None:
         self._recording.close()
 
-    def _in_span(self, readings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _in_time(self, readings: list[dict[str, Any]]) -> list[dict[str, Any]]:
         timed = []
         for each in readings:
-            time_ns = self.start_ns + round(each.pop("time_s") * NS_PER_S)
-            if self._span.has(time_ns):
-                timed.append({**each, "log_time_ns": time_ns})
+            time_s = each.pop("time_s")
+            if time_s >= self.start_s and (self.end_s is None or time_s < self.end_s):
+                timed.append({**each, "log_time_ns": self.start_ns + round(time_s * NS_PER_S)})
         return timed

@@ -6,6 +6,8 @@ protocol, docs/reference/shared-memory.md explains it.
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -63,13 +65,18 @@ class Sample:
         self,
         source: FrameSource,
         data: bytearray | memoryview,
-        in_ring: memoryview | None = None,
         start: int = 0,
+        in_ring: memoryview | None = None,
+        header: memoryview | None = None,
     ) -> None:
         self._data = data
         self._start = start
         self._in_ring = in_ring
-        self._header = memoryview(data)[start:].cast("Q") if in_ring is None else in_ring.tolist()
+        self._header: Sequence[int]
+        if in_ring is not None:
+            self._header = in_ring.tolist()
+        else:
+            self._header = memoryview(data)[start:].cast("Q") if header is None else header
         self._columns = source.columns
         self.context: object = source.context
         self.generation: int = source.generation
@@ -144,6 +151,22 @@ else:
     from typing import TypeVar
 
     SampleT = TypeVar("SampleT", bound=Sample)
+
+
+class RingWords(ctypes.Structure):
+    """``skinware__ring`` of skinware.h, with which the structures of readers and writers begin."""
+
+    _fields_ = [
+        ("map", ctypes.c_void_p),
+        ("slot_offset", ctypes.c_uint64),
+        ("slot_stride", ctypes.c_uint64),
+        ("slot_count", ctypes.c_uint64),
+    ]
+
+    @classmethod
+    def of(cls, segment: Segment) -> RingWords:
+        layout = segment.layout
+        return cls(segment.data.ctypes.data, layout.slot_offset, layout.slot_stride, layout.slot_count)
 
 
 def slots_of(segment: Segment) -> list[memoryview]:

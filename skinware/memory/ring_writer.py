@@ -14,10 +14,9 @@ import numpy.typing as npt
 from skinware import native
 from skinware.errors import Closed, ServiceError
 from skinware.memory import file_layout
-from skinware.memory.ring import LATEST, MISSED_PERIODS, STATE, slots_of
+from skinware.memory.ring import LATEST, MISSED_PERIODS, STATE, RingWords, slots_of
 from skinware.memory.segments import Segment
 from skinware.memory.statistics import bucket_of
-from skinware.memory.take import RingWords
 
 _begin = native.core().quick.skinware_native_begin
 _commit = native.core().quick.skinware_native_commit

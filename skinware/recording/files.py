@@ -140,10 +140,11 @@ class PendingChunk:
 
     Attributes:
         chunk: takes messages; another one after each :meth:`move_to`.
+        heads: of the generations of its samples.
     """
 
     def __init__(self) -> None:
-        self.chunk, self._heads = OpenChunk(), set[Head]()
+        self.chunk, self.heads = OpenChunk(), set[Head]()
         self._decoded_size = 0
 
     @property
@@ -163,19 +164,16 @@ class PendingChunk:
         """Code a sample and add it; the first one of its channel becomes a key frame."""
         if not self.chunk.has(channel):
             encoder.next_is_key()
-        self._heads.add(head)
+        self.heads.add(head)
         self._decoded_size += len(sample.slot)
         self.chunk.add(channel, schema, sample.sequence, time_ns, encoder.encode(sample), wall_ns)
-
-    def add_head(self, head: Head) -> None:
-        self._heads.add(head)
 
     def move_to(self, target: Target | RecordingFile) -> None:
         """Close the chunk, add it to a target unless it is empty, and begin another."""
         if self.chunk.is_empty:
             return
-        chunk, heads = self.chunk.close(), self._heads
-        self.chunk, self._heads, self._decoded_size = OpenChunk(), set(), 0
+        chunk, heads = self.chunk.close(), self.heads
+        self.chunk, self.heads, self._decoded_size = OpenChunk(), set(), 0
         target.add(chunk, heads)
 
 

@@ -13,7 +13,7 @@ import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -229,17 +229,8 @@ class McapFile:
         if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * summary_size + _LEAST_FREE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
         index = chunk.index
-        moved = ChunkIndex(
-            chunk_length=index.chunk_length,
-            chunk_start_offset=self.size,
-            compression=index.compression,
-            compressed_size=index.compressed_size,
-            message_end_time=index.message_end_time,
-            message_index_length=index.message_index_length,
-            message_index_offsets={channel: self.size + at for channel, at in index.message_index_offsets.items()},
-            message_start_time=index.message_start_time,
-            uncompressed_size=index.uncompressed_size,
-        )
+        offsets = {channel: self.size + at for channel, at in index.message_index_offsets.items()}
+        moved = replace(index, chunk_start_offset=self.size, message_index_offsets=offsets)
         try:
             self._index.save()
         except OSError as error:

@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 from mcap.records import Channel, Schema
@@ -41,31 +42,6 @@ _MOST_WAITING = 128 << 20
 """Bytes of samples in memory."""
 _LONGEST_REST_NS = 10_000_000
 _MOST_NEWS = 100
-
-
-@dataclass(frozen=True)
-class _Began:
-    service: str
-    head: bytes
-
-
-@dataclass(frozen=True)
-class _Took:
-    service: str
-    frame: Sample
-
-
-@dataclass(frozen=True)
-class _Happened:
-    event: dict[str, Any]
-
-
-class _Save:
-    """Asks the coder to write the chunks that are only in memory."""
-
-
-class _End:
-    """Asks the coder to end."""
 
 
 class Renderer(Protocol):
@@ -103,9 +79,8 @@ class Recorder:
         clocks: Callable[[], Clocks] = read_clocks,
     ) -> None:
         self._target = target
-        self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
-        self._coder = _Coder(target, self._jobs, disguise, renderer, TimeAxis(clocks))
+        self._coder = _Coder(target, disguise, renderer, TimeAxis(clocks))
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # later services are recorded from their first sample on
         self._stopping = False
@@ -159,7 +134,7 @@ class Recorder:
                 if not self._coder.failure:
                     self._collector.take()
         finally:
-            self._jobs.put(_End())
+            self._coder.jobs.put(None)
             self._coder.join()
             self._collector.close()
         if self._coder.failure:
@@ -171,20 +146,20 @@ class Recorder:
 
     def save(self) -> None:
         """Write the chunks in memory (:class:`skinware.recording.files.Past`); from any thread or signal handler."""
-        self._jobs.put(_Save())
+        self._coder.jobs.put(self._coder.save)
 
     # -- the collector's listener ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
         """See :class:`skinware.transfer.collecting.FrameListener`."""
-        self._jobs.put(_Began(service, head))
+        self._coder.jobs.put(partial(self._coder.begin, service, head))
 
     def took(self, service: str, frame: Sample) -> None:
         self._bytes_given += len(frame.slot)
-        self._jobs.put(_Took(service, frame))
+        self._coder.jobs.put(partial(self._coder.take, service, frame))
 
     def happened(self, event: dict[str, Any]) -> None:
-        self._jobs.put(_Happened(event))
+        self._coder.jobs.put(partial(self._coder.add_json, EVENTS, event))
 
 
 @dataclass
@@ -204,12 +179,15 @@ class _WireStream:
 
 
 class _Coder(threading.Thread):
-    """Codes samples, fills chunks, and hands them to the target when they are due."""
+    """Codes samples, fills chunks, and hands them to the target when they are due.
+
+    Attributes:
+        jobs: to be done in this thread; None: the last one was before it.
+    """
 
     def __init__(
         self,
         target: Target,
-        jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End],
         disguise: Callable[[str], str] | None,
         renderer: Renderer | None,
         axis: TimeAxis,
@@ -218,7 +196,8 @@ class _Coder(threading.Thread):
         self.channels = Channels()
         self.bytes_done = 0
         self.failure: Exception | None = None
-        self._target, self._jobs, self._disguise, self._renderer = target, jobs, disguise, renderer
+        self.jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
+        self._target, self._disguise, self._renderer = target, disguise, renderer
         self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
         self._pending = PendingChunk()
         self._abouts = 0
@@ -248,36 +227,33 @@ class _Coder(threading.Thread):
             self._pending.move_to(self._target)
         until_ns = self._next_clock_ns if self._pending.chunk.is_empty else min(self._due_ns, self._next_clock_ns)
         try:
-            job = self._jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
+            job = self.jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
         except queue.Empty:
             return True
-        match job:
-            case _Took(service, frame):
-                match self._streams[service]:
-                    case _WireStream() as stream:
-                        self._add_wire(stream, frame)
-                    case _Stream() as stream:
-                        self._add_frame(stream, service, frame)
-                self.bytes_done += len(frame.slot)
-            case _Began(service, head):
-                self._begin(service, head)
-            case _Happened(event):
-                self._add_json(EVENTS, event)
-            case _Save():
-                self._pending.move_to(self._target)
-                self._target.save()
-            case _End():
-                return False
-        return True
+        if job is not None:
+            job()
+        return job is not None
 
-    def _begin(self, service: str, head: bytes) -> None:
+    def take(self, service: str, frame: Sample) -> None:
+        match self._streams[service]:
+            case _WireStream() as stream:
+                self._add_wire(stream, frame)
+            case _Stream() as stream:
+                self._add_frame(stream, service, frame)
+        self.bytes_done += len(frame.slot)
+
+    def save(self) -> None:
+        self._pending.move_to(self._target)
+        self._target.save()
+
+    def begin(self, service: str, head: bytes) -> None:
         segment = segments.recorded(head, service)
         stride = segment.layout.slot_stride
         if stride > LIMITS.slot_size:
             why = f"frames of {stride} bytes; at most {LIMITS.slot_size} are recorded"
             event = {"event": UNREADABLE, "service": service, "time_ns": now_ns(), "why": why}
             self._streams[service] = None
-            self._add_json(EVENTS, event)
+            self.add_json(EVENTS, event)
             self.news.append(event)
             return
         wires = _wires_of(segment)
@@ -308,7 +284,7 @@ class _Coder(threading.Thread):
             about = {**wires.about, "buses": dict(zip(wires.buses, wires.about.get("buses", ()), strict=False))}
             self._abouts += 1
             channel, schema = self.channels.of_about(wires.driver)
-            self._pending.add_head(Head(channel, schema, self._abouts, json.dumps(about).encode()))
+            self._pending.heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
     def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
@@ -326,7 +302,7 @@ class _Coder(threading.Thread):
         channel, schema = self.channels.of_wire(stream.driver, stream.buses[bus])
         self._add(channel, schema, frame.sequence, frame.published_ns, message_of(frame))
 
-    def _add_json(self, topic: str, data: dict[str, Any], monotonic_ns: int | None = None) -> None:
+    def add_json(self, topic: str, data: dict[str, Any], monotonic_ns: int | None = None) -> None:
         channel, schema = self.channels.of_all(topic)
         self._add(channel, schema, 0, now_ns() if monotonic_ns is None else monotonic_ns, json.dumps(data).encode())
 
@@ -340,9 +316,9 @@ class _Coder(threading.Thread):
         self._next_clock_ns = now_ns() + _CLOCK_NS
         for event in self._axis.look():
             self.news.append(event)
-            self._add_json(EVENTS, event, event["time_ns"])
+            self.add_json(EVENTS, event, event["time_ns"])
         clocks = self._axis.clocks
-        self._add_json(CLOCK, {**clocks._asdict(), "boot": boot()}, clocks.monotonic_ns)
+        self.add_json(CLOCK, {**clocks._asdict(), "boot": boot()}, clocks.monotonic_ns)
         self._target.check()
 
     def _begin_chunk(self) -> None:

@@ -129,7 +129,9 @@ class Timeline:
         if moments is None:
             number, coming = self._coming
             moments = coming.result() if coming is not None and number == chunk else self._decoded(chunk)
-            self._prepare(chunk + 1)
+            following = chunk + 1
+            if self._ahead is not None and following < len(self._places) and following not in self._kept:
+                self._coming = following, self._ahead.submit(self._decoded, following)
         self._kept[chunk] = moments
         if len(self._kept) > _KEPT_CHUNKS:
             del self._kept[next(iter(self._kept))]
@@ -137,7 +139,3 @@ class Timeline:
 
     def _decoded(self, chunk: int) -> list[Moment]:
         return self._recording.moments_in(self._places[chunk], self.services)
-
-    def _prepare(self, chunk: int) -> None:
-        if self._ahead is not None and chunk < len(self._places) and chunk not in self._kept:
-            self._coming = chunk, self._ahead.submit(self._decoded, chunk)

@@ -11,8 +11,7 @@ from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import ACQUIRED, Sample, SampleT
-from skinware.memory.ring_reader import RingReader
-from skinware.memory.take import NEWER, NEXT
+from skinware.memory.ring_reader import NEWER, NEXT, RingReader
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._taking import Position, Taking

@@ -11,8 +11,7 @@ from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Sample, SampleT
-from skinware.memory.ring_reader import RingReader, Turns
-from skinware.memory.take import NEXT, Turn
+from skinware.memory.ring_reader import NEXT, RingReader, Turn, Turns
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._attachment import GENERATION_ENDED, Attachment
 
@@ -307,11 +306,9 @@ class Taking(Attachment[SampleT]):
         self._accounts.end_turn(turn)
 
     def _count(self, frame: SampleT) -> None:
-        last = self._last
-        missed = 0
-        if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
-            missed = frame.sequence - last[1] - 1
-        self._last = frame.generation, frame.sequence
+        self._come_back()
+        last, self._last_taken = self._last_taken, (frame.generation, frame.sequence)
+        missed = 0 if last is None else max(0, frame.sequence - last[1] - 1)  # of this generation: _adopt saw to it
         self._accounts.taken(missed)
         self._open_turn = frame.acquired_ns, now_ns()
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,48 +25,6 @@ LENGTH_S = 10.0
 _FRAMES = 320
 """Snapshots that are kept at most: ten seconds at 32 a second."""
 _TIMES_THE_NOISE = 6
-
-
-class ChangeSpan:
-    """The greatest change from rest seen lately, rounded up; it is forgotten slowly."""
-
-    def __init__(self) -> None:
-        self._greatest = 0.0
-        self._time_ns = 0
-
-    def follow(self, change: Floats, noise: float, time_ns: int) -> float:
-        """Take changes into account and return the span.
-
-        Args:
-            change: (k,) physical, 0 or more, of the sensors that count.
-            noise: how far values move without a touch; the span is at least 8 times as large.
-        """
-        passed_s = max(0, time_ns - self._time_ns) / 1e9
-        self._time_ns = time_ns
-        self._greatest *= math.exp(-passed_s / _FORGET_S)
-        self._greatest = max(self._greatest, float(change.max(initial=0)))
-        return rounded_up(max(self._greatest, _LEAST_SPAN * noise))
-
-
-class ValueLimits:
-    """The two limits of values where they are known, otherwise the extremes seen so far."""
-
-    def __init__(self) -> None:
-        self._low, self._high = math.inf, -math.inf
-
-    def follow(self, values: Floats, limits: tuple[float, float]) -> tuple[float, float]:
-        """Take values into account and return the limits.
-
-        Args:
-            values: (k,) of the sensors that count.
-            limits: of the sensor type; infinite where they are not known.
-        """
-        if all(map(math.isfinite, limits)):
-            return limits
-        counting = values[np.isfinite(values)]
-        self._low = min(self._low, float(counting.min(initial=math.inf)))
-        self._high = max(self._high, float(counting.max(initial=-math.inf)))
-        return (self._low, self._high) if self._low <= self._high else (0.0, 1.0)
 
 
 def rounded_up(value: float) -> float:
@@ -211,26 +167,6 @@ class WipeTest:
         positions = np.arange(self._structure.n_sensors)[index]
         return positions[self.travel()[index] <= threshold(noise)]
 
-    def save(self, folder: Path, driver: str, type_name: str, noise: float) -> Path:
-        """Write a list of the sensors that never moved.
-
-        Returns:
-            The new file; its name contains the time.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        structure = self._structure
-        never = self.never_moved(type_name, noise)
-        unit = structure.type(type_name).unit
-        size = len(np.arange(structure.n_sensors)[structure.index(type_name)])
-        path = folder / f"never-moved-{driver}-{type_name}-{time.strftime('%Y%m%d-%H%M%S')}.txt"
-        head = f"# {driver}: {len(never)} of {size} {type_name} sensors never moved by more than"
-        lines = [f"{head} {threshold(noise):.4g} {unit}".rstrip(), "# position in a frame, uid, name"]
-        lines += [f"{p}\t{int(structure.sensor_uid[p]):#x}\t{structure.sensor_name(p)}" for p in never.tolist()]
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        return path
-
 
 def threshold(noise: float) -> float:
     """Return how far a sensor moves at least when it is touched."""
@@ -245,13 +181,35 @@ class Memory:
         self.rest = rest or DriverRest(structure)
         self.wipe: WipeTest | None = None
         self.peak: tuple[str, Floats] | None = None
-        self._spans: dict[tuple[str, str], ChangeSpan] = {}
-        self._limits: dict[tuple[str, str], ValueLimits] = {}
+        self._greatest: dict[tuple[str, str], tuple[float, int]] = {}  # and when
+        self._extremes: dict[tuple[str, str], tuple[float, float]] = {}
 
     def span(self, key: tuple[str, str], change: Floats, noise: float, time_ns: int) -> float:
-        """Return the span of one kind of change; see :meth:`ChangeSpan.follow`."""
-        return self._spans.setdefault(key, ChangeSpan()).follow(change, noise, time_ns)
+        """Return the greatest change from rest seen lately, rounded up; it is forgotten slowly.
+
+        Args:
+            key: of the kind of change.
+            change: (k,) physical, 0 or more, of the sensors that count.
+            noise: how far values move without a touch; the span is at least 8 times as large.
+        """
+        greatest, before_ns = self._greatest.get(key, (0.0, time_ns))
+        greatest *= math.exp(-max(0, time_ns - before_ns) / 1e9 / _FORGET_S)
+        greatest = max(greatest, float(change.max(initial=0)))
+        self._greatest[key] = greatest, time_ns
+        return rounded_up(max(greatest, _LEAST_SPAN * noise))
 
     def limits(self, key: tuple[str, str], values: Floats, known: tuple[float, float]) -> tuple[float, float]:
-        """Return the limits of one kind of values; see :meth:`ValueLimits.follow`."""
-        return self._limits.setdefault(key, ValueLimits()).follow(values, known)
+        """Return the two limits of values where they are known, otherwise the extremes seen so far.
+
+        Args:
+            key: of the kind of values.
+            values: (k,) of the sensors that count.
+            known: of the sensor type; infinite where they are not known.
+        """
+        if all(map(math.isfinite, known)):
+            return known
+        counting = values[np.isfinite(values)]
+        low, high = self._extremes.get(key, (math.inf, -math.inf))
+        low, high = min(low, float(counting.min(initial=math.inf))), max(high, float(counting.max(initial=-math.inf)))
+        self._extremes[key] = low, high
+        return (low, high) if low <= high else (0.0, 1.0)

@@ -1,9 +1,12 @@
-"""Follow drivers live, and the services about them: contacts, motion, calmed drivers, and bridges."""
+"""Follow drivers live, all or one of them, and the services about them: contacts, motion, calmed drivers, bridges."""
 
 from __future__ import annotations
 
+import select
+import sys
+import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -13,10 +16,11 @@ from skinware.bridge_state import BridgeReader, BridgeState
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
-from skinware.errors import NamespaceError, StructureError
+from skinware.errors import ConfigurationError, NamespaceError, ServiceNotFound, ServiceTimeout, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.skin import Skin
 from skinware.state import DriverReport, report_of
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
@@ -28,6 +32,8 @@ _RATE_WINDOW_NS = 2 * NS_PER_S
 _COUNT_EVERY_NS = NS_PER_S // 10
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
+_WAIT_S = 0.1
+_SILENT_S = 5.0
 
 
 class _Count(NamedTuple):
@@ -163,10 +169,6 @@ class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
         return None
 
 
-def live_contacts(namespace: Namespace) -> LiveSources[ContactsSample]:
-    return LiveSources(namespace, ContactsReader)
-
-
 class TactileServices:
     """Calmed drivers, contacts and motion for the drivers of a namespace, from it and from the namespace of calm.
 
@@ -177,8 +179,9 @@ class TactileServices:
     def __init__(self, drivers: LiveDrivers, names: Collection[str] = (), calm: Namespace | None = None) -> None:
         self._calm = None if calm is None else LiveDrivers(calm, names)
         namespaces = [drivers.namespace, *([] if calm is None else [calm])]
-        self._contacts = [live_contacts(namespace) for namespace in namespaces]
+        self._contacts = [LiveSources[ContactsSample](namespace, ContactsReader) for namespace in namespaces]
         self._motion = [LiveSources[MotionSample](namespace, MotionReader) for namespace in namespaces]
+        self._all: list[LiveSources[Any]] = [*self._contacts, *self._motion]
 
     def look(self) -> None:
         """Look for services that came or went.
@@ -188,9 +191,8 @@ class TactileServices:
         """
         if self._calm is not None:
             self._calm.look()
-        for contacts, motion in zip(self._contacts, self._motion, strict=True):
-            contacts.look()
-            motion.look()
+        for services in self._all:
+            services.look()
 
     def is_due(self, live: LiveDriver) -> bool:
         """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
@@ -213,9 +215,8 @@ class TactileServices:
         return next((sample for source in self._motion if (sample := source.of(driver)) is not None), None)
 
     def close(self) -> None:
-        for contacts, motion in zip(self._contacts, self._motion, strict=True):
-            contacts.close()
-            motion.close()
+        for services in self._all:
+            services.close()
         if self._calm is not None:
             self._calm.close()
 
@@ -267,7 +268,7 @@ class Overview:
 
     def __init__(self, namespace: Namespace) -> None:
         self.drivers = LiveDrivers(namespace)
-        self.contacts = live_contacts(namespace)
+        self.contacts = LiveSources[ContactsSample](namespace, ContactsReader)
         self.bridges = LiveBridges(namespace)
 
     def look(self) -> list[LiveDriver]:
@@ -291,3 +292,62 @@ class Overview:
         self.bridges.close()
         self.contacts.close()
         self.drivers.close()
+
+
+def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReader:
+    """Return a reader of a driver, or of the only one that runs.
+
+    Args:
+        driver: its name; None: the only one.
+        how: the way to choose one, for the message.
+
+    Raises:
+        ServiceNotFound: it does not run, or none does.
+        ConfigurationError: several run.
+    """
+    if driver is None:
+        with Skin(namespace) as skin:
+            drivers = skin.refresh().drivers
+        if not drivers:
+            raise ServiceNotFound(f"no driver runs in namespace {namespace.name!r}")
+        if len(drivers) > 1:
+            raise ConfigurationError(f"several drivers run: choose one with {how}: {', '.join(drivers)}")
+        driver = drivers[0]
+    return DriverReader(driver, namespace=namespace)
+
+
+def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverSnapshot]:
+    """Yield the driver's newest snapshots, each once.
+
+    Args:
+        is_over: called before each snapshot, and ten times a second while none arrives; True ends it.
+
+    Raises:
+        ServiceTimeout: no snapshot arrived for 5 s.
+        StructureChanged: the driver has other sensors now.
+    """
+    newest: DriverSnapshot | None = None
+    heard_s = time.monotonic()
+    while not is_over():
+        try:
+            newest = reader.read(newer_than=newest, timeout_s=_WAIT_S)
+        except ServiceTimeout:
+            if time.monotonic() - heard_s > _SILENT_S:
+                raise
+            continue
+        heard_s = time.monotonic()
+        yield newest
+
+
+def after(seconds: float) -> Callable[[], bool]:
+    """Return a function that returns whether this time has passed since now."""
+    end_s = time.monotonic() + seconds
+    return lambda: time.monotonic() >= end_s
+
+
+def enter_pressed() -> bool:
+    """Return whether Enter was pressed at the terminal, and read the line; False without a terminal."""
+    if sys.stdin is None or not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True

@@ -155,7 +155,8 @@ class Scene:
             corners = np.array(np.meshgrid(*zip(body.at.min(axis=0), body.at.max(axis=0), strict=True))).reshape(3, -1)
             at = pose[:3, :3] @ corners + pose[:3, 3:]
             if not self._is_placed(body):
-                away = self._way_right(at[0].min(), np.ptp(at[0]))
+                gap = max(_BETWEEN_ISLANDS * np.ptp(at[0]), 2 * _BETWEEN_PATCHES * FLAT_PITCH_M)
+                away = max(0.0, float(self._right + gap - at[0].min()))  # to the right of everything so far
                 pose[0, 3] += away
                 at[0] += away
             self._pose_of |= {(driver, body.frame): pose for driver in body.drivers}
@@ -164,11 +165,6 @@ class Scene:
 
     def _is_placed(self, body: _Body) -> bool:
         return body.is_first and body.frame in self._poses
-
-    def _way_right(self, left: float, width: float) -> float:
-        """Return how far something must move to stand on the right of everything that is placed."""
-        gap = max(_BETWEEN_ISLANDS * width, 2 * _BETWEEN_PATCHES * FLAT_PITCH_M)
-        return max(0.0, float(self._right + gap - left))
 
     def _arrange_flat(self, sizes: Mapping[str, tuple[float, float]]) -> dict[str, Pose]:
         """Return (3,) for each driver: the upper left corner of its flat layout, beside everything with places."""

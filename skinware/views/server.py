@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.views import operations
+from skinware.views import looks
 from skinware.views.access import Access, AccessRefused
 from skinware.views.following import Follower
 from skinware.views.recording import RecordingProgram, ReplayControl
@@ -147,8 +147,8 @@ class ViewServer:
         try:
             async for text in connection:
                 try:
-                    operation = operations.operation_of(text)
-                    if isinstance(operation, operations.Next):
+                    operation = looks.operation_of(text)
+                    if isinstance(operation, looks.Next):
                         wanted.release()
                     self._do(viewer, operation)
                 except ConfigurationError as error:
@@ -176,27 +176,27 @@ class ViewServer:
         self._news.set()
         self._news.clear()
 
-    def _do(self, viewer: Viewer, operation: operations.Operation) -> None:
+    def _do(self, viewer: Viewer, operation: looks.Operation) -> None:
         match operation:
-            case operations.Next():
+            case looks.Next():
                 if operation.protocol not in (None, PROTOCOL):
                     raise ConfigurationError(f"this server speaks {PROTOCOL}: reload the page")
-            case operations.Choose():
+            case looks.Choose():
                 viewer.choose(operation)
-            case operations.Exact():
+            case looks.Exact():
                 viewer.pin(operation.sensors)
-            case operations.Names() | operations.Series():
+            case looks.Names() | looks.Series():
                 viewer.ask(operation)
-            case operations.Tare():
+            case looks.Tare():
                 viewer.tare()
-            case operations.Wipe():
+            case looks.Wipe():
                 viewer.wipe(operation.action == "start")
-            case operations.Record() if self._recording is not None:
+            case looks.Record() if self._recording is not None:
                 if operation.action == "start":
                     self._recording.start()
                 else:
                     self._recording.stop()
-            case operations.Replay():
+            case looks.Replay():
                 self._replay.act(operation.action, operation.value, viewer.refuse)
             case _:
                 raise ConfigurationError("this server cannot do that")

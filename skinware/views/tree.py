@@ -15,10 +15,8 @@ from skinware.state import (
     STARTING,
     WITHOUT_NEWS,
     DriverReport,
-    bus_state_name,
-    patch_state_name,
 )
-from skinware.status import BusState, PatchState, Status
+from skinware.status import Status
 from skinware.structure import Structure
 from skinware.text import age_text, count_text, plural, words
 from skinware.views.following import ShownDriver
@@ -96,12 +94,12 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
     if report.life not in WITHOUT_NEWS:
         for bus in report.buses:
             reason = f": {words(bus.reason)}" if bus.reason else ""
-            if bus.state != bus_state_name(BusState.LIVE):
+            if bus.state != LIVE:
                 add(ERROR, f"{bus.name} is {bus.state}{reason}", bus=bus.name)
             elif reason:
                 add(WARNING, f"{bus.name}{reason}", bus=bus.name)
         for patch in report.patches:
-            if patch.state != patch_state_name(PatchState.LIVE):
+            if patch.state != LIVE:
                 age = "" if patch.age_ns is None else f", its newest data is {age_text(patch.age_ns)} old"
                 on = report.buses[patch.bus].name
                 add(WARNING, f"{patch.name} is {patch.state}{age}", bus=on, patch=patch.name)

@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.views import operations
+from skinware.views import looks
 from skinware.views.following import Follower, ShownDriver
 from skinware.views.live import places_of
-from skinware.views.looks import Look
 from skinware.views.scene import Scene
 from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
 
@@ -54,7 +53,7 @@ class Viewer:
     """One viewer: its look, its questions, and what it has got so far."""
 
     def __init__(self, follower: Follower) -> None:
-        self.look = Look()
+        self.look = looks.Look()
         self._follower = follower
         self._number = 0
         self._edition = -1
@@ -64,10 +63,10 @@ class Viewer:
         self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
         self._asked = False
-        self._questions: list[operations.Names | operations.Series] = []
+        self._questions: list[looks.Names | looks.Series] = []
         self._error: str | None = None
 
-    def choose(self, choice: operations.Choose) -> None:
+    def choose(self, choice: looks.Choose) -> None:
         self.look.choose(choice.mode, choice.type, choice.scale, choice.fps)
         self._see_all_again()
 
@@ -83,7 +82,7 @@ class Viewer:
         """Send the exact values of these sensors, pairs of driver and position, in every turn."""
         self._exact, self._asked = sensors, True
 
-    def ask(self, question: operations.Names | operations.Series) -> None:
+    def ask(self, question: looks.Names | looks.Series) -> None:
         if len(self._questions) == _MOST_QUESTIONS:
             self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
         else:
@@ -120,7 +119,9 @@ class Viewer:
         if self._exact:
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         self._asked = False
-        for question in self._next_questions():
+        firsts = {type(question): question for question in reversed(self._questions)}.values()  # one of each kind
+        self._questions = [question for question in self._questions if question not in firsts]
+        for question in firsts:
             header |= self._answer(question, blobs)
         if self._error is not None:
             header["error"], self._error = self._error, None
@@ -248,18 +249,12 @@ class Viewer:
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
 
-    def _next_questions(self) -> list[operations.Names | operations.Series]:
-        """Take the first question of each kind from those that wait."""
-        firsts = list({type(question): question for question in reversed(self._questions)}.values())
-        self._questions = [question for question in self._questions if question not in firsts]
-        return firsts
-
-    def _answer(self, question: operations.Names | operations.Series, blobs: Blobs) -> dict[str, Any]:
+    def _answer(self, question: looks.Names | looks.Series, blobs: Blobs) -> dict[str, Any]:
         driver = self._follower.get(question.driver)
         try:
             if driver is None:
                 raise ConfigurationError(f"no driver {question.driver}")
-            if isinstance(question, operations.Names):
+            if isinstance(question, looks.Names):
                 return {"names": _names(driver, question.type)}
             return {"series": _series(driver, question.position, blobs)}
         except ConfigurationError as error:

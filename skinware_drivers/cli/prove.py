@@ -156,7 +156,7 @@ def _captured(
     name: str | None, driver_arguments: Sequence[str], place: Namespace, files: ProofFiles
 ) -> Iterator[DriverReader]:
     """Capture a running driver, or start one, while the block runs, and yield a reader of it."""
-    from skinware.views.driver_snapshots import reader_of
+    from skinware.views.live import reader_of
     from skinware_drivers.cli.capturing import captured
 
     with contextlib.ExitStack() as beside:

@@ -13,7 +13,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
-from skinware.cli.replay import NAMESPACE, publish_again
+from skinware.cli.replay import NAMESPACE, Pace, publish_again
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireTrack
@@ -98,46 +98,26 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
+    pace = Pace(factor, start_s, end_s, loop, paused, stay, times == "recorded")
     if wire:
         cli.refuse_others("--wire", {"file", "names", "factor", "start_s", "end_s", "loop", "as_json", "buses"})
         if not buses:
             raise click.UsageError(
                 f"--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:{file}"
             )
-        _replay_wires(file, names, buses, factor, start_s, end_s, loop, as_json)
+        _replay_wires(file, names, buses, pace, as_json)
         return
     if buses:
         raise click.UsageError("--bus needs --wire")
-    publish_again(
-        file,
-        names,
-        namespace,
-        speed=factor,
-        start_s=start_s,
-        end_s=end_s,
-        loop=loop,
-        paused=paused,
-        stay=stay,
-        times=times,
-        as_json=as_json,
-    )
+    publish_again(file, names, namespace, pace, as_json)
 
 
-def _replay_wires(
-    file: Path,
-    drivers: Sequence[str],
-    buses: Sequence[str],
-    speed: float,
-    start_s: float,
-    end_s: float | None,
-    loop: bool,
-    as_json: bool,
-) -> None:
+def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace: Pace, as_json: bool) -> None:
     import skinware.recording
 
     with skinware.recording.open(file) as recording:
         pairs = _pairs(recording, drivers, buses)
-        sender = WireSender(pairs, speed, start_s, end_s)
+        sender = WireSender(pairs, pace.speed, pace.start_s, pace.end_s)
         with contextlib.closing(sender), cli.signals_end(sender.stop):
             sender.open()
             names = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
@@ -145,7 +125,7 @@ def _replay_wires(
                 print_json({"event": "ready", "file": str(file), "buses": names, "duration_s": recording.duration_s})
             else:
                 echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in names.items())} (Ctrl-C ends)")
-            sender.send_all(loop=loop)
+            sender.send_all(loop=pace.loop)
         for problem in recording.problems:
             cli.warn(problem)
     if as_json:

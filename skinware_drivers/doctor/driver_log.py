@@ -15,8 +15,8 @@ from skinware.errors import ConfigurationError
 from skinware.matrices import filled_by
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware.samples import sample_report, sample_text
-from skinware.state import bus_reason_name, bus_state_name, count_statuses, patch_state_name
-from skinware.status import Status, load_report
+from skinware.state import count_statuses, state_name
+from skinware.status import BusReason, BusState, PatchState, Status, load_report
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.chain_health import ChainHealth
@@ -122,10 +122,10 @@ class DriverLog:
     def _follow_states(self, frame: DriverSnapshot, time_s: float) -> None:
         states: dict[tuple[str, int], Change] = {}
         for row, (state, reason) in enumerate(zip(frame.bus_state.tolist(), frame.bus_reason.tolist(), strict=True)):
-            why = (bus_reason_name(reason) or "").replace("_", "-")
-            states["bus", row] = Change(time_s, bus_state_name(state), why)
+            why = state_name(BusReason, reason).replace("_", "-") if reason else ""
+            states["bus", row] = Change(time_s, state_name(BusState, state), why)
         for row, state in enumerate(frame.patch_state.tolist()):
-            states["patch", row] = Change(time_s, patch_state_name(state))
+            states["patch", row] = Change(time_s, state_name(PatchState, state))
         for part, now in states.items():
             changes = self._states.setdefault(part, [])
             if not changes or (changes[-1].state, changes[-1].reason) != (now.state, now.reason):

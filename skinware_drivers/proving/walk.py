@@ -16,7 +16,7 @@ from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.text import figure_text, plural, words
-from skinware.views.driver_snapshots import after, frames_until
+from skinware.views.live import after, frames_until
 from skinware_drivers.proving.proof import Proof, Verdict
 from skinware_drivers.proving.strokes import Matrix, judge
 

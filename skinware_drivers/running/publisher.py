@@ -38,7 +38,7 @@ class Desk(Protocol):
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None: ...
 
 
-class Pace(NamedTuple):
+class PublishPace(NamedTuple):
     """Times of the publisher, ns.
 
     Attributes:
@@ -57,7 +57,7 @@ class Pace(NamedTuple):
     silence_ns: int
 
     @classmethod
-    def of(cls, period_s: float) -> Pace:
+    def of(cls, period_s: float) -> PublishPace:
         period_ns = round(period_s * NS_PER_S)
         return cls(period_ns, period_ns * 3 // 2, period_ns // 2, max(_IDLE_NS, 2 * period_ns), age_limit_ns(period_ns))
 
@@ -103,7 +103,7 @@ class BurstPauses:
         gap_ns: (n_groups,), the time before the last update of each group.
     """
 
-    def __init__(self, state: SkinState, pace: Pace) -> None:
+    def __init__(self, state: SkinState, pace: PublishPace) -> None:
         n_patches = len(state.patch_time_ns)
         n_prompt = np.bincount(state.group_patch[state.is_prompt], minlength=n_patches)
         self.pause_ns: npt.NDArray[np.int64] = np.full(n_patches, pace.pause_ns, np.int64)
@@ -155,7 +155,7 @@ class Publisher:
         structure = decoder.tables.structure
         self.writer, self.watch, self._desk = writer, watch, desk
         self.by_cycle, self.on_request = by_cycle, on_request and desk is not None
-        self.pace = Pace.of(period_s)
+        self.pace = PublishPace.of(period_s)
         self.state: SkinState = decoder.state
         self.state.settle_pace(self.pace.period_ns)
         self.buses, self.patches = BusColumns(len(structure.buses)), PatchLife(structure, self.pace.period_ns)

@@ -165,6 +165,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         log.info("%s: %s, firmware %s, %s", link.bus_name, model.name, hand.firmware.hex("."), tip.name)
         self.dtype = np.dtype(tip.dtype).newbyteorder("=")
         self.types, names = self._channels(hand.sensors)
+        names_of = FINGERS if model.fingers == len(FINGERS) else [f"finger {n + 1}" for n in range(model.fingers)]
         modules = [
             Module(
                 [
@@ -173,7 +174,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
                 ],
                 key=finger,
                 kind=f"{tip.grid.rows}x{tip.grid.columns}" if tip.grid else "force",
-                name=f"{_name_of(model, finger)} tip",
+                name=f"{names_of[finger]} tip",
             )
             for finger in hand.fitted
         ]
@@ -257,10 +258,6 @@ def _layout(hand: _Hand, tip: _Tip, order: Sequence[int]) -> Layout:
         for number in hand.fitted
     ]
     return Layout(frames)
-
-
-def _name_of(model: _Model, finger: int) -> str:
-    return FINGERS[finger] if model.fingers == len(FINGERS) else f"finger {finger + 1}"
 
 
 def _geometry(model: _Model, tip: _Tip, fitted: Sequence[int], type_names: Sequence[str]) -> Geometry:

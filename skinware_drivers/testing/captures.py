@@ -21,7 +21,7 @@ import pytest
 
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.proving.captures import check_capture
-from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.waiting import require
 
 
 class CaptureTests:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from skinware_drivers.testing.defect import defect
+from skinware_drivers.testing.waiting import defect
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, NeverEnds, package_on
 
 T = TypeVar("T")

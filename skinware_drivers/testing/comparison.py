@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.realtime import NS_PER_S
+from skinware.status import Status
 from skinware.structure import Structure
-from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, sensor_name
+from skinware_drivers.testing.rig import LONGEST_START_S, SHOWN_ANYWAY, Running, is_fresh, sensor_name
+from skinware_drivers.testing.waiting import defect, require
 
 Values = npt.NDArray[np.int64]
 _LATE_NS = 6_000_000
@@ -248,6 +251,50 @@ class ShownUpdates:
             return f"always shows {shown[0]} — is it written at all?"
         example = self._felt[device][newest[-1], own]
         return f"shows {shown[-1]} where {example} was felt — look at `offset`, `dtype` and `bits` of the layout"
+
+
+async def until_fresh(rig: Running, within_s: float = LONGEST_START_S) -> DriverSnapshot:
+    """Let time pass until every sensor is fresh; explain why if that does not happen."""
+    frames, begun_ns = rig.wire.frames, rig.clock.now_ns
+    heard_ns: int | None = None
+    # from the first data to fresh sensors: a driver repeats its questions within 4 s
+    longest_ns = max(5 * NS_PER_S, 30 * rig.period_ns)
+
+    def is_decided(frame: DriverSnapshot) -> bool:
+        nonlocal heard_ns
+        if heard_ns is None and rig.wire.frames > frames:
+            heard_ns = rig.clock.now_ns
+        is_late = heard_ns is not None and rig.clock.now_ns > heard_ns + longest_ns
+        return is_fresh(frame) or is_late
+
+    try:
+        frame = await rig.until(is_decided, "", within_s)
+        require(is_fresh(frame), "")
+    except BaseException:
+        _explain_not_fresh(rig, (rig.clock.now_ns - begun_ns) / 1e9)
+        raise
+    return frame
+
+
+def _explain_not_fresh(rig: Running, within_s: float) -> None:
+    within = f"after {within_s:.1f} s of emulated data"
+    if not rig.record.frames:
+        if rig.wire.frames:
+            defect(f"nothing was published {within}, though the devices sent {rig.wire.frames} frames")
+        defect(f"nothing was published {within}: the devices sent no frame; the driver: {rig.sent_in_words()}")
+    frame = rig.record.frames[-1]
+    if rig.truth.bursts:
+        ShownUpdates(rig).require_no_shift()
+    else:
+        defect(f"the devices sent no data {within}: does `start` start them? It sent: {rig.sent_in_words()}")
+    missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
+    never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))
+    named = ", ".join(sensor_name(frame.structure, sensor) for sensor in (never if len(never) else missing)[:3])
+    what = "was never seen" if len(never) else "is not fresh"
+    count = len(never) if len(never) else len(missing)
+    why = "No frame of the layout writes them: is a frame, a module or a channel missing, or two channels `to` one?"
+    why = rig.unused_in_words() + why
+    defect(f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}.\n{why}")
 
 
 def _as_numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

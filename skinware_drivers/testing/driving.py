@@ -23,8 +23,7 @@ from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.streams.tcp import TcpServerBus
-from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.waiting import SLOWER
+from skinware_drivers.testing.waiting import SLOWER, defect, require
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
@@ -299,7 +298,7 @@ def emulated_skin(
             line = make_bus(bus, payload_size=adapter.payload_size)
         else:
             hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))
-            line = VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
+            line = VirtualCanBus("", hardware=hardware, payload_size=adapter.payload_size)
         driving = running.enter_context(driving_lines([(adapter, line)], name))
         reader = running.enter_context(DriverReader(name, timeout_s=_LONGEST_S))
         yield EmulatedSkin(driving, reader, line, hardware)

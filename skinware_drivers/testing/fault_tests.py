@@ -15,12 +15,12 @@ from skinware.status import BusState, PatchState, Status
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.polling import Watch
-from skinware_drivers.testing.comparison import ShownUpdates
-from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
 from skinware_drivers.testing.rig import Running, in_its_time, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import FrameLog
 from skinware_drivers.testing.vectors import DirectPath
+from skinware_drivers.testing.waiting import require
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -83,7 +83,7 @@ class FaultTests(Suite):
                 comparison.require_complete(comparison.spoilt(), " (before others there was noise)")
             return
         async with rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             before = rig.counters()["unknown"]
             declared: Collection[int] = getattr(rig.devices, "identifiers", ())
             own = declared or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
@@ -103,7 +103,7 @@ class FaultTests(Suite):
 
     async def _damage(self, rig: Running, fault: Fault) -> None:
         """Run, damage some frames, and let the last burst come through."""
-        await rig.until_fresh()
+        await until_fresh(rig)
         rig.wire.every_ns = _BETWEEN_DAMAGES * rig.period_ns
         rig.wire.fault = fault
         await rig.sleep(_DAMAGES * _BETWEEN_DAMAGES * rig.adapter.period_s)
@@ -124,7 +124,7 @@ class SilenceTests(Suite):
     async def test_silence_is_shown_and_ends(self, clock: HandClock) -> None:
         """A cable that is cut: every value goes stale, and is fresh again when the cable is back."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             rig.wire.silent = True
             slowest_ns = int(rig.record.frames[-1].structure.group_period_ns.max())
             await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s, 4 * slowest_ns / NS_PER_S))
@@ -140,7 +140,7 @@ class SilenceTests(Suite):
 
         async def scenario(clock: HandClock) -> tuple[FrameLog, Running]:
             async with self.running(clock) as rig:
-                await rig.until_fresh()
+                await until_fresh(rig)
                 heard = FrameLog(rig)
                 await rig.sleep(_BURSTS * rig.adapter.period_s)
                 return heard, rig
@@ -172,7 +172,7 @@ class SilenceTests(Suite):
     async def test_a_lost_bus_comes_back(self, clock: HandClock) -> None:
         """The interface is unplugged and plugged in again: the driver continues by itself."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             rig.bus.vanish()
             await rig.until(
                 lambda frame: frame.bus_state[0] in (BusState.GONE, BusState.DOWN),
@@ -189,7 +189,7 @@ class SilenceTests(Suite):
     @in_its_time
     async def test_restarted_devices_come_back(self, clock: HandClock) -> None:
         async with self.running(clock, boot_s=0.5) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             number = rig.numbers[0]
             await self._restart(rig, number, clock.now_ns)
             patch = rig.first_patch_of(number)
@@ -226,7 +226,7 @@ class SilenceTests(Suite):
     async def test_a_dead_device_holds_up_no_other(self, clock: HandClock) -> None:
         """One device dies: the others continue at their rate."""
         async with self.running(clock, boot_s=1e6) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             if len(rig.numbers) < 2:
                 return
             await self._restart(rig, rig.numbers[0], clock.now_ns)

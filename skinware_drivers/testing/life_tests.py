@@ -17,9 +17,11 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.layout_check import check_layout
-from skinware_drivers.testing.defect import Belongings, defect, files_left, require
+from skinware_drivers.testing.comparison import until_fresh
+from skinware_drivers.testing.leaks import Belongings, files_left
 from skinware_drivers.testing.rig import Running, in_its_time, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
 
@@ -150,7 +152,7 @@ class LifeTests(Suite):
         async with rig:
             await rig.sleep(_ABSENT_S)
             rig.wire.silent = False
-            await rig.until_fresh()
+            await until_fresh(rig)
 
     @in_its_time
     async def test_devices_are_silent_again_after_stop(self, clock: HandClock) -> None:
@@ -159,7 +161,7 @@ class LifeTests(Suite):
             rig.wire.skip(clock.now_ns)
             if self._frames_alone(clock):
                 return  # they send by themselves: nothing stops them
-            await rig.until_fresh()
+            await until_fresh(rig)
         self._let_pass(rig, 0.1)
         sent = len(self._let_pass(rig, 1.0))
         require(
@@ -185,7 +187,7 @@ class LifeTests(Suite):
 
         async def scenario(clock: HandClock) -> None:
             async with self.running(clock) as rig:
-                await rig.until_fresh()
+                await until_fresh(rig)
                 rig.bus.vanish()
                 await rig.sleep(0.5)
                 rig.bus.come_back()
@@ -207,7 +209,7 @@ class LifeTests(Suite):
         rig = self.running(clock)
         rig.record.keep = False
         async with rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             await rig.sleep(10 * rig.adapter.period_s)
             rig.truth.remember = rig.wire.remember = False  # then only the driver can grow
             await rig.sleep(20 * rig.adapter.period_s)  # makes what is kept from then on

@@ -97,7 +97,7 @@ def namespace(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -
     A test that failed is not checked, because pytest's report of the failure keeps its objects.
     """
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.testing.defect import Belongings, files_left
+    from skinware_drivers.testing.leaks import Belongings, files_left
 
     monkeypatch.setenv("SKINWARE_NAMESPACE", f"test-{os.getpid()}-{secrets.token_hex(4)}")
     place = Namespace()

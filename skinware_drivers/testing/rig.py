@@ -16,7 +16,6 @@ import numpy.typing as npt
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware.samples import sample_report, sample_text
 from skinware.status import BusState, PatchState, Status
 from skinware.structure import Structure
@@ -27,7 +26,7 @@ from skinware_drivers.proving.captures import snapshots_after
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import (
     EmulatedBus,
     Interference,
@@ -41,7 +40,7 @@ T = TypeVar("T")
 NAME = "driver_under_test"
 _BUS = "bus"
 _SLOTS = 64
-_LONGEST_START_S = 12.0
+LONGEST_START_S = 12.0
 _UNUSED = (
     *("unknown", "bad_length", "bad_content", "refused", "orphans", "checksum_errors", "bad_form"),
     "polls_unanswered",
@@ -227,7 +226,7 @@ class Running(Rig):
             defect(f"the driver ended by itself: {type(error).__name__}: {error}" if error else "the driver ended")
 
     async def until(
-        self, condition: Callable[[DriverSnapshot], object], why_not: str, within_s: float = _LONGEST_START_S
+        self, condition: Callable[[DriverSnapshot], object], why_not: str, within_s: float = LONGEST_START_S
     ) -> DriverSnapshot:
         """Let time pass until a snapshot fulfils a condition; fail with ``why_not`` if none does."""
         record, end_ns = self.record, self.clock.now_ns + round(within_s * 1e9)
@@ -240,51 +239,7 @@ class Running(Rig):
             require(self.clock.now_ns < end_ns, why_not)
             await self.sleep(min(self.adapter.period_s / 2, 0.05))
 
-    async def until_fresh(self, within_s: float = _LONGEST_START_S) -> DriverSnapshot:
-        """Let time pass until every sensor is fresh; explain why if that does not happen."""
-        frames, begun_ns = self.wire.frames, self.clock.now_ns
-        heard_ns: int | None = None
-        # from the first data to fresh sensors: a driver repeats its questions within 4 s
-        longest_ns = max(5 * NS_PER_S, 30 * self.period_ns)
-
-        def is_decided(frame: DriverSnapshot) -> bool:
-            nonlocal heard_ns
-            if heard_ns is None and self.wire.frames > frames:
-                heard_ns = self.clock.now_ns
-            is_late = heard_ns is not None and self.clock.now_ns > heard_ns + longest_ns
-            return is_fresh(frame) or is_late
-
-        try:
-            frame = await self.until(is_decided, "", within_s)
-            require(is_fresh(frame), "")
-        except BaseException:
-            self._explain_not_fresh((self.clock.now_ns - begun_ns) / 1e9)
-            raise
-        return frame
-
-    def _explain_not_fresh(self, within_s: float) -> None:
-        from skinware_drivers.testing.comparison import ShownUpdates  # which looks at rigs
-
-        within = f"after {within_s:.1f} s of emulated data"
-        if not self.record.frames:
-            if self.wire.frames:
-                defect(f"nothing was published {within}, though the devices sent {self.wire.frames} frames")
-            defect(f"nothing was published {within}: the devices sent no frame; the driver: {self.sent_in_words()}")
-        frame = self.record.frames[-1]
-        if self.truth.bursts:
-            ShownUpdates(self).require_no_shift()
-        else:
-            defect(f"the devices sent no data {within}: does `start` start them? It sent: {self.sent_in_words()}")
-        missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
-        never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))
-        named = ", ".join(sensor_name(frame.structure, sensor) for sensor in (never if len(never) else missing)[:3])
-        what = "was never seen" if len(never) else "is not fresh"
-        count = len(never) if len(never) else len(missing)
-        why = "No frame of the layout writes them: is a frame, a module or a channel missing, or two channels `to` one?"
-        why = self._unused_in_words() + why
-        defect(f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}.\n{why}")
-
-    def _unused_in_words(self) -> str:
+    def unused_in_words(self) -> str:
         """Return counters of unused frames, samples, and their reasons in the layout; empty if all were used."""
         counters = {name: count for name, count in self.counters().items() if count and name in (*_UNUSED, "orphans")}
         lone = counters.pop("orphans", 0)  # perhaps a consequence of the others

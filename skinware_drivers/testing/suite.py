@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Case, Handshakes, Running
+from skinware_drivers.testing.waiting import require
 from skinware_drivers.testing.wire import Pattern
 from skinware_drivers.virtual.emulator import each_value
 from skinware_drivers.virtual.hand_clock import HandClock

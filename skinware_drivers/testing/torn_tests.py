@@ -23,11 +23,11 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.path_hooks import Named
-from skinware_drivers.testing.comparison import ShownUpdates
-from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
 from skinware_drivers.testing.rig import Running, in_its_time
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.vectors import DirectPath
+from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 
@@ -56,7 +56,7 @@ class TornTests(Suite):
     async def test_no_run_of_lost_frames_tears_a_burst(self, clock: HandClock) -> None:
         """Runs up to two bursts long, from every frame on; the frames around them in time, late, or caught up."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             if not rig.adapter.layout.cycles:
                 return  # a frame is all of an update
             heard = FrameLog(rig)
@@ -82,7 +82,7 @@ class TornTests(Suite):
     async def test_nothing_torn_is_shown_while_a_sender_stumbles(self, clock: HandClock) -> None:
         """The driver runs while its devices lose runs of frames, stand still and catch up; then all is fresh again."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             before, bursts = rig.wire.frames, rig.truth.most_bursts
             await rig.sleep(8 * rig.adapter.period_s)
             size = round((rig.wire.frames - before) / max(1, rig.truth.most_bursts - bursts))

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from skinware.status import Status
-from skinware_drivers.testing.comparison import ShownUpdates
-from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
 from skinware_drivers.testing.rig import in_its_time
 from skinware_drivers.testing.suite import Suite, extreme
+from skinware_drivers.testing.waiting import require
 from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24
@@ -24,7 +24,7 @@ class ValueTests(Suite):
     async def test_every_value_is_right_and_in_order(self, clock: HandClock) -> None:
         """Each sensor shows its values, every burst is shown once, and no counter of faults grows."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             await rig.sleep(_BURSTS * rig.adapter.period_s)
             comparison = ShownUpdates(rig)
             comparison.require_right()
@@ -41,7 +41,7 @@ class ValueTests(Suite):
     async def test_extreme_values(self, clock: HandClock) -> None:
         """Least and greatest values, alternating bits, and the sign bit alone are shown as they were sent."""
         async with self.running(clock, pattern=extreme) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             await rig.sleep(24 * rig.adapter.period_s)
             ShownUpdates(rig).require_right()
 
@@ -71,7 +71,7 @@ class ValueTests(Suite):
             rig.wire.keep = first_of_each_burst
             await rig.sleep(_SILENCE_S)
             rig.wire.keep = lambda _identifier, _payload: True
-            await rig.until_fresh()
+            await until_fresh(rig)
             ShownUpdates(rig).require_right(
                 "with most frames missing on the wire, sensors without a frame of theirs were filled in"
             )
@@ -80,7 +80,7 @@ class ValueTests(Suite):
     async def test_the_rate_is_the_declared_one(self, clock: HandClock) -> None:
         """Updates come every ``period_s``: readers, staleness and pairing depend on it."""
         async with self.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             await rig.sleep(2 * _BURSTS * rig.adapter.period_s)
             for number in rig.numbers:
                 real_s = _mean_interval_s([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])

@@ -45,7 +45,7 @@ from skinware_drivers.running.path_hooks import Named
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import make_bus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame

@@ -1,24 +1,36 @@
-"""Wait in real time for a condition, without a fixed sleep."""
+"""Fail a test in words, at once or after waiting in real time for a condition, without a fixed sleep."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable
+from typing import NoReturn
 
 import numpy as np
+import pytest
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ServiceTimeout
 from skinware.samples import sample_report, sample_text
 from skinware.status import Status
-from skinware_drivers.testing.defect import defect, require
 
 SLOWER = float(os.environ.get("SKINWARE_TEST_PATIENCE") or (4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1))
 """Factor for the waiting times of tests in real time; the CAN lab has an emulated processor."""
 PATIENCE_S = 12.0 * SLOWER
 """Longest time to wait for a snapshot, unless a test gives another."""
+
+
+def defect(what: str) -> NoReturn:
+    """Fail the test with a message that names the defect and the place to look at."""
+    pytest.fail(what, pytrace=False)
+
+
+def require(condition: object, what: str) -> None:
+    """Fail the test unless a condition holds."""
+    if not condition:
+        defect(what)
 
 
 def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.testing.defect import defect
+from skinware_drivers.testing.waiting import defect
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame

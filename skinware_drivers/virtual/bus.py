@@ -6,7 +6,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -88,26 +88,6 @@ class VirtualCanBus(Bus):
         self._present = True
         self._next_error: BusError | None = None
 
-    @classmethod
-    def with_hardware(
-        cls,
-        hardware: EmulatedHardware,
-        *,
-        payload_size: int = 8,
-        listen_only: bool = False,
-        clock: Callable[[], int] = time.monotonic_ns,
-        make_timer: Callable[[], Timer] = MonotonicTimer,
-    ) -> Self:
-        """Make a bus with devices of the caller, for tests."""
-        return cls(
-            "",
-            payload_size=payload_size,
-            listen_only=listen_only,
-            hardware=hardware,
-            clock=clock,
-            make_timer=make_timer,
-        )
-
     # Bus
 
     @property
@@ -170,7 +150,9 @@ class VirtualCanBus(Bus):
             BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
         """
         try:
-            self._check_sending(payload)
+            self.may_send_by(self._timer if self._present else None)
+            if len(payload) > self.payload_size:
+                raise BusSendError(f"{self.name}: {len(payload)} bytes of payload, in frames of {self.payload_size}")
         except BusSendError:
             self.counters.send_failures += 1
             raise
@@ -240,11 +222,6 @@ class VirtualCanBus(Bus):
     def _wake_at(self, time_ns: int | None) -> None:
         if self._timer is not None:
             self._timer.wake_at(time_ns)
-
-    def _check_sending(self, payload: bytes) -> None:
-        self.may_send_by(self._timer if self._present else None)
-        if len(payload) > self.payload_size:
-            raise BusSendError(f"{self.name}: {len(payload)} bytes of payload, in frames of {self.payload_size}")
 
 
 @cache

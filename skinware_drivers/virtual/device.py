@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from msgspec import Meta
 
 from skinware_drivers.options import Options
 from skinware_drivers.virtual.wire import Transmitter
-
-if TYPE_CHECKING:
-    from skinware_drivers.virtual import stage as emulation
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Seconds = Annotated[float, Meta(ge=0)]
@@ -75,6 +72,17 @@ class Scheduled(NamedTuple):
     action: Callable[[int], object]
 
 
+class TimerOwner(Protocol):
+    """The emulator of a device, as its timers call it."""
+
+    @property
+    def options(self) -> EmulatorOptions: ...
+
+    def on_timer(self, device: Device, name: str, time_ns: int) -> None: ...
+
+    def skipped(self, device: Device, name: str, times: int) -> int: ...
+
+
 class Device:
     """One emulated device.
 
@@ -90,7 +98,7 @@ class Device:
         random: source of the faults of its frames.
     """
 
-    def __init__(self, number: int, stage: emulation.Stage[Any], transmitter: Transmitter, now_ns: int) -> None:
+    def __init__(self, number: int, stage: TimerOwner, transmitter: Transmitter, now_ns: int) -> None:
         self.number = number
         self.stage = stage
         self.transmitter = transmitter

@@ -14,16 +14,16 @@ from textual.widgets import Static
 from skinware import Namespace, Structure
 from skinware.cli import _top_app
 from skinware.cli._command import exit_status
-from skinware.cli._contacts import TITLES, labels_of, line_of, lines_of, plain_text
 from skinware.cli._heat_map import arrange
 from skinware.cli._painting import HeatMap
 from skinware.cli._top_app import SkinTop
+from skinware.cli._top_rows import TITLES, contact_text, labels_of, line_of, lines_of
 from skinware.cli.top import command
 from skinware.geometry import Geometry
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
-from skinware.views.live import live_contacts, places_of
+from skinware.views.live import LiveSources, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until
@@ -109,7 +109,7 @@ def test_where_nobody_knows_places_a_contact_is_on_its_first_module() -> None:
         (place,) = places_of(reader.read(timeout_s=10), structure)
     assert place.module == "board 7, triangle 1"
     assert "-" in line_of(place)
-    assert "at - m" in plain_text(place)
+    assert "at - m" in contact_text(place)
 
 
 def test_lines_fit_80_columns_and_what_has_no_room_is_counted() -> None:
@@ -148,7 +148,7 @@ def test_labels_stand_over_the_sensors_that_are_drawn() -> None:
 
 
 def test_services_that_come_and_go_are_followed() -> None:
-    contacts = live_contacts(Namespace())
+    contacts = LiveSources(Namespace(), ContactsReader)
     with touched_skin() as writer:
         contacts.look()
         frame = contacts.of("a")

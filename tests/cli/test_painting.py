@@ -99,9 +99,4 @@ def test_only_marks_that_are_there_are_explained() -> None:
     marks = np.array([heat.FRESH] * 5 + [heat.STALE] * 2 + [heat.NOT_CONNECTED], np.uint8)
     assert marks_text(marks, TRUE_COLOURS).plain == "5 fresh  ░ 2 stale  x 1 not connected"
     assert marks_text(np.zeros(0, np.uint8), TRUE_COLOURS).plain == "0 fresh"
-    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(10))
-
-
-def test_what_never_moved_is_fresh_all_the_same() -> None:
-    marks = np.array([heat.FRESH] * 5 + [heat.UNMOVED] * 2, np.uint8)
-    assert marks_text(marks, TRUE_COLOURS).plain == "7 fresh  □ 2 never moved"
+    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(9))

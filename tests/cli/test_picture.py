@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from skinware.cli._heat_map import LEVELS
 from skinware.cli._picture import RANGE, Picture, describe_sensor
 from skinware.cli._top_rows import BUS, DRIVER, PATCH, RowKey
 from skinware.tactile.regions import Region, Regions
-from skinware.views import history
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 DRIVER_ROW, BUS_ROW, PATCH_ROW = RowKey("a", DRIVER, 0), RowKey("a", BUS, 0), RowKey("a", PATCH, 1)
@@ -111,45 +109,6 @@ def test_the_baseline_is_taken_anew_on_request() -> None:
         assert len(drawn(picture, PATCH_ROW, reader.read())) == 2
         picture.take_baselines()
         assert drawn(picture, PATCH_ROW, reader.read()) == [0]
-
-
-def test_a_taxel_stuck_at_a_plausible_value_is_found_by_a_wipe_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(history, "SETTLING_S", 0.0)
-    with published() as (skin, reader):
-        assert skin.values is not None
-        picture = Picture()
-        skin.values[41] = 100  # board 8, triangle 0, taxel 5: well within what others say
-        skin.publish()
-        drawn(picture, PATCH_ROW, reader.read())
-        assert (picture.wipe_text("a"), picture.save_wipe("a", tmp_path)) == (None, None)
-        picture.wipe_test()
-        assert drawn(picture, PATCH_ROW, reader.read()) == [heat.UNMOVED * LEVELS]
-        assert (
-            picture.wipe_text("a") == "wipe test: 30 never moved (l saves the list): board 8, triangle 0, taxel 0 ..."
-        )
-        pressure = skin.structure.sensor_type == 1
-        for touch in (80, 0):
-            skin.values[pressure] = 255 - touch
-            skin.values[41] = 100
-            skin.publish()
-            drawn(picture, PATCH_ROW, reader.read())
-        unmoved, peak = sorted(set(picture.pixels.ravel().tolist()) - {heat.BACKGROUND})[::-1]
-        assert (unmoved, peak > 8) == (heat.UNMOVED * LEVELS, True)  # peaks stay, though nothing touches any more
-        assert picture.marks.plain == "30 fresh  □ 1 never moved"
-        assert picture.scale.plain.startswith("peak 0 ")
-        assert picture.wipe_text("a") == "wipe test: 1 never moved (l saves the list): board 8, triangle 0, taxel 5"
-        path = picture.save_wipe("a", tmp_path)
-        assert path is not None
-        assert path.read_text().splitlines()[2:] == ["41\t0x411\tboard 8, triangle 0, taxel 5"]
-        skin.values[41] = 180
-        skin.publish()
-        drawn(picture, PATCH_ROW, reader.read())
-        assert picture.wipe_text("a") == "wipe test: every sensor has moved"
-        picture.wipe_test()
-        drawn(picture, PATCH_ROW, reader.read())
-        assert picture.wipe_text("a") is None
 
 
 def test_nothing_but_nan_is_drawn_all_the_same() -> None:

@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -250,30 +249,6 @@ def test_types_and_scales_take_turns() -> None:
                 await until(pilot, lambda: line(app, "scale").startswith("raw "))
 
     go(scene)
-
-
-def test_a_wipe_test_and_its_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    async def scene() -> None:
-        with FakeSkin("a", fake_structure(1, 1)) as skin:
-            skin.values = skin.status * 0 + 240
-            skin.publish()
-            async with shown() as (app, pilot):
-                await until(pilot, lambda: line(app, "marks") == "10 fresh")
-                await pilot.press("l")  # there is no list yet
-                await pilot.press("w")
-                await until(pilot, lambda: line(app, "marks") == "10 fresh  □ 10 never moved")
-                assert line(app, "detail").startswith("wipe test: 10 never moved (l saves the list): board 7, taxel 0")
-                assert line(app, "scale").startswith("peak ")
-                await pilot.press("l")
-                await until(pilot, lambda: bool(list(tmp_path.iterdir())))
-                await pilot.press("w", "b")
-                await until(pilot, lambda: line(app, "marks") == "10 fresh")
-
-    go(scene)
-    (saved,) = tmp_path.iterdir()
-    assert saved.read_text().startswith("# a: 10 of 10 pressure sensors never moved")
 
 
 @pytest.mark.parametrize(

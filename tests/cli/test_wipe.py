@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from skinware.views.history import WipeTest
@@ -38,14 +36,3 @@ def test_a_value_that_is_no_number_takes_nothing_away() -> None:
     test = wiped()
     test.follow(np.full(N, np.nan, np.float32), FRESH)
     assert test.never_moved("pressure", NOISE).tolist() == [STUCK, MISSING]
-
-
-def test_the_list_has_names_that_people_know(tmp_path: Path) -> None:
-    path = wiped().save(tmp_path, "torso", "pressure", NOISE)
-    assert path.name.startswith("never-moved-torso-pressure-")
-    assert path.read_text() == (
-        "# torso: 2 of 20 pressure sensors never moved by more than 12 counts\n"
-        "# position in a frame, uid, name\n"
-        "3\t0x3eb\tboard 7, triangle 0, taxel 3\n"
-        "12\t0x3f4\tboard 7, triangle 1, taxel 0\n"
-    )

@@ -188,9 +188,9 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
         class Overtaken(Sample):
             __slots__ = ()
 
-            def __init__(self, *arguments: object) -> None:
+            def __init__(self, *arguments: Any, **named: Any) -> None:
                 nonlocal attempts
-                super().__init__(*arguments)  # type: ignore[arg-type]
+                super().__init__(*arguments, **named)
                 attempts += 1
                 publish()
                 publish()
@@ -199,7 +199,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
         in_order = reader.in_order(timeout_s=PATIENCE_S)
         next(in_order)
         publish()
-        reader._ring._frame_class = Overtaken
+        reader._ring.frame_class = Overtaken
         takes: dict[str, Callable[[], Sample]] = {
             "copy": reader.read,
             "view": reader.view().__enter__,
@@ -209,7 +209,7 @@ def test_a_writer_that_is_always_faster_is_an_overrun_after_a_bounded_number_of_
             takes[way]()
         assert COPY_ATTEMPTS <= attempts <= COPY_ATTEMPTS + 1
         assert reader.statistics.overruns == 1
-        reader._ring._frame_class = Sample
+        reader._ring.frame_class = Sample
         assert is_whole(reader.read())
 
 

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from skinware import DriverWriter, Skin, Snapshot
-from skinware import skin as skin_module
 from skinware.errors import Closed, ServiceTimeout
-from skinware.memory.take import Take
+from skinware.memory.ring_reader import Take
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 
@@ -26,24 +25,22 @@ NAMES = "abc"
 
 
 @pytest.fixture
-def skins(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Skin]]:
+def skins() -> Iterator[dict[str, Skin]]:
     """A skin that leaves its looks to C, and one that does not."""
-    made = {way: LookingIn(way, monkeypatch) for way in ("C", "Python")}
+    made = {way: LookingIn(way) for way in ("C", "Python")}
     yield dict(made)
     for skin in made.values():
         skin.close()
 
 
 class LookingIn(Skin):
-    def __init__(self, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, way: str) -> None:
         super().__init__()
-        self.way, self.monkeypatch = way, monkeypatch
+        self.way = way
 
-    def read(self, **how: Any) -> Snapshot:
-        with self.monkeypatch.context() as patch:
-            if self.way == "Python":
-                patch.setattr(skin_module, "take_of", lambda _: None)
-            return super().read(**how)
+    def _leave_to_c(self, snapshot: Snapshot) -> None:
+        if self.way == "C":
+            super()._leave_to_c(snapshot)
 
 
 def publish(writer: DriverWriter, value: int) -> None:

@@ -21,9 +21,9 @@ import pytest
 
 from skinware import Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Closed, PlatformError, ServiceTimeout
-from skinware.memory.ring_reader import RingReader
+from skinware.memory.ring import RingWords
+from skinware.memory.ring_reader import ReaderPlace, ReaderState, RingReader, TakeState
 from skinware.memory.ring_writer import RingWriter, WriterState
-from skinware.memory.take import ReaderPlace, ReaderState, RingWords, TakeState
 from skinware.service import _attachment, _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import compiled

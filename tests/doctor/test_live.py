@@ -114,7 +114,7 @@ class _TwoWithOneAddress:
 
 
 def test_two_boards_with_one_address() -> None:
-    bus = VirtualCanBus.with_hardware(_TwoWithOneAddress())
+    bus = VirtualCanBus("", hardware=_TwoWithOneAddress())
     with driving(bus):
         finding = found_until(of("patches", "two boards with one address"), seconds=1.5)
     assert finding.what.startswith("board 7 sends ")

@@ -104,7 +104,7 @@ class Bench:
         self.hardware = case.devices(self.log, **faults)
         self.adapter = case.adapter()
         size = self.adapter.payload_size
-        self.bus = VirtualCanBus.with_hardware(self.hardware, payload_size=size, clock=lambda: loop.now_ns)
+        self.bus = VirtualCanBus("", hardware=self.hardware, payload_size=size, clock=lambda: loop.now_ns)
         self.link = Link(self.bus)
         self.updates: list[tuple[int, int, list[int]]] = []
         self.notices: list[tuple[str, Notice]] = []

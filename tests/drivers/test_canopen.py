@@ -61,7 +61,7 @@ class Stage:
     def __init__(self, **options: Any) -> None:
         self.log: list[Any] = []
         self.hardware = EmulatedCanopen(EmulatedCanopenOptions(boot_s=0.05), log=self.log)
-        self.bus = VirtualCanBus.with_hardware(self.hardware)
+        self.bus = VirtualCanBus("", hardware=self.hardware)
         self.adapter = CanopenDriver(CanopenOptions(nodes=(5, 6), **options))
         self._context: Any = None
 
@@ -251,7 +251,7 @@ def test_tpdos_that_wait_for_sync_get_it(tmp_path: Path) -> None:
 
 def test_a_listener_learns_the_nodes_from_what_it_hears() -> None:
     hardware = EmulatedCanopen(EmulatedCanopenOptions(nodes=(17, 99), streaming=True))
-    bus = VirtualCanBus.with_hardware(hardware, listen_only=True)
+    bus = VirtualCanBus("", hardware=hardware, listen_only=True)
     adapter = CanopenDriver(CanopenOptions(learn_s=0.2))
     with driving_lines([(adapter, bus)], "skin", listen_only=True), DriverReader("skin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())

@@ -10,6 +10,7 @@ import pytest
 from skinware.status import PatchState, Status
 from skinware_drivers.loading import registered
 from skinware_drivers.registry import DRIVERS
+from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.virtual.hand_clock import HandClock
@@ -82,7 +83,7 @@ def test_the_row_is_what_is_shown(row: Row) -> None:
 
     async def scenario(clock: HandClock) -> tuple[Any, dict[str, int]]:
         async with suite.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             before = rig.counters()
             rig.devices.silent.add(row.kind)
             await rig.sleep(max(_LEAST_S, _PERIODS * rig.adapter.period_s))

@@ -71,7 +71,7 @@ class Ear:
 def sent_by(adapter: AnyAdapter, until: Sequence[tuple[int, str]], **answers: Any) -> list[tuple[int, str]]:
     """Everything that a driver sends, from its start to its end."""
     ear = Ear(answers.get("answers", {}))
-    with driving_lines([(adapter, VirtualCanBus.with_hardware(ear))], "skin", wait=False):
+    with driving_lines([(adapter, VirtualCanBus("", hardware=ear))], "skin", wait=False):
         wait_until(lambda: set(until) <= set(ear.heard))
     return ear.heard
 

@@ -88,7 +88,7 @@ class Measured(VirtualCanBus):
 
 
 def test_the_load_is_as_the_bus_counts_it_while_it_is_heard() -> None:
-    bus = Measured.with_hardware(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)))
+    bus = Measured("", hardware=EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)))
     bus.wire_bits = 1e15  # from before
     heard = heard_on(bus)
     assert heard.load is not None
@@ -122,7 +122,7 @@ def test_a_silent_bus_is_asked_by_discovery(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_boot_loader_is_told_from_an_application(monkeypatch: pytest.MonkeyPatch) -> None:
     loader = Chatter((0x750, b"\xff\x0b\x02\x07"))  # as if it answered: every 10 ms
-    bus = VirtualCanBus.with_hardware(loader)
+    bus = VirtualCanBus("", hardware=loader)
     silent = HeardOnBus("bus", duration_s=1.0)
     monkeypatch.setattr(looking, "make_bus", lambda *_, **__: bus)
     answer = asyncio.run(ask(silent, DRIVERS))
@@ -131,7 +131,7 @@ def test_a_boot_loader_is_told_from_an_application(monkeypatch: pytest.MonkeyPat
 
 def test_a_bus_of_strangers_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     strangers = Chatter((0x181, b"\x01\x02"))
-    answer = asked_on(VirtualCanBus.with_hardware(strangers), monkeypatch)
+    answer = asked_on(VirtualCanBus("", hardware=strangers), monkeypatch)
     assert "no driver knows what is sending" in answer.refused
     assert strangers.heard == []
 
@@ -237,7 +237,7 @@ def test_drivers_that_do_not_say_how_to_ask_ask_nobody() -> None:
 def test_devices_are_taken_for_what_they_are_and_for_nothing_else(
     emulator: EmulatedHardware, driver: str, patches: tuple[str, ...]
 ) -> None:
-    bus = VirtualCanBus.with_hardware(emulator, listen_only=True)
+    bus = VirtualCanBus("", hardware=emulator, listen_only=True)
     drivers: dict[str, type[AnyAdapter]] = {
         "allegro_v5": AllegroV5Driver,
         "barrett": BarrettDriver,

@@ -55,7 +55,7 @@ def test_versions_of_a_live_bus_disturb_nobody() -> None:
 
 
 def test_nobody_there_has_no_versions() -> None:
-    assert done(VirtualCanBus.with_hardware(Chatter()), "versions") == {}
+    assert done(VirtualCanBus("", hardware=Chatter()), "versions") == {}
 
 
 def test_an_address_is_moved_and_checked() -> None:
@@ -104,7 +104,7 @@ class Deaf(VirtualCanBus):
 
 
 def test_a_board_that_did_not_take_its_address_is_a_failure() -> None:
-    deaf = Deaf.with_hardware(emulated(boards=(7,)).hardware)
+    deaf = Deaf("", hardware=emulated(boards=(7,)).hardware)
     with pytest.raises(HandshakeTimeout, match="board 7 got the address 9, but no board answers there"):
         done(deaf, "set_address", address=9)
 
@@ -123,13 +123,13 @@ def test_two_boards_of_one_address_are_a_failure() -> None:
                 self._wake_when_due()
 
     with pytest.raises(BusError, match="board 7 and board 9 both answer"):
-        done(Both.with_hardware(bus.hardware), "set_address", address=9)
+        done(Both("", hardware=bus.hardware), "set_address", address=9)
 
 
 def test_a_board_without_skin_keeps_its_address() -> None:
     strain = Chatter((0x2D0, b"\x1c\x0c\x01\x00\x00\x02\x00\x01"), (0x7D0, b"\xff\x0c\x01\x00\x00"))
     with pytest.raises(HandshakeTimeout, match="no device of this driver answers"):  # that a stranger does is no answer
-        done(VirtualCanBus.with_hardware(strain), "set_address", {"force": True}, address=9)
+        done(VirtualCanBus("", hardware=strain), "set_address", {"force": True}, address=9)
     assert [payload for _, payload in strain.heard if payload[0] == 0x32] == []
 
 
@@ -170,7 +170,7 @@ def test_mistakes_are_told_before_the_bus_is_opened() -> None:
     with pytest.raises(ConfigurationError, match="rate: "):
         done(emulated(boards=(7,)), "rate", hz="fast")
     with pytest.raises(HandshakeTimeout, match="bus: no device of this driver answers"):
-        done(VirtualCanBus.with_hardware(Chatter()), "rebaseline")
+        done(VirtualCanBus("", hardware=Chatter()), "rebaseline")
 
 
 def test_a_bus_that_fails_at_the_end_is_told() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from skinware import Status
 from skinware_drivers.modbus import Registers
+from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.virtual import Device
@@ -37,7 +38,7 @@ class OfTwoBlocks(Suite):
 def test_only_the_taxels_of_the_silent_block_are_stale() -> None:
     async def scenario(clock: HandClock) -> None:
         async with OfTwoBlocks().running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             rig.devices.silent.add("300")
             await rig.sleep(2.0)
             frame = rig.record.frames[-1]

@@ -167,7 +167,7 @@ def hand(
     driver = Hand(NoOptions()) if on_tare is None else TaringHand(NoOptions())
     if isinstance(driver, TaringHand) and on_tare is not None:
         driver.on_tare = partial(on_tare, devices)
-    bus = VirtualCanBus.with_hardware(devices, payload_size=64)
+    bus = VirtualCanBus("", hardware=devices, payload_size=64)
     with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
         yield reader
 

@@ -32,7 +32,7 @@ from skinware.conversion.learning import (
     read_intervals,
 )
 from skinware.conversion.learning.features import Moments, Statistics
-from skinware.conversion.learning.joined import Joined, matched
+from skinware.conversion.learning.wanted import Joined, matched
 from skinware.conversion.mcap_files import write_recording
 from skinware.conversion.tables import Table
 from skinware.errors import BadRecording, ConfigurationError

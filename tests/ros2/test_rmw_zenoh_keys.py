@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from skinware.errors import BridgeError
-from skinware.ros2.rmw_zenoh_keys import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token, qos_text
+from skinware.ros2.rmw_zenoh import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token, qos_text
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos, ServiceType
 
 STRING = MessageType("std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18")

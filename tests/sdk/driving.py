@@ -30,7 +30,7 @@ SILENCE_NS = 600_000_000
 
 def emulated(log: list[Event] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
     hardware = EmulatedRoboskin(EmulatorOptions(**options), log=log)
-    return VirtualCanBus.with_hardware(hardware, listen_only=listen_only)
+    return VirtualCanBus("", hardware=hardware, listen_only=listen_only)
 
 
 def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
@@ -218,7 +218,7 @@ class TroubledBus(VirtualCanBus):
 
 
 def troubled(log: list[Event] | None = None, **options: Any) -> TroubledBus:
-    return TroubledBus.with_hardware(EmulatedRoboskin(EmulatorOptions(**options), log=log))
+    return TroubledBus("", hardware=EmulatedRoboskin(EmulatorOptions(**options), log=log))
 
 
 def follow(reader: DriverReader, condition: Callable[[Any], bool]) -> Any:

@@ -27,11 +27,11 @@ AT = [0.07, 0.0225, 0.0]
 
 def on_arm(board: int, *, listen_only: bool = False) -> VirtualCanBus:
     options = EmulatorOptions(boards=(board,), pattern="idle", streaming=listen_only)
-    return PlacedCanBus.with_hardware(EmulatedRoboskin(options), listen_only=listen_only)
+    return PlacedCanBus("", hardware=EmulatedRoboskin(options), listen_only=listen_only)
 
 
 def nowhere(board: int) -> VirtualCanBus:
-    return VirtualCanBus.with_hardware(EmulatedRoboskin(EmulatorOptions(boards=(board,), pattern="idle")))
+    return VirtualCanBus("", hardware=EmulatedRoboskin(EmulatorOptions(boards=(board,), pattern="idle")))
 
 
 def driver(*boards: int) -> RoboskinDriver:

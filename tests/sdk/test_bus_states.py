@@ -73,7 +73,7 @@ class SlowBus(ReportingBus):
 
 
 def reporting(kind: type[ReportingBus] = ReportingBus, **options: object) -> ReportingBus:
-    return kind.with_hardware(EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,), **options)))  # type: ignore[arg-type]
+    return kind("", hardware=EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,), **options)))  # type: ignore[arg-type]
 
 
 def told(caplog: pytest.LogCaptureFixture, bus: str) -> list[str]:
@@ -239,7 +239,7 @@ def test_interfaces_are_closed_side_by_side(caplog: pytest.LogCaptureFixture) ->
                 self.all_at_once.wait(30)
             super().close()
 
-    buses = [Closing.with_hardware(EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,)))) for _ in range(3)]
+    buses = [Closing("", hardware=EmulatedRoboskin(EmulatedRoboskinOptions(boards=(7,)))) for _ in range(3)]
     with driving(*buses):
         pass
     assert [bus.fileno() for bus in buses] == [-1, -1, -1]

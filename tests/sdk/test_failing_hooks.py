@@ -314,7 +314,7 @@ def test_a_bus_whose_code_fails_is_lost_and_opened_again(caplog: pytest.LogCaptu
                 self.fault = ""
                 raise KeyError("oops")
 
-    bus = Broken.with_hardware(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
+    bus = Broken("", hardware=EmulatedRoboskin(EmulatorOptions(boards=(7,))))
     with driving(bus) as running, DriverReader("roboskin") as reader:
         follow(reader, lambda f: not f.status.any())
         for fault in ("receive", "check"):

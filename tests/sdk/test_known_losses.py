@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import Case, Running, play
 from skinware_drivers.testing.suite import lively
 from skinware_drivers.virtual.hand_clock import HandClock
@@ -19,7 +20,7 @@ def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, name
     async def scenario(clock: HandClock) -> list[list[int]]:
         told: list[list[int]] = []
         async with Running(case, clock, lively(EmulatedFingertips)) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             assert rig.runner is not None
             assert rig.runner.builder.generation is not None
             generation: Any = rig.runner.builder.generation

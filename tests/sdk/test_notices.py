@@ -124,7 +124,7 @@ NEW = int(Status.NEVER_SEEN | Status.SUSPECT)
 
 
 def test_a_patch_that_restarted_is_set_up_at_once_and_alone(devices: Devices, caplog: pytest.LogCaptureFixture) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus("", hardware=devices)
     with caplog.at_level(logging.WARNING), driving_lines([(adapter, bus)], "speaking") as running:
         with DriverReader("speaking") as reader:
             stage = Stage(running, devices, adapter)
@@ -137,7 +137,7 @@ def test_a_patch_that_restarted_is_set_up_at_once_and_alone(devices: Devices, ca
 
 
 def test_a_set_up_that_fails_is_tried_again_for_ever(devices: Devices) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus("", hardware=devices)
     adapter.failures = 2
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         read_until(reader, statuses(GOOD, GOOD))
@@ -156,7 +156,7 @@ class Slow(Speaking):
 def test_a_lost_patch_is_stale_until_its_next_data_and_a_listener_revives_none(
     devices: Devices, notice: Notice
 ) -> None:
-    adapter, bus = Slow(NoOptions()), VirtualCanBus.with_hardware(devices, listen_only=True)
+    adapter, bus = Slow(NoOptions()), VirtualCanBus("", hardware=devices, listen_only=True)
     with driving_lines([(adapter, bus)], "speaking", listen_only=True) as running:
         with DriverReader("speaking") as reader:
             stage = Stage(running, devices, adapter)
@@ -169,7 +169,7 @@ def test_a_lost_patch_is_stale_until_its_next_data_and_a_listener_revives_none(
 
 
 def test_errors_make_values_suspect_until_they_are_over_or_the_patch_was_set_up(devices: Devices) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         stage = Stage(running, devices, adapter)
         read_until(reader, statuses(GOOD, GOOD))
@@ -184,7 +184,7 @@ def test_errors_make_values_suspect_until_they_are_over_or_the_patch_was_set_up(
 
 
 def test_what_is_told_of_oneself_is_no_unknown_frame(devices: Devices) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         Stage(running, devices, adapter).say(1, Notice.SUSPECT)
         read_until(reader, statuses(SUSPECT, GOOD))
@@ -198,7 +198,7 @@ def test_a_patch_that_restarts_again_while_it_is_set_up_is_found(devices: Device
             if len(self.revived) == 1:
                 devices.mute.add(patch.key)  # it loses its configuration again, without a word
 
-    adapter, bus = Hasty(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Hasty(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         read_until(reader, statuses(GOOD, GOOD))
         Stage(running, devices, adapter).say(1, Notice.RESTARTED, mute=True)
@@ -211,7 +211,7 @@ def test_an_adapter_that_fails_while_it_attends_ends_the_driver(devices: Devices
         async def attend(self, link: Link) -> None:
             raise ZeroDivisionError("a bug")
 
-    lines = [(Broken(NoOptions()), VirtualCanBus.with_hardware(devices))]
+    lines = [(Broken(NoOptions()), VirtualCanBus("", hardware=devices))]
     ended_by_itself: list[bool] = []
 
     def see_it_end(running: Driving) -> None:
@@ -239,7 +239,7 @@ def test_a_patch_that_changed_is_asked_anew_until_what_it_says_makes_sense(
     one, two = Speaking.patches
     three = Patch("three", [Module(taxels(2, first_uid=4))], key=3)
     answers: list[Callable[[], Sequence[Patch]]] = [nothing, lambda: (one, one), lambda: (one, two, three)]
-    adapter, bus = Changing(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Changing(NoOptions()), VirtualCanBus("", hardware=devices)
     with (
         caplog.at_level(logging.WARNING),
         driving_lines([(adapter, bus)], "speaking") as running,
@@ -273,7 +273,7 @@ def test_an_adapter_whose_bus_fails_while_it_attends_attends_again(devices: Devi
             self.attends = True
             await super().attend(link)
 
-    adapter, bus = Shaky(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Shaky(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         wait_until(lambda: adapter.attends)
         Stage(running, devices, adapter).say(1, Notice.SUSPECT)
@@ -281,7 +281,7 @@ def test_an_adapter_whose_bus_fails_while_it_attends_attends_again(devices: Devi
 
 
 def test_nobody_is_probed_while_the_devices_of_a_bus_are_being_set_up(devices: Devices) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         read_until(reader, statuses(GOOD, GOOD))
         runner = running.runner
@@ -319,7 +319,7 @@ def test_sequence_numbers_of_a_patch_that_was_set_up_anew_begin_anew(devices: De
         return bytes((numbers[key] % 256, key, key))
 
     devices.data = data
-    adapter, bus = Counting(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter, bus = Counting(NoOptions()), VirtualCanBus("", hardware=devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
         read_until(reader, statuses(GOOD, GOOD))
 

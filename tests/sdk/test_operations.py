@@ -54,9 +54,9 @@ def test_rebaseline_ends_a_suspicion() -> None:
     bus = emulated(boards=(7,))
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
-        running.do(lambda: hardware_of(bus).acknowledge(7, 3, bus._clock(), on=False))
+        running.do(lambda: hardware_of(bus).set_triangle(7, 3, "no_ack", bus._clock()))
         read_until(reader, lambda f: bool((f.status & Status.SUSPECT).all()))
-        running.do(lambda: hardware_of(bus).acknowledge(7, 3, bus._clock(), on=True))
+        running.do(lambda: hardware_of(bus).set_triangle(7, 3, "ack", bus._clock()))
         reader.call("rebaseline")
         read_until(reader, lambda f: not f.status.any())
 

@@ -74,7 +74,7 @@ class Device:
 
 
 def bus_with(device: Device, *, listen_only: bool = False) -> TroubledBus:
-    return TroubledBus.with_hardware(device, listen_only=listen_only)
+    return TroubledBus("", hardware=device, listen_only=listen_only)
 
 
 def test_answers_to_polls_are_published_one_by_one_at_absolute_deadlines() -> None:

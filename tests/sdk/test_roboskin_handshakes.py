@@ -74,14 +74,14 @@ def test_only_applications_of_possible_addresses_are_boards() -> None:
         (0x7A1, bytes.fromhex("FF0B011900")),  # an answer to another host
     )
     both = Together(EmulatedRoboskin(EmulatorOptions(boards=(7,))), strangers)
-    with driving(VirtualCanBus.with_hardware(both)), DriverReader("roboskin") as reader:
+    with driving(VirtualCanBus("", hardware=both)), DriverReader("roboskin") as reader:
         assert patches_of(reader) == ["board 7"]
 
 
 def test_boards_without_skin_are_left_alone_unless_they_are_named(caplog: pytest.LogCaptureFixture) -> None:
     strain2 = Chatter((0x790, bytes.fromhex("FF0C010200")))
     both = Together(EmulatedRoboskin(EmulatorOptions(boards=(7, 8), mtb3=(8,))), strain2)
-    with driving(VirtualCanBus.with_hardware(both)), DriverReader("roboskin") as reader:
+    with driving(VirtualCanBus("", hardware=both)), DriverReader("roboskin") as reader:
         assert patches_of(reader) == ["board 7", "board 8"]
         read_until(reader, lambda f: not f.status.any())
     assert {identifier for identifier, _ in strain2.heard} == {0x70F, 0x207, 0x208}
@@ -110,7 +110,7 @@ def test_a_named_board_that_sends_no_data_is_named_and_set_up_when_it_appears(
     late_log: list[Event] = []
     present = EmulatedRoboskin(EmulatorOptions(boards=(7,)), log=log)
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(8,)), log=late_log))
-    bus = VirtualCanBus.with_hardware(Together(present, late))
+    bus = VirtualCanBus("", hardware=Together(present, late))
     with caplog.at_level(logging.WARNING), driving(bus, boards=(7, 8)) as running, DriverReader("roboskin") as reader:
         wait_until(lambda: "bus0: board 8 sends no data" in caplog.text)
         frame = read_until(reader, lambda f: not f.status[:192].any())
@@ -127,7 +127,7 @@ def test_a_named_board_that_sends_no_data_is_named_and_set_up_when_it_appears(
 
 def test_named_boards_of_which_none_answers_are_waited_for(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7, 8))))
-    bus = VirtualCanBus.with_hardware(late)
+    bus = VirtualCanBus("", hardware=late)
     with (
         caplog.at_level(logging.WARNING),
         driving(bus, wait=False, boards=(7, 8)) as running,
@@ -148,7 +148,7 @@ def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
     monkeypatch.setattr(roboskin_boards, "_REPLY_S", 0.05)
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), pattern="idle")))
     log: list[Event] = []
-    buses = emulated(log, boards=(7,), pattern="idle"), VirtualCanBus.with_hardware(late)
+    buses = emulated(log, boards=(7,), pattern="idle"), VirtualCanBus("", hardware=late)
     with driving(*buses, boards=boards) as running, DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())
         assert patches_of(reader) == ["board 7"]
@@ -245,14 +245,14 @@ def test_a_board_that_moved_its_baseline_is_trusted_again_once_it_was_set_up() -
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         hardware = hardware_of(bus)
-        running.do(lambda: hardware.acknowledge(7, 1, bus._clock(), on=False))
+        running.do(lambda: hardware.set_triangle(7, 1, "no_ack", bus._clock()))
         read_until(reader, lambda f: bool((f.status[:192] & Status.SUSPECT).all()))
-        running.do(lambda: hardware.acknowledge(7, 1, bus._clock(), on=True))
+        running.do(lambda: hardware.set_triangle(7, 1, "ack", bus._clock()))
         running.do(lambda: hardware.restart(7, bus._clock()))
         read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
         read_until(reader, lambda f: not f.status.any())
         # one more cycle without acknowledgement is the first one of a new count
-        running.do(lambda: hardware.acknowledge(7, 1, bus._clock(), on=False))
+        running.do(lambda: hardware.set_triangle(7, 1, "no_ack", bus._clock()))
         frame = read_until(reader, lambda f: bool((f.status[:192] & Status.NO_ACK).any()))
         assert not (frame.status & Status.SUSPECT).any()
 
@@ -272,7 +272,7 @@ def test_a_listener_believes_data_of_skin_only() -> None:
         (0x5C3, head),
     )
     streaming = EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True))
-    bus = VirtualCanBus.with_hardware(Together(streaming, strangers), listen_only=True)
+    bus = VirtualCanBus("", hardware=Together(streaming, strangers), listen_only=True)
     with driving(bus, listen_only=True, learn_s=0.3), DriverReader("roboskin") as reader:
         assert patches_of(reader) == ["board 7"]
         frame = read_until(reader, lambda f: reader.bus_counters(f)[0]["unknown"] >= 70)
@@ -282,7 +282,7 @@ def test_a_listener_believes_data_of_skin_only() -> None:
 def test_a_listener_learns_for_as_long_as_it_was_told() -> None:
     early = EmulatedRoboskin(EmulatorOptions(boards=(9,), streaming=True))
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)))
-    bus = VirtualCanBus.with_hardware(Together(early, late), listen_only=True)
+    bus = VirtualCanBus("", hardware=Together(early, late), listen_only=True)
     with driving(bus, listen_only=True, wait=False, learn_s=1.0) as running:
         wait_until(lambda: bus.counters.frames > 0)
         running.do(lambda: setattr(late, "present", True))

@@ -15,12 +15,8 @@ from tests.sdk.driving import commands, driving, emulated, hardware_of, read_unt
 from tests.sdk.test_roboskin_wire import MS, Rig, halves
 
 
-def in_class_3(frames: list[tuple[int, int, bytes]]) -> list[tuple[int, int, bytes]]:
-    return [(time_ns, identifier - 0x100, payload) for time_ns, identifier, payload in frames]
-
-
 def test_class_3_is_skin_only_where_it_was_said() -> None:
-    frames = in_class_3(halves(3, 5))
+    frames = [(time_ns, identifier - 0x100, payload) for time_ns, identifier, payload in halves(3, 5)]
     usual, old = Rig(), Rig(old_style=True, boards=(7,))
     assert usual.feed(frames) == []
     assert usual.count("unknown") == 2

@@ -69,7 +69,7 @@ def test_a_flood_on_one_bus_holds_up_no_other(
 ) -> None:
     monkeypatch.setattr("skinware_drivers.bus.BATCH_FRAMES", 128)
     hardware = EmulatedRoboskin(EmulatorOptions(boards=(7,)))
-    flood = Flood.with_hardware(hardware)
+    flood = Flood("", hardware=hardware)
     flood.frames = frames
     others = [emulated(boards=(board,), pattern="idle") for board in (8, 9)]
     with driving(flood, *others) as running, DriverReader("roboskin") as reader:
@@ -116,7 +116,7 @@ def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
         return [(board + triangle + channel) % 256 for channel in range(12)]
 
     hardware = EmulatedRoboskin(EmulatorOptions(boards=(7, 9)), source=source)
-    with driving(VirtualCanBus.with_hardware(hardware)), DriverReader("roboskin") as reader:
+    with driving(VirtualCanBus("", hardware=hardware)), DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())
         uid = frame.structure.sensor_uid.astype(np.int64)
         assert frame.values.tolist() == ((uid >> 16) + (uid >> 8 & 0xFF) + (uid & 0xFF)).tolist()
@@ -221,7 +221,7 @@ def test_diagnostics_of_the_hardware_reach_the_user() -> None:
         frame = read_until(reader, lambda f: not (f.status & Status.NEVER_SEEN).any())
         assert frame.status[2 * 12 + 5] == Status.OUT_OF_RANGE
         assert set(frame.status[36:48].tolist()) == {int(Status.NOT_CONNECTED)}
-        running.do(lambda: hardware_of(bus).unplug(7, 4, bus._clock()))
+        running.do(lambda: hardware_of(bus).set_triangle(7, 4, "unplugged", bus._clock()))
         frame = read_until(reader, lambda f: bool((f.status[48:60] & Status.NOT_CONNECTED).all()))
         assert set(frame.values[48:60].tolist()) == {0}  # full pressure, if it were not for the flag
 
@@ -231,7 +231,7 @@ def test_a_board_that_recalibrates_itself_is_suspect() -> None:
     bus = emulated(boards=(7, 8), pattern="idle")
     with driving(bus) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
-        running.do(lambda: hardware_of(bus).acknowledge(7, 1, bus._clock(), on=False))
+        running.do(lambda: hardware_of(bus).set_triangle(7, 1, "no_ack", bus._clock()))
         frame = read_until(reader, lambda f: bool((f.status[:192] & Status.SUSPECT).all()))
         assert not (frame.status[192:] & Status.SUSPECT).any()
 
@@ -260,7 +260,7 @@ def test_a_listener_sends_nothing_and_learns_what_it_hears() -> None:
 @pytest.mark.usefixtures("hurry")
 def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
-    bus = VirtualCanBus.with_hardware(late)
+    bus = VirtualCanBus("", hardware=late)
     with caplog.at_level(logging.WARNING), driving(bus, wait=False) as running:
         wait_until(lambda: "no patch answers; waiting" in caplog.text)
         late.present = True
@@ -279,7 +279,7 @@ def test_a_listener_that_hears_nobody_says_so(caplog: pytest.LogCaptureFixture) 
 def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(9,), streaming=True)))
     both = Together(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)), late)
-    bus = VirtualCanBus.with_hardware(both, listen_only=True)
+    bus = VirtualCanBus("", hardware=both, listen_only=True)
     with driving(bus, listen_only=True, learn_s=0.3) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         assert reader.structure.n_patches == 1

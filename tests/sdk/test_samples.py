@@ -106,7 +106,7 @@ class Pad(CanAdapter[NoOptions]):
 def test_a_running_driver_shows_them() -> None:
     """Unknown, of a wrong length, without meaning, and refused by the bus; in its frames and in what it prints."""
     babbler = Babbler((0x123, b"\1\2"), (0x473, b"\x40\1"), (0x473, b"\x11" * 8), (0x222, bytes(64)))
-    bus = TroubledBus.with_hardware(babbler, listen_only=True)
+    bus = TroubledBus("", hardware=babbler, listen_only=True)
     with (
         driving_lines([(Pad(NoOptions()), bus)], "skin", listen_only=True) as running,
         DriverReader("skin") as reader,

@@ -109,7 +109,7 @@ def test_silent_patches_are_told_of_in_one_line(
     frames = [replace(SHORT, name=f"short {n}", when=[Identifier(0x100 + n)], patch=n) for n in range(count)]
     patches = [Patch(f"finger {n}", [Module(taxels(6, first_uid=16 * n))], key=n) for n in range(count)]
     driver = type("Silent", (Fingers,), {"layout": Layout(frames), "patches": patches})
-    bus = TroubledBus.with_hardware(Chatter((0x100, bytes(8))))
+    bus = TroubledBus("", hardware=Chatter((0x100, bytes(8))))
     with driving_lines([(driver(NoOptions()), bus)], "silent", wait=False):
         wait_until(lambda: any("no data" in text for text in caplog.messages))
     (told,) = [text for text in caplog.messages if "no data" in text]

@@ -21,7 +21,7 @@ from skinware.memory.namespace import Namespace
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
-from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.waiting import require
 from skinware_drivers.virtual.hand_clock import HandClock, package_on
 from tests.specification.one_path import Marking, NativeWay, NumpyWay, Publishing, Way
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.decoding.decoder import SkinState, Updates
-from skinware_drivers.running.publisher import BurstPauses, Pace
+from skinware_drivers.running.publisher import BurstPauses, PublishPace
 from tests.specification.decoding import join
 
 Indices = npt.NDArray[np.int64]
@@ -42,7 +42,7 @@ class Bursts:
         self,
         state: SkinState,
         pauses: BurstPauses,
-        pace: Pace,
+        pace: PublishPace,
         show: Callable[[Updates], None],
         skip: Callable[[Indices], None],
     ) -> None:

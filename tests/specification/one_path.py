@@ -20,7 +20,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher
-from skinware_drivers.testing.defect import defect
+from skinware_drivers.testing.waiting import defect
 from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
 

@@ -17,10 +17,11 @@ from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.native_stream import NativeStream, can_compile
 from skinware_drivers.serial.stream import PythonStream, Stream
 from skinware_drivers.testing import conformance
-from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import FrameLog
+from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.specification.both_paths import Pair, hand_clock
@@ -174,7 +175,7 @@ class PathTests(Suite):
 
         async def scenario(clock: HandClock) -> tuple[FrameLog, Running]:
             async with self.running(clock) as rig:
-                await rig.until_fresh()
+                await until_fresh(rig)
                 heard = FrameLog(rig)
                 if trouble == "stumbling":
                     rig.wire.stumbling = Stumbling(rig.period_ns, _FRAMES_OF_A_BURST)

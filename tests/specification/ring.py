@@ -74,7 +74,7 @@ class SpecifiedReader(RingReader[SampleT]):
         if words[SEQUENCE] != sequence:
             return None
         fence()
-        sample = self._frame_class(self, bytearray(self._slots[slot]))
+        sample = self.frame_class(self, bytearray(self._slots[slot]))
         fence()
         return sample if words[SEQUENCE] == sequence else None
 

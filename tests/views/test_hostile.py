@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 
 from skinware.errors import ConfigurationError
 from skinware.views import server
-from skinware.views.operations import operation_of
+from skinware.views.looks import operation_of
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.views.client import page_of
 from tests.views.conftest import Serve

@@ -234,10 +234,10 @@ def test_plugged_in_again() -> None:
     rig = Rig()
     rig.configure()
     rig.run_ms(500)
-    rig.hardware.unplug(7, 3, rig.now_ns)
+    rig.hardware.set_triangle(7, 3, "unplugged", rig.now_ns)
     rig.run_ms(5)
     assert {frame.payload[6:].hex() for frame in rig.run_ms(50) if frame.identifier == 0x473} >= {"fff2"}
-    rig.hardware.plug_in(7, 3, rig.now_ns)
+    rig.hardware.set_triangle(7, 3, "plugged_in", rig.now_ns)
     rig.run_ms(5)
     assert {f.payload[6:].hex() for f in rig.run_ms(50) if (f.identifier, f.payload[0]) == (0x473, 0xC0)} == {"0000"}
     assert [event.fault for event in rig.events("triangle_fault")] == ["unplugged", "plugged_in"]
@@ -247,7 +247,7 @@ def test_a_triangle_plugged_in_after_calibration_reads_no_pressure_until_the_nex
     rig = Rig(not_connected=("7/3",))
     rig.configure(skin_type=2)
     rig.run_ms(100)
-    rig.hardware.plug_in(7, 3, rig.now_ns)
+    rig.hardware.set_triangle(7, 3, "plugged_in", rig.now_ns)
     rig.run_ms(50)
     head, tail = cycles(rig.run_ms(100))[-1][6:8]
     assert head.payload == bytes.fromhex("40 FF FF FF FF FF FF FF")
@@ -298,7 +298,7 @@ def test_the_recalibration_of_a_pressed_patch_makes_values_jump() -> None:
     rig.configure(skin_type=2, period_ms=10)
     while (deepest := min(min(f.payload[1:6], default=255) for f in rig.run_ms(10))) > 150:
         assert rig.now_ns < START_NS + 20_000 * MS
-    rig.hardware.acknowledge(7, 15, rig.now_ns, on=False)
+    rig.hardware.set_triangle(7, 15, "no_ack", rig.now_ns)
     rig.run_ms(70)
     assert deepest + 60 < min(min(frame.payload[1:6]) for frame in rig.run_ms(10))
     assert rig.events("triangle_fault")[0].fault == "no_ack"
@@ -308,7 +308,7 @@ def test_acknowledging_again_after_the_recalibration_reads_full_pressure() -> No
     rig = Rig(no_ack=("7/3",), no_ack_after_cycles=4)
     rig.configure(skin_type=2)
     rig.run_ms(1000)
-    rig.hardware.acknowledge(7, 3, rig.now_ns, on=True)
+    rig.hardware.set_triangle(7, 3, "ack", rig.now_ns)
     rig.run_ms(50)
     head, tail = cycles(rig.run_ms(100))[-1][6:8]
     assert (head.payload, tail.payload[6:]) == (bytes.fromhex("40 00 00 00 00 00 00 00"), bytes.fromhex("FF F0"))

@@ -91,7 +91,7 @@ def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_frames_of_a_program_have_any_length() -> None:
-    bus = VirtualCanBus.with_hardware(Long(SerialEmulatorOptions(streaming=True)), payload_size=400)
+    bus = VirtualCanBus("", hardware=Long(SerialEmulatorOptions(streaming=True)), payload_size=400)
     bus.open()
     try:
         first = received(bus, 400)[0]

@@ -226,7 +226,7 @@ def test_a_bus_by_name_has_places_if_its_devices_have_and_one_for_tests_has_none
     assert len(bus.geometry) == 2 * 192
     assert virtual_bus("xela").geometry is None
     assert virtual_bus("openpatch").geometry is None
-    assert VirtualCanBus.with_hardware(Rig().hardware).geometry is None
+    assert VirtualCanBus("", hardware=Rig().hardware).geometry is None
 
 
 def test_every_address_of_a_board_has_its_own_place() -> None:

@@ -51,8 +51,8 @@ def make_bus(clock: Clock) -> Iterator[MakeBus]:
 
     def make(payload_size: int = 8, listen_only: bool = False, **options: object) -> VirtualCanBus:
         options.setdefault("boards", (7, 8))
-        bus = VirtualCanBus.with_hardware(
-            boards(**options), payload_size=payload_size, listen_only=listen_only, clock=clock
+        bus = VirtualCanBus(
+            "", hardware=boards(**options), payload_size=payload_size, listen_only=listen_only, clock=clock
         )
         buses.append(bus)
         bus.open()
@@ -223,7 +223,7 @@ def test_frames_that_no_row_can_hold_are_counted(clock: Clock) -> None:
         def totals(self) -> dict[str, int]:
             return {}
 
-    bus = VirtualCanBus.with_hardware(LongFrames(), clock=clock)
+    bus = VirtualCanBus("", hardware=LongFrames(), clock=clock)
     bus.open()
     assert bus.receive(batch := FrameBatch(10), 0) == 1
     assert frames_of(batch)[0].identifier == 2

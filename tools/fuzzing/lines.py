@@ -27,6 +27,7 @@ from skinware_drivers.counters import BusCounters  # noqa: E402
 from skinware_drivers.description import SkinTables  # noqa: E402
 from skinware_drivers.registry import load_driver  # noqa: E402
 from skinware_drivers.serial.adapter import SerialAdapter  # noqa: E402
+from skinware_drivers.testing.comparison import until_fresh  # noqa: E402
 from skinware_drivers.testing.rig import Case, Running, play  # noqa: E402
 from skinware_drivers.testing.suite import lively  # noqa: E402
 from skinware_drivers.virtual.hand_clock import HandClock  # noqa: E402
@@ -48,7 +49,7 @@ def heard(name: str, emulated: dict[str, Any], options: dict[str, Any]) -> tuple
     async def scenario(clock: HandClock) -> tuple[SerialAdapter[Any], SkinTables, bytes]:
         case = Case(driver, emulator, options, emulated, lambda felt: felt)
         async with Running(case, clock, lively(emulator)) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             said: list[bytes] = []
             emit = rig.devices.emit
 

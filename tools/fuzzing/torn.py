@@ -33,6 +33,7 @@ from skinware_drivers.bus import wire_dtype
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Identifier, SequenceNumber
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
+from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Bursts, FrameLog, find_torn, record
@@ -78,7 +79,7 @@ def of_driver(suite: Suite) -> Bursts | None:
 
     async def scenario(clock: HandClock) -> Bursts | None:
         async with suite.running(clock) as rig:
-            await rig.until_fresh()
+            await until_fresh(rig)
             if not rig.adapter.layout.cycles:
                 return None
             heard = FrameLog(rig)

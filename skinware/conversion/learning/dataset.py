@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import pyarrow
 from skinware.conversion.learning.features import (
     IMAGE,
     STATISTICS,
@@ -21,6 +20,7 @@ from skinware.conversion.learning.features import (
     pixel_count,
     pixels_of,
 )
+from skinware.conversion.tables import pyarrow
 
 VERSION = "v3.0"
 _CHUNK_FILES, _FILE_MB, _VIDEO_MB = 1000, 100, 200

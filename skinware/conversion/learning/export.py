@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import pyarrow
-from skinware.conversion.converting import Converted, Watched, begun_beside, new_target
+from skinware.conversion.converting import Converted, begun_beside, new_target
 from skinware.conversion.learning.dataset import DatasetWriter
 from skinware.conversion.learning.features import (
     IMAGE,
@@ -25,11 +24,9 @@ from skinware.conversion.learning.features import (
     SkinFeatures,
     joined_rows,
 )
-from skinware.conversion.learning.joined import Joined
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
-from skinware.conversion.learning.wanted import Interval, LearningSet
-from skinware.conversion.selection import Selection
-from skinware.conversion.tables import RecordedSource, Table, TableSource, sensor_table
+from skinware.conversion.learning.wanted import Interval, Joined, LearningSet
+from skinware.conversion.tables import RecordedSource, Selection, Table, TableSource, pyarrow, sensor_table
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -74,12 +71,7 @@ def convert_to_learning_set(
     joined = [Joined(join) for join in wanted.joins]
 
     def open_one(path: Path) -> TableSource:
-        whole = RecordedSource(path, start_s, end_s)
-        try:
-            return Watched((selection or Selection()).of(whole), is_stopped)
-        except BaseException:
-            whole.close()
-            raise
+        return RecordedSource(path, start_s, end_s, selection, is_stopped)
 
     notes: list[str] = []
     frames: Counter[str] = Counter()

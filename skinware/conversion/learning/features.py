@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion._packages import pillow
-from skinware.conversion.learning.joined import Joined
-from skinware.conversion.tables import COLUMNS, TIME, Block, Table
+from skinware.conversion.learning.wanted import Joined
+from skinware.conversion.tables import COLUMNS, TIME, Block, Table, package
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
@@ -219,7 +218,7 @@ def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
         ConfigurationError: the image is damaged.
         MissingExtra: pillow is not installed.
     """
-    image_module = pillow()
+    image_module = package("PIL.Image", "a data set with images")
     try:
         with image_module.open(BytesIO(png)) as image:
             pixels = np.asarray(image)

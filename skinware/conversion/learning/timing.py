@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.learning.joined import Joined, matched
-from skinware.conversion.learning.wanted import Interval, LearningSet
+from skinware.conversion.learning.wanted import Interval, Joined, LearningSet, matched
 from skinware.conversion.tables import TIME, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S

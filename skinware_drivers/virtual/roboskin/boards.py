@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -13,11 +14,10 @@ from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.roboskin.converters import Converters, TriangleFaults, TriangleState
 from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 from skinware_drivers.virtual.roboskin.inertial import InertialSensors, Units
-from skinware_drivers.virtual.roboskin.touch import Touch
+from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
+from skinware_drivers.virtual.roboskin.touch import PressedSkin, Touch, WireSource
+from skinware_drivers.virtual.stage import Stage
 from skinware_drivers.virtual.wire import Transmission, Transmitter
-
-if TYPE_CHECKING:
-    from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 POLLING, OLD_DATA, DATA, INERTIAL, BOOTLOADER = 2, 3, 4, 5, 7
 """Message classes (icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h)."""
@@ -39,8 +39,11 @@ class EmulatedBoard(Device):
         address: on the bus, the ``number`` of the device, which commands can change.
         now_ns: time of power-up.
         phase: 0-1, when in its period a started board sends its first burst.
+        skin: of all boards, with the presses on it.
+        source: the values of every burst, instead of felt ones.
 
     Attributes:
+        command_bytes: bytes of each command; shorter ones are ignored here, real boards read old bytes of their buffer.
         last_cycle: bursts after which it dies; None: it lives on.
     """
 
@@ -49,14 +52,24 @@ class EmulatedBoard(Device):
     firmware: ClassVar[tuple[int, int, int]]
     protocol: ClassVar[tuple[int, int]]
     units: ClassVar[Units]
-    stage: EmulatedRoboskin
+    command_bytes: ClassVar[Mapping[int, int]]
+    stage: Stage[EmulatedRoboskinOptions]
 
     def __init__(
-        self, address: int, stage: EmulatedRoboskin, transmitter: Transmitter, now_ns: int, phase: float
+        self,
+        address: int,
+        stage: Stage[EmulatedRoboskinOptions],
+        transmitter: Transmitter,
+        now_ns: int,
+        *,
+        phase: float,
+        skin: PressedSkin,
+        source: WireSource | None,
     ) -> None:
         super().__init__(address, stage, transmitter, now_ns)
         options = stage.options
-        self.touch = Touch(options.seed, options.boards.index(address), stage.skin)
+        self.touch = Touch(options.seed, options.boards.index(address), skin)
+        self._source = source
         self.faults = TriangleFaults(options, address)
         self.last_cycle = options.dead_after_cycles if address in options.dead else None
         self._phase = phase
@@ -79,9 +92,34 @@ class EmulatedBoard(Device):
         self.last_cycle = None
         self.touch.stream_from(None)
 
-    @abstractmethod
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
         """Take a frame from the bus; return whether the board obeyed or answered it. Nothing is ever acknowledged."""
+        message_class, host, destination = identifier >> 8, identifier >> 4 & 0xF, identifier & 0xF
+        is_for_all = destination == EVERY_BOARD and (message_class == BOOTLOADER or not self.is_mtb3)
+        if destination != self.number and not is_for_all:
+            return False
+        if message_class == BOOTLOADER:
+            return self._obey_bootloader(host, payload, now_ns)
+        command = payload[0] & (0xFF if self.is_mtb3 else 0x7F)
+        if message_class != POLLING or len(payload) < self.command_bytes.get(command, 9):
+            return False
+        if command == 0x1C:
+            self._send_version(host, payload, now_ns)
+        elif command == 0x32:
+            return self._set_address(payload[1])
+        elif command == 0x4F:
+            self._send_inertial(self.inertial.set_up(payload[1]), payload[2], now_ns)
+        else:
+            return self._obey(command, payload, now_ns)
+        return True
+
+    @abstractmethod
+    def _obey_bootloader(self, host: int, payload: bytes, now_ns: int) -> bool:
+        """Obey a command in the class of the bootloader."""
+
+    @abstractmethod
+    def _obey(self, command: int, payload: bytes, now_ns: int) -> bool:
+        """Obey a command of polling that only this kind of board has, or obeys in its own way."""
 
     def set_triangle(self, triangle: int, fault: TriangleState, now_ns: int) -> None:
         """Break or mend a triangle, from the next burst on."""
@@ -108,7 +146,7 @@ class EmulatedBoard(Device):
             self._recalibration_due = False
             if not self._recalibrate_by_itself(time_ns):
                 return
-        source = self.stage.source
+        source = self._source
         if source is None:
             acquired = self._converters.acquire(time_ns, self.cycle, self._period_ns)
         else:
@@ -146,6 +184,12 @@ class EmulatedBoard(Device):
 
     # Both kinds of boards obey these commands alike
 
+    def _set_board(self, payload: bytes) -> None:
+        """Obey SKIN_BRD_CFG (0x4D): type, period, no load; all triangles are disabled."""
+        self._converters.set_board(payload[1] & 0x0F, payload[3])
+        self._period_ns = payload[2] * 1_000_000
+        self._active[:] = False
+
     def _set_triangles(self, payload: bytes) -> bool:
         """Obey SET_TRIANG_CFG (0x50): range, shift, enable, offset. Return False for one that is ignored."""
         first, last, shift, enable = payload[1:5]
@@ -164,10 +208,6 @@ class EmulatedBoard(Device):
             return False
         self.number = address
         return True
-
-    def _set_up_inertial(self, mask: int, period_ms: int, now_ns: int) -> None:
-        """Obey ACC_GYRO_SETUP (0x4F)."""
-        self._send_inertial(self.inertial.set_up(mask), period_ms, now_ns)
 
     def _send_inertial(self, wanted: bool, period_ms: int, now_ns: int) -> None:
         period_ns = period_ms * 1_000_000

@@ -13,18 +13,18 @@ folder, emBODY/eBcode/arch-arm/embot/prot/can/embot_prot_can_analog_polling.cpp 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, EmulatedBoard
+from skinware_drivers.virtual.roboskin.boards import DATA, OLD_DATA, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
 from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, MTB4_UNITS, Units
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET
 
 _MTB3_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}
 _MTB4_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x33: 8, 0x35: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}
-"""Bytes of each command. Shorter ones are ignored here; real boards read old content of their buffer."""
 _NOT_COMPENSATED = 2
 _OWN_TIMER = 3
 """Timer byte of TACT_SETUP (0x4C) for a period in its last two bytes."""
@@ -43,6 +43,7 @@ class Mtb3(EmulatedBoard):
     firmware: ClassVar[tuple[int, int, int]] = (2, 10, 14)
     protocol: ClassVar[tuple[int, int]] = (1, 0)  # assumed: no public source has its GET_FW_VERSION
     units: ClassVar[Units] = MTB3_UNITS
+    command_bytes: ClassVar[Mapping[int, int]] = _MTB3_BYTES
 
     def begin(self, now_ns: int) -> None:
         super().begin(now_ns)
@@ -50,27 +51,6 @@ class Mtb3(EmulatedBoard):
         self._enabled = False
         self._busy_until_ns = now_ns
         self._calibrate(now_ns, "power_up")
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
-        host, destination = identifier >> 4 & 0xF, identifier & 0xF
-        if identifier >> 8 == BOOTLOADER and destination in (self.number, EVERY_BOARD):
-            return self._obey_bootloader(host, payload, now_ns)
-        if identifier >> 8 != POLLING or destination != self.number:
-            return False
-        command = payload[0]
-        if len(payload) < _MTB3_BYTES.get(command, 9):
-            return False
-        if command == 0x1C:
-            self._send_version(host, payload, now_ns)
-        elif command == 0x32:
-            return self._set_address(payload[1])
-        elif command == 0x4F:
-            self._set_up_inertial(payload[1], payload[2], now_ns)
-        elif command in (0x4C, 0x4E):
-            return self._obey_old(command, payload, now_ns)
-        else:
-            return self._obey_new(command, payload, now_ns)
-        return True
 
     def _obey_bootloader(self, host: int, payload: bytes, now_ns: int) -> bool:
         """Stop the timers, whatever the command is, until a skin command starts them again."""
@@ -82,12 +62,12 @@ class Mtb3(EmulatedBoard):
             self._send_discovery(host, now_ns)
         return True
 
-    def _obey_new(self, command: int, payload: bytes, now_ns: int) -> bool:
+    def _obey(self, command: int, payload: bytes, now_ns: int) -> bool:
+        if command in (0x4C, 0x4E):
+            return self._obey_old(command, payload, now_ns)
         if command == 0x4D:
             self._data_class = DATA
-            self._converters.set_board(payload[1] & 0x0F, payload[3])
-            self._period_ns = payload[2] * 1_000_000
-            self._active[:] = False
+            self._set_board(payload)
             self._begin_if_enabled(now_ns)
         elif command == 0x50:
             self._data_class = DATA
@@ -152,37 +132,11 @@ class Mtb4(EmulatedBoard):
     firmware: ClassVar[tuple[int, int, int]] = (1, 25, 0)
     protocol: ClassVar[tuple[int, int]] = (2, 0)
     units: ClassVar[Units] = MTB4_UNITS
+    command_bytes: ClassVar[Mapping[int, int]] = _MTB4_BYTES
 
     def begin(self, now_ns: int) -> None:
         super().begin(now_ns)
         self._converters_ready = False
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
-        destination = identifier & 0xF
-        if destination not in (self.number, EVERY_BOARD):
-            return False
-        host = identifier >> 4 & 0xF
-        if identifier >> 8 == BOOTLOADER:
-            return self._obey_bootloader(host, payload, now_ns)
-        if identifier >> 8 != POLLING:
-            return False
-        command = payload[0] & 0x7F
-        if len(payload) < _MTB4_BYTES.get(command, 9):
-            return False
-        if command == 0x1C:
-            self._send_version(host, payload, now_ns)
-        elif command == 0x32:
-            return self._set_address(payload[1])
-        elif command == 0x4F:
-            self._set_up_inertial(payload[1], payload[2], now_ns)
-        elif command == 0x33:
-            self.inertial.configure_imu(payload[1] | payload[2] << 8)
-        elif command == 0x35:
-            self._send_inertial(self.inertial.transmit_imu(), payload[1], now_ns)
-        else:
-            self._start_converters(now_ns)
-            return self._obey_skin(command, payload, now_ns)
-        return True
 
     def _obey_bootloader(self, host: int, payload: bytes, now_ns: int) -> bool:
         if payload[0] == 0xFF:
@@ -190,11 +144,18 @@ class Mtb4(EmulatedBoard):
             return True
         return payload[0] == 0x32 and len(payload) >= 2 and self._set_address(payload[1])
 
-    def _obey_skin(self, command: int, payload: bytes, now_ns: int) -> bool:
+    def _obey(self, command: int, payload: bytes, now_ns: int) -> bool:
+        if command == 0x33:
+            self.inertial.configure_imu(payload[1] | payload[2] << 8)
+            return True
+        if command == 0x35:
+            self._send_inertial(self.inertial.transmit_imu(), payload[1], now_ns)
+            return True
+        if not self._converters_ready:  # the first skin command takes the first baseline (``hwinit``)
+            self._converters_ready = True
+            self._calibrate(now_ns, "power_up")
         if command == 0x4D:
-            self._converters.set_board(payload[1] & 0x0F, payload[3])
-            self._period_ns = payload[2] * 1_000_000
-            self._active[:] = False
+            self._set_board(payload)
             if self.runs(BURSTS):
                 self._begin_bursts(now_ns)
         elif command == 0x50:
@@ -215,12 +176,6 @@ class Mtb4(EmulatedBoard):
             self._calibrate(now_ns, "command")
             self._begin_bursts(now_ns)
         return True
-
-    def _start_converters(self, now_ns: int) -> None:
-        """Start the converters at the first skin command, which takes the first baseline (``hwinit``)."""
-        if not self._converters_ready:
-            self._converters_ready = True
-            self._calibrate(now_ns, "power_up")
 
     def _recalibrate_by_itself(self, time_ns: int) -> bool:
         """Take new baselines at the beginning of a burst, which follows at once (``tick``)."""

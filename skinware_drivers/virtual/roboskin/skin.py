@@ -54,7 +54,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         self, options: EmulatedRoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
     ) -> None:
         super().__init__(options, log=log)
-        self.source = cycle_pattern if source is None and options.pattern == "cycle" else source
+        self._source = cycle_pattern if source is None and options.pattern == "cycle" else source
         self.skin = PressedSkin(options)
         n_boards = len(options.boards)
         self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
@@ -94,18 +94,12 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
 
     # Faults at a moment of the caller's choice
 
-    def unplug(self, address: int, triangle: int, now_ns: int) -> None:
-        """Pull a triangle's plug: from its next burst on it reads full pressure and is flagged."""
-        self._set_triangle(address, triangle, "unplugged", now_ns)
+    def set_triangle(self, address: int, triangle: int, fault: TriangleState, now_ns: int) -> None:
+        """Break or mend a triangle; an unplugged one reads full pressure from its next burst on, and is flagged.
 
-    def plug_in(self, address: int, triangle: int, now_ns: int) -> None:
-        self._set_triangle(address, triangle, "plugged_in", now_ns)
-
-    def acknowledge(self, address: int, triangle: int, now_ns: int, *, on: bool) -> None:
-        """Let a triangle's converter stop (``on=False``) or begin again to acknowledge on its I2C line."""
-        self._set_triangle(address, triangle, "ack" if on else "no_ack", now_ns)
-
-    def _set_triangle(self, address: int, triangle: int, fault: TriangleState, now_ns: int) -> None:
+        Raises:
+            ConfigurationError: there is no such board.
+        """
         now_ns = self.run_to(now_ns)
         _board(self.device(address)).set_triangle(triangle, fault, now_ns)
 
@@ -113,7 +107,8 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
 
     def make_device(self, number: int, now_ns: int) -> EmulatedBoard:
         kind = Mtb3 if number in self.options.mtb3 else Mtb4
-        return kind(number, self, self.wire.attach(), now_ns, self._phases[self.options.boards.index(number)])
+        phase = self._phases[self.options.boards.index(number)]
+        return kind(number, self, self.wire.attach(), now_ns, phase=phase, skin=self.skin, source=self._source)
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
         options = self.options

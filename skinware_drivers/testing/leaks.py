@@ -1,4 +1,4 @@
-"""Fail a test in words, and find what a test leaves behind: descriptors, threads, processes, files."""
+"""Find what a test leaves behind: descriptors, threads, processes, files."""
 
 from __future__ import annotations
 
@@ -7,20 +7,6 @@ import multiprocessing
 import os
 import threading
 from pathlib import Path
-from typing import NoReturn
-
-import pytest
-
-
-def defect(what: str) -> NoReturn:
-    """Fail the test with a message that names the defect and the place to look at."""
-    pytest.fail(what, pytrace=False)
-
-
-def require(condition: object, what: str) -> None:
-    """Fail the test unless a condition holds."""
-    if not condition:
-        defect(what)
 
 
 class Belongings:

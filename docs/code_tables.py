@@ -1,0 +1,96 @@
+"""Directives for tables that the code already has: ``settings CLASS``, ``members ENUM`` and ``columns SOURCE``.
+
+``settings`` shows the fields of a class with their defaults, ``members`` the members of an enumeration, ``columns`` the
+columns of a service, from the source of its values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module
+from typing import Any
+
+import msgspec
+import numpy as np
+from docutils import nodes
+from docutils.statemachine import StringList
+from json_fields import meanings
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+from skinware.service import Column
+from skinware.tactile.contacts_service import ContactsSource
+from skinware.tactile.health_service import HealthSource
+from skinware.tactile.motion_service import MotionSource
+
+_NONE = np.zeros(1, np.uint64)
+_VALUES = {"driver": "", "type_name": "", "unit": "that of the values", "frames": ()}
+SOURCES = {
+    "contacts": ContactsSource(**_VALUES, uid=_NONE),
+    "motion": MotionSource(**_VALUES, regions=("",)),
+    "health": HealthSource("", _NONE, _NONE.astype(np.uint32)),
+}
+
+
+def settings(name: str) -> Iterator[str]:
+    """Yield the lines of a table of a class' fields."""
+    cls = _named(name)
+    yield from ("| setting | default | meaning |", "|---|---|---|")
+    for field, meaning in meanings(cls).items():
+        yield f"| `{field}` | {_shown(_defaults(cls)[field])} | {meaning.replace('null', 'None')} |"
+
+
+def members(name: str) -> Iterator[str]:
+    """Yield the lines of a table of an enumeration's members."""
+    cls = _named(name)
+    texts = meanings(cls)
+    yield from ("| number | name | meaning |", "|---|---|---|")
+    for member, text in texts.items():
+        yield f"| {getattr(cls, member).value} | `{member}` | {text} |"
+
+
+def columns(service: str) -> Iterator[str]:
+    """Yield the lines of a table of a service's columns."""
+    yield from ("| column | dtype and shape | unit | meaning |", "|---|---|---|---|")
+    for name, column in SOURCES[service].columns().items():
+        yield f"| `{name}` | {_form(column)} | {column.unit} | {column.description} |"
+
+
+def _shown(default: Any) -> str:
+    return "" if default is MISSING else f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def _form(column: Column) -> str:
+    return f"{column.dtype} {column.shape[1:]}" if column.shape[1:] else str(column.dtype)
+
+
+def _named(name: str) -> type:
+    module, _, cls = name.rpartition(".")
+    found: type = getattr(import_module(module), cls)
+    return found
+
+
+def _defaults(cls: type) -> dict[str, Any]:
+    if is_dataclass(cls):
+        return {field.name: field.default for field in fields(cls)}
+    return {field.name: field.default for field in msgspec.structs.fields(cls)}
+
+
+class CodeTable(SphinxDirective):
+    """Show the table of this directive's name."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        lines = {"settings": settings, "members": members, "columns": columns}[self.name](self.arguments[0])
+        found = nodes.container()
+        rows = StringList(list(lines), source=self.get_source_info()[0])
+        self.state.nested_parse(rows, self.content_offset, found)
+        return found.children
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    for name in ("settings", "members", "columns"):
+        app.add_directive(name, CodeTable)
+    return {"parallel_read_safe": True}

@@ -88,10 +88,6 @@ class SkinTables:
     channel_to_sensor: npt.NDArray[np.int64] = field(repr=False)
     module_period_ns: npt.NDArray[np.int64] = field(repr=False)
 
-    def with_buses(self, names: Sequence[str]) -> SkinTables:
-        """Return the same sensors on buses of other names, or on some of more buses."""
-        return replace(self, structure=self.structure.replace(buses=names))
-
     def placed(self, geometry: Geometry) -> SkinTables:
         """Return the same sensors with the positions of a geometry."""
         return replace(self, structure=self.structure.placed(geometry))

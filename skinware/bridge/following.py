@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from skinware.errors import BadRecording, BridgeError, SkinwareError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import FrameDecoder
-from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
+from skinware.transfer.collecting import DEAD
 from skinware.transfer.generation import Generation, RecordedSample, frame_of
 
 _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
@@ -26,7 +27,6 @@ _AGAIN_NS = NS_PER_S // 4
 """Pause after a frame that could not be published."""
 _LATEST_NS = 1 << 61
 """More than any clock shows."""
-_EVENTS = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
 class FrameOutput:
@@ -112,7 +112,7 @@ class ServiceFollower:
         if service.generation and (self._generation is None or self._generation.generation != service.generation):
             self._ask_generation(service.generation)
         if service.state != before.state or service.state in ("closed", "dead"):
-            self._mirror.happened(self._name, _EVENTS[service.state])
+            self._mirror.happened(self._name, service.state)
         if service.state == "closed":
             self.is_over = True
             self._end_listening()
@@ -152,22 +152,27 @@ class ServiceFollower:
             held, self._held = self._held, b""
             self._take_frame(held)
 
-    # -- generations ----------------------------------------------------------------------------------------------
+    def _ask(
+        self, what: str, answered: Callable[[bytes | None, int], None], parameters: dict[str, object], **how: Any
+    ) -> None:
+        """Ask for something of the service, or of the part of it that is wanted."""
+        if self._part:
+            parameters["part"] = self._part
+        self._peer.ask(self._peer.keys.of(self._name, what), answered, parameters=parameters, **how)
 
-    def _parameters(self, **parameters: object) -> dict[str, object]:
-        return {**parameters, "part": self._part} if self._part else parameters
+    # -- generations ----------------------------------------------------------------------------------------------
 
     def _ask_generation(self, number: int) -> None:
         time_ns = now_ns()
         if self._asked[0] == number and time_ns < self._asked[1]:
             return
         self._asked = asked = number, time_ns + round(self._patience_s * NS_PER_S)
-        self._peer.ask(
-            self._peer.keys.of(self._name, "generation"),
+        self._ask(
+            "generation",
             lambda payload, _: self._take_generation(asked, payload),
+            {"number": number},
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
-            parameters=self._parameters(number=number),
             is_large=True,
         )
 
@@ -227,18 +232,13 @@ class ServiceFollower:
         timeout_s = 2 * (ANSWER_S + self._peer.clock.round_trip_ns / NS_PER_S)
         pull = self._pulls.begin(timeout_s)
         number, sequence = self.output.newest if here is None else max(self.output.newest, here.position)
-        self._peer.ask(
-            self._peer.keys.of(self._name, "newest"),
+        known = {"generation": number, "sequence": sequence, "base": self._decoder.sequence if self._decoder else 0}
+        self._ask(
+            "newest",
             lambda payload, _: self._pulled(pull, payload),
+            {"who": self._peer.who, **known, "others": others},
             timeout_s=timeout_s,
             priority=Priority.PULLED,
-            parameters=self._parameters(
-                who=self._peer.who,
-                generation=number,
-                sequence=sequence,
-                base=0 if self._decoder is None else self._decoder.sequence,
-                others=others,
-            ),
         )
 
     def _pulled(self, pull: int, message: bytes | None) -> None:
@@ -254,12 +254,12 @@ class ServiceFollower:
     def _probe(self) -> None:
         asked_ns = now_ns()
         self._pulls.probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
-        self._peer.ask(
-            self._peer.keys.of(self._name, "newest"),
+        self._ask(
+            "newest",
             lambda payload, returned_ns: self._probed(returned_ns - asked_ns, payload),
+            {"form": RAW},
             timeout_s=2 * ANSWER_S,
             priority=Priority.PULLED,
-            parameters=self._parameters(form=RAW),
         )
 
     def _probed(self, took_ns: int, message: bytes | None) -> None:
@@ -334,7 +334,7 @@ class ServiceFollower:
             return
         service = self.service
         if service.state != "live" and frame.position <= (service.generation, service.sequence):
-            self._mirror.happened(self._name, _EVENTS[service.state])  # the frame is older than the state
+            self._mirror.happened(self._name, service.state)  # the frame is older than the state
         if self._pacing.arrived(now_ns(), age_ns, self._peer.clock.round_trip_ns):
             self._change_mode()
 

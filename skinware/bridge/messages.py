@@ -42,6 +42,7 @@ import msgspec
 
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.limits import LIMITS, read_json, unpack
+from skinware.memory.namespace import is_name
 from skinware.memory.ring import Sample
 from skinware.tactile.regions import Region, Regions, SensorChoice
 
@@ -53,7 +54,6 @@ _CODED_HEAD = struct.Struct("<BB6x")
 _SIZE = struct.Struct("<I")
 MOST_FRAMES = 1 << 53
 """More frames than any robot publishes: a larger number is wrong."""
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
 _INSTANCE = re.compile(r"[0-9a-f]{16}")
 
 _Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
@@ -215,7 +215,7 @@ class Keys:
     """
 
     def __init__(self, robot: str, instance: str = "*") -> None:
-        if not _NAME.fullmatch(robot):
+        if not is_name(robot):
             raise ConfigurationError(
                 f"robot {robot!r}: give 1 to 47 letters, digits, '_' or '-', the first a letter or digit"
             )
@@ -242,7 +242,7 @@ def token_parts(key: str) -> tuple[str, int, str]:
         BridgeError: it is no token.
     """
     parts = key.split("/")
-    if len(parts) != 5 or not _NAME.fullmatch(parts[2]) or len(key) > 256:
+    if len(parts) != 5 or not is_name(parts[2]) or len(key) > 256:
         raise BridgeError("a token of no bridge")
     robot, version, instance = parts[2:]
     if version == str(VERSION) and not _INSTANCE.fullmatch(instance):

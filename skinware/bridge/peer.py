@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
@@ -169,27 +169,14 @@ class Peer:
         self,
         key: str,
         answered: Callable[[bytes | None, int], None],
-        *,
-        timeout_s: float,
-        priority: Any,
-        parameters: Mapping[str, object] | None = None,
-        payload: bytes = b"",
-        is_large: bool = False,
+        **how: Any,
     ) -> None:
         """Ask as :meth:`skinware.bridge.link.Link.ask`; a job calls ``answered(answer, when it came)``."""
 
         def came(answer: bytes | None) -> None:
             self.soon("an answer", partial(answered, answer, now_ns()), len(answer or b""))
 
-        self._link.ask(
-            key,
-            came,
-            timeout_s=timeout_s,
-            priority=priority,
-            parameters=parameters,
-            payload=payload,
-            is_large=is_large,
-        )
+        self._link.ask(key, came, **how)
 
     def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Listen as :meth:`skinware.bridge.link.Link.listen`, in the receiving thread."""

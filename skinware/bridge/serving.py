@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import msgspec
 
@@ -58,14 +58,9 @@ _MOST_FRAMES = 1024
 _CALLS_AT_ONCE, _MOST_CALLS, _CALL_S = 4, 64, 30.0
 _OPERATIONS_S = 1.0
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
-_STATES: dict[str, State] = {
-    "live": "live",
-    "paused": "paused",
-    "closed": "closed",
-    "dead": "dead",
-    "restarted": "live",
-    "found": "live",
-}
+_STATES: dict[str, State] = {"restarted": "live", "found": "live"}
+_STATES |= {state: state for state in get_args(State)}
+"""State of a service after an event."""
 _ErrorKind = Literal["refused", "failed", "paused", "cancelled"]
 _ERRORS: dict[type[Exception], _ErrorKind] = {
     Paused: "paused",

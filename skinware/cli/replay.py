@@ -129,7 +129,7 @@ _DRAW_EVERY_S = 0.1
 
 
 @dataclass(frozen=True)
-class Pace:
+class Playback:
     """The part of a recording to publish, and how: options of ``skin-replay``, arguments of a ``Replayer``."""
 
     speed: float
@@ -141,7 +141,7 @@ class Pace:
     keeps_times: bool
 
 
-def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace: Pace, as_json: bool) -> None:
+def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace: Playback, as_json: bool) -> None:
     """Publish the services of a recording until its end; the arguments are the options of ``skin-replay``."""
     import skinware.recording
     from skinware.memory.namespace import Namespace

@@ -46,7 +46,7 @@ class Accounts:
         return self._record
 
     def begin_loop(self, kind: str) -> None:
-        """Return the reader reads in a loop from now on, whose turns are timed."""
+        """From now on the reader reads in a loop, whose turns are timed."""
         self._record.kind = kind
         self._in_loop = True
 

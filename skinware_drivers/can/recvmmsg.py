@@ -78,12 +78,8 @@ class Rows:
         """Clear ancillary data before frames are received that may have none of their own."""
         self.control[rows] = 0
 
-    def any_cut(self, rows: slice) -> bool:
-        """Return whether a datagram was longer than its row: an FD frame, though the layout has none."""
-        return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
-
     def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """Return (n,) bool: the datagrams that were longer than their row."""
+        """Return (n,) bool: the datagrams that were longer than their row: FD frames, though the layout has none."""
         found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
         return found
 

@@ -312,7 +312,7 @@ class SocketCanBus(KernelBus):
         """Remove rows that are no data frames of this layout from new rows of a batch; return how many are left."""
         rows, wire, first = rows_of(batch), batch.wire[new], new.start
         identifier = wire["identifier"]
-        is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new)
+        is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.cut(new).any()
         if is_usual and (not len(wire) or int(wire["length"].max()) <= batch.payload_size):
             self._health.heard_data()
             return len(wire)

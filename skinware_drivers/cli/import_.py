@@ -159,7 +159,7 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) 
     for part in parts:
         files = {"config": folder / f"{part.name}.toml"}
         geometry = part.yarp_geometry() if root else part.geometry() if part.groups else ""
-        regions = part.yarp_regions_text() if root else part.regions_text() if part.regions else ""
+        regions = part.regions_text(by_port=bool(root))
         if geometry:
             files["geometry"] = folder / f"{part.name}.geometry.toml"
             texts[files["geometry"]] = geometry

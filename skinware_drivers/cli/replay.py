@@ -13,7 +13,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
-from skinware.cli.replay import NAMESPACE, Pace, publish_again
+from skinware.cli.replay import NAMESPACE, Playback, publish_again
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireTrack
@@ -98,7 +98,7 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
-    pace = Pace(factor, start_s, end_s, loop, paused, stay, times == "recorded")
+    pace = Playback(factor, start_s, end_s, loop, paused, stay, times == "recorded")
     if wire:
         cli.refuse_others("--wire", {"file", "names", "factor", "start_s", "end_s", "loop", "as_json", "buses"})
         if not buses:
@@ -112,7 +112,7 @@ def command(
     publish_again(file, names, namespace, pace, as_json)
 
 
-def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace: Pace, as_json: bool) -> None:
+def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace: Playback, as_json: bool) -> None:
     import skinware.recording
 
     with skinware.recording.open(file) as recording:

@@ -102,15 +102,16 @@ class ImportedPart:
         lines = f"Places of the sensors of {self.name} by their ports, made by skin-import: its driver publishes them."
         return geometry_to_toml(groups, lines) if groups else ""
 
-    def yarp_regions_text(self) -> str:
+    def regions_text(self, *, by_port: bool) -> str:
+        """Return a file of regions: the ports, or the body parts; empty if no body part is known."""
+        if not by_port:
+            made = f"Body parts of {self.name} as regions, made by skin-import."
+            return regions_to_toml(self.regions, made) if self.regions else ""
         regions = [
             Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
             for bus, port in enumerate(self.yarp)
         ]
         return regions_to_toml(regions, f"Ports of {self.name} as regions, made by skin-import.")
-
-    def regions_text(self) -> str:
-        return regions_to_toml(self.regions, f"Body parts of {self.name} as regions, made by skin-import.")
 
     def figures(self) -> dict[str, object]:
         return {

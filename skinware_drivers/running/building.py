@@ -102,7 +102,8 @@ class Builder:
         if not adapters:
             if forced and self.generation is not None:  # the sensors stay, without data
                 described = self.generation.decoder.compiled.described
-                self._change_to(described.with_buses([line.name for line in self._lines]))
+                structure = described.structure.replace(buses=[line.name for line in self._lines])
+                self._change_to(replace(described, structure=structure))
             return
         try:
             tables = assemble(

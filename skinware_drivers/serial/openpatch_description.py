@@ -127,10 +127,6 @@ class ModuleKind:
     def n_values(self) -> int:
         return sum(map(len, self.taxels))
 
-    @property
-    def has_sensors(self) -> bool:
-        return any(name is not None for taxel in self.taxels for name in taxel)
-
 
 @dataclass(frozen=True)
 class Description:
@@ -284,7 +280,7 @@ def _check(found: Description) -> None:
             raise BadDescription(f"the patch has {count} {what}; 1 to {most} can be")
     if len({t.id for t in found.types}) < len(found.types) or len({t.name for t in found.types}) < len(found.types):
         raise BadDescription("two types of the patch share a name or an id")
-    if not any(kind.has_sensors for kind in used):
+    if not any(name is not None for kind in used for taxel in kind.taxels for name in taxel):
         raise BadDescription("the patch has no sensors")
     if {"<i4", "<f4"} <= {kind.dtype for kind in used}:
         raise BadDescription("the patch has 32-bit whole numbers beside floating point: no common dtype holds both")

@@ -21,8 +21,10 @@ from setuptools.build_meta import *  # noqa: F403
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
-OPTIONS = ["-O2", "-std=c11", "-fPIC", "-shared", "-fvisibility=hidden", *shlex.split(os.environ.get("CFLAGS", ""))]
-LINKER = shlex.split(os.environ.get("LDFLAGS", ""))
+OPTIONS = ["-O3", "-std=c11", "-fPIC", "-shared", "-fvisibility=hidden"]
+OPTIONS += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]  # loops over taxels
+OPTIONS += shlex.split(os.environ.get("CFLAGS", ""))
+LINKER = ["-lm", *shlex.split(os.environ.get("LDFLAGS", ""))]
 HEADERS = [str(header) for header in Path().glob("skinware*/native/*.h")]
 ZIG = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
 PROBE = "#include <sys/epoll.h>\nint probe(void);\nint probe(void) { return EPOLLIN; }\n"

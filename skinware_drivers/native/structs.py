@@ -6,52 +6,21 @@ The class of ``struct asked_read`` is ``structs.AskedRead``, a ``ctypes.Structur
 from __future__ import annotations
 
 import ctypes
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.native.structs import read_structs
 from skinware_drivers.wire_tap import Kept
 
 _HEADERS = ("path.h", "inside.h", "framing.h", "flow.h")
-_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
-_STRUCT = re.compile(r"^struct (\w+) \{(.*?)^\};", re.DOTALL | re.MULTILINE)
-_FUNCTION = re.compile(r"(\w+) \(\*(\w+)\)\((.*)\)", re.DOTALL)
-_VARIABLES = re.compile(r"(?:const )?(?:struct )?(\w+) (.*)", re.DOTALL)
 _OF_C_ALONE = ("path", "chain")
 """Structs with fields of other sizes, which Python never sees."""
 
-_kinds: dict[str, Any] = {"void": None, "int64_t": ctypes.c_int64, "double": ctypes.c_double}
-_classes: dict[str, type[ctypes.Structure]] = {}
-
-
-def _fields(declaration: str) -> Iterator[tuple[str, Any]]:
-    if function := _FUNCTION.fullmatch(declaration):
-        returned, name, parameters = function.groups()
-        kinds = [
-            ctypes.c_void_p if "*" in parameter else _kinds[parameter.split()[-2]]
-            for parameter in parameters.split(",")
-            if parameter != "void"
-        ]
-        yield name, ctypes.CFUNCTYPE(_kinds[returned], *kinds)
-    elif variables := _VARIABLES.fullmatch(declaration):
-        for variable in variables[2].split(","):
-            yield variable.strip(" *"), ctypes.c_void_p if "*" in variable else _kinds[variables[1]]
-
-
-def _read_headers() -> None:
-    text = "".join(Path(__file__).with_name(name).read_text() for name in _HEADERS)
-    for name, body in _STRUCT.findall(_COMMENT.sub("", text)):
-        if name not in _OF_C_ALONE:
-            fields = [field for one in body.split(";") if one.strip() for field in _fields(one.strip())]
-            in_python = "".join(word.capitalize() for word in name.split("_"))
-            _classes[in_python] = _kinds[name] = type(in_python, (ctypes.Structure,), {"_fields_": fields})
-
-
-_read_headers()
+_classes = read_structs([Path(__file__).with_name(name) for name in _HEADERS], _OF_C_ALONE)
 
 
 def __getattr__(name: str) -> Any:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skinware.tactile.offsets import Grouping
+from tests.specification.baseline.offsets import Grouping
 
 
 @pytest.mark.thorough

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.offsets import Grouping
-from skinware.tactile.rule import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
-from skinware.tactile.touches import Touches
+from tests.specification.baseline.numbers import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
+from tests.specification.baseline.offsets import Grouping
+from tests.specification.baseline.touches import Touches
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]

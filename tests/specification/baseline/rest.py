@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.offsets import Grouping
-from skinware.tactile.rule import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD, MOVED_SHARE, BaselineSettings
+from skinware.tactile.rule import BaselineSettings
+from tests.specification.baseline.numbers import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD2, MOVED_SHARE
+from tests.specification.baseline.offsets import Grouping
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -65,7 +66,7 @@ class Rest:
         self._frames = 0
         self._sums = np.zeros((6, n), np.float32)
         """Sums of frames, deviations d from the first value, common modes c, d * d, d * c and c * c."""
-        self._blocks: deque[Floats] = deque(maxlen=BLOCKS)
+        self._blocks: deque[Floats] = deque(maxlen=int(BLOCKS))
         self._common: Floats = np.zeros(self._patches.n, np.float32)
 
     def measure(
@@ -127,14 +128,14 @@ class Rest:
         count, d, c, dd, dc, cc = (blocks[:, row] for row in range(6))
         found = np.isfinite(count).sum(axis=0)
         enough = found >= ENOUGH_BLOCKS * BLOCKS
-        typical = _MEDIAN_OF_VARIANCE.get(int(np.nanmedian(count)) if found.any() else 0, 1.0)
+        typical = _MEDIAN_OF_VARIANCE.get(_lower_median(count), 1.0)
         own, mode = dd - d * d / count, cc - c * c / count
         both = dc - d * c / count
         noise2 = _median((own - 2 * both + mode) / (count - 1)) / np.float32(typical)
         mean_c = np.nansum(c, axis=0) / np.maximum(np.nansum(count, axis=0), 1)
         power = np.nansum(cc, axis=0) - mean_c * np.nansum(c, axis=0)
         beside = np.nansum(dc, axis=0) - mean_c * np.nansum(d, axis=0) - power
-        prior = noise2 / np.float32(GAIN_SPREAD**2) + np.float32(1e-12)
+        prior = noise2 / np.float32(GAIN_SPREAD2) + np.float32(1e-12)
         gain = (1 + beside / (power + prior)).astype(np.float32)
         noise2 = _median((own - 2 * gain * both + gain * gain * mode) / (count - 1)) / np.float32(typical)
         levels = (d - gain * c) / count
@@ -147,6 +148,11 @@ class Rest:
             Measured(taxels, *(a.astype(np.float32) for a in (level, np.maximum(noise2, 0), gain, variance))),
             moves,
         )
+
+
+def _lower_median(count: Floats) -> int:
+    known = np.sort(count[np.isfinite(count)])
+    return int(known[(len(known) - 1) // 2]) if len(known) else 0
 
 
 def _median(blocks: Floats) -> Floats:

@@ -7,17 +7,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.offsets import Grouping
-from skinware.tactile.rule import FADED, FALLEN, MOST_REMAINDER, USED_S
+from tests.specification.baseline.numbers import FADED, FALLEN, LEFT_AT_S, MOST_REMAINDER, SETTLED_S, USED_S
+from tests.specification.baseline.offsets import Grouping
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
-
-_LEFT_AT_S = 3.0
-"""Seconds after a sudden fall at which it is noted how much is left."""
-_SETTLED_S = 1.0
-"""Seconds after the end of a touch at which what is left of it is known."""
 
 
 class Remainders:
@@ -49,7 +44,7 @@ class Remainders:
     @property
     def has_settled(self) -> Flags:
         """(n,) which taxels' last touch has been over for a second: what is left of it is known now."""
-        settled: Flags = self.since_end_s >= _SETTLED_S
+        settled: Flags = self.since_end_s >= SETTLED_S
         return settled
 
     def begin(self, taxels: Rows, load: Floats) -> None:
@@ -73,7 +68,7 @@ class Remainders:
         left = np.where(moved, np.nan, self._noted[active])
         goes_on = ~(moved & np.isfinite(self._noted[active]))
         since = np.where(fell, 0, np.where(goes_on, self._since_fall_s[active], np.inf)) + np.float32(passed_s)
-        notes = np.isnan(left) & (since >= _LEFT_AT_S) & (since < 2 * _LEFT_AT_S)
+        notes = np.isnan(left) & (since >= LEFT_AT_S) & (since < 2 * LEFT_AT_S)
         left = np.where(notes, steady, left)
         then = np.where(notes, self.used[active], self._used_then[active])
         self._steady[active], self._noted[active] = steady, left
@@ -103,7 +98,7 @@ class Remainders:
             passed_s: since the last frame.
         """
         self.any_used = bool(self.used.any())
-        rows = np.flatnonzero(touched | (self.used > 0) | (self.since_end_s < _SETTLED_S))
+        rows = np.flatnonzero(touched | (self.used > 0) | (self.since_end_s < SETTLED_S))
         if not len(rows):
             return
         now = np.where(touched[rows], np.maximum(load[rows], 0), np.float32(0))
@@ -113,7 +108,7 @@ class Remainders:
         self.used[rows] = used
         after = self.since_end_s[rows]
         self.since_end_s += np.float32(passed_s)
-        due = (after < _SETTLED_S) & (after + passed_s >= _SETTLED_S) & ~touched[rows] & (used > 5 * on[rows])
+        due = (after < SETTLED_S) & (after + passed_s >= SETTLED_S) & ~touched[rows] & (used > 5 * on[rows])
         if due.any():
             due &= self._modules.sum(touched)[self._modules.group[rows]] == 0  # else a weaker grip may be left
             taxels = rows[due]

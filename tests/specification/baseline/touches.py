@@ -7,9 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.offsets import Grouping, Offsets
-from skinware.tactile.remainders import Remainders
-from skinware.tactile.rule import (
+from tests.specification.baseline.numbers import (
     ALIKE,
     DRIFT_SIGMA,
     FALLEN,
@@ -17,15 +15,15 @@ from skinware.tactile.rule import (
     MOST_ALIKE,
     OFF_TO_ON,
     PEAK_S,
+    QUICK_S,
     STEP_OVER_ON,
 )
+from tests.specification.baseline.offsets import Grouping, Offsets
+from tests.specification.baseline.remainders import Remainders
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
-
-_QUICK_S = 0.12
-"""Seconds: with frames more apart, one high value is a touch; with more frames it takes two."""
 
 
 class Touches:
@@ -88,7 +86,7 @@ class Touches:
         smooth, now = self.load(self.smooth), self.load(deviation)
         high = (now > off) & live
         begins = high & (smooth > on) & ~self.touched
-        if passed_s < _QUICK_S:
+        if passed_s < QUICK_S:
             begins &= self._high
         np.copyto(self._high, high, where=live)
         begun = np.flatnonzero(begins)

@@ -1,0 +1,224 @@
+/* Follow the baselines of the taxels of one sensor type: one call a frame. */
+
+#include "baseline.h"
+
+#include <string.h>
+
+enum { REST, HELD, RELEARNING, COVERED, DOUBTED, SATURATED, NO_RESOLUTION }; /* skinware/tactile/rule.py: Why */
+
+enum { NO_VALUE = -1, NO_NOISE = -2 }; /* of a tare */
+
+SKINWARE_EXPORT void skinware_baseline_begin(struct baseline *b);
+SKINWARE_EXPORT void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values,
+                                              const uint8_t *usable, const uint8_t *jumped, float *to);
+SKINWARE_EXPORT int64_t skinware_baseline_tare(struct baseline *b, int64_t patch);
+SKINWARE_EXPORT void skinware_baseline_lose_common(struct baseline *b);
+
+/* Begins with memory that is 0. */
+void skinware_baseline_begin(struct baseline *b) {
+    int64_t i;
+    b->few_levels = b->resolution > 0;
+    for (i = 0; i < b->n; i++) {
+        b->level[i] = b->noise2[i] = b->last[i] = b->noted[i] = b->first[i] = NAN;
+        b->gain[i] = b->gain_before[i] = 1;
+        b->gain_variance[i] = GAIN_SPREAD2;
+        b->since_fall_s[i] = b->since_end_s[i] = INFINITY;
+    }
+    for (i = 0; i < b->n_patches; i++)
+        b->patches[i].since_s = INFINITY;
+    for (i = 0; i < b->n_modules; i++)
+        b->modules[i].old_s = INFINITY;
+}
+
+double least_on(const struct baseline *b) {
+    return isnan(b->minimum_on) ? b->resolution * (b->few_levels ? 0.5 : STEPS_OF_A_TOUCH) : b->minimum_on;
+}
+
+float least_noise2(const struct baseline *b, float level) {
+    const double rounding = b->resolution * (b->few_levels ? 0.05 : 0.28867513459481287 /* 1 / sqrt(12) */);
+    const float least = EPSILON * fabsf(level) + TINY;
+    return rounding > 0 ? (float)(rounding * rounding) : least > 0 ? least * least : 0;
+}
+
+static void put_at(struct baseline *b, int64_t taxel, float level) {
+    b->level[taxel] = level;
+    b->variance[taxel] = b->noise2[taxel];
+    b->cross[taxel] = b->slow[taxel] = 0;
+    b->forced[taxel] = 1;
+}
+
+/* Moves an offset at once; it is as certain as one value is. */
+void put(struct baseline *b, int64_t taxel, float by) {
+    put_at(b, taxel, b->level[taxel] + by);
+    b->deviation[taxel] -= by;
+    b->smooth[taxel] -= by;
+}
+
+/* Takes a frame in. A taxel that sends again after too long is measured again. */
+static void take_in(struct baseline *b, const float *values, const uint8_t *usable, const uint8_t *jumped,
+                    double passed_s) {
+    const struct baseline a = *b; /* no store can change it */
+    const float most = (float)(FEW_LEVELS * b->resolution), passed = (float)passed_s, long_s = (float)b->forget_after_s;
+    int64_t i, few_levels = b->few_levels, all_ready = 1;
+    for (i = 0; i < b->n; i++) {
+        const int is_usable = isfinite(values[i]) && (!usable || usable[i]);
+        a.away_s[i] += passed;
+        a.live[i] = a.flag[i] = 0;
+        a.at_end[i] = (uint8_t)is_usable; /* until compare() */
+        if (is_usable) {
+            if (a.away_s[i] > long_s) {
+                a.ready[i] = 0;
+                a.level[i] = NAN;
+                forget_touch(b, i);
+            }
+            if (jumped && jumped[i] && a.ready[i]) {
+                a.level[i] += values[i] - a.last[i];
+                a.forced[i] = 1;
+            }
+            a.away_s[i] = 0;
+            a.last[i] = values[i];
+            a.seen[i] = 1;
+            few_levels &= !(fabsf(values[i]) > most);
+            a.live[i] = a.ready[i];
+            a.flag[i] = !a.ready[i];
+        }
+        all_ready &= a.ready[i];
+    }
+    b->few_levels = few_levels, b->all_ready = all_ready;
+}
+
+/* How far values are from their offsets, and from when on that is a touch. A value at an end of its range shows nothing. */
+static void compare(struct baseline *b) {
+    const struct baseline a = *b; /* no store can change it */
+    const float least = (float)b->least, most = (float)b->most, on_sigma = (float)b->on_sigma;
+    const float minimum = (float)least_on(b), minimum_off = (float)((double)OFF_TO_ON * least_on(b));
+    const float off_sigma = (float)b->off_sigma;
+    const int has_ends = isfinite(b->most - b->least);
+    int64_t number, i;
+    for (number = 0; number < b->n_runs; number++) {
+        const struct run *run = &b->runs[number];
+        const float common = (float)b->patches[run->patch].variance;
+        const int64_t first = run->first, last = run->last;
+        INDEPENDENT
+        for (i = first; i < last; i++) {
+            const float deviation = a.last[i] - a.level[i] - a.left[i], noise2 = a.noise2[i];
+            a.deviation[i] = a.live[i] ? deviation : 0.0f;
+            a.on[i] = highest(minimum, on_sigma * sqrtf(noise2 + a.variance[i] + a.gain[i] * a.gain[i] * common));
+            a.off[i] = highest(minimum_off, off_sigma * sqrtf(noise2));
+            a.at_end[i] = (uint8_t)(has_ends & ((a.last[i] >= most) | (a.last[i] <= least)));
+        }
+    }
+}
+
+static uint8_t why_of(const struct baseline *b, int64_t i, int is_shown) {
+    if (b->few_levels && b->live[i])
+        return NO_RESOLUTION;
+    if (b->touched[i] && b->at_end[i])
+        return SATURATED;
+    if (b->returned[i])
+        return DOUBTED;
+    if (b->low[i])
+        return COVERED;
+    if (!b->ready[i] || (b->variance[i] > b->noise2[i] && !b->touched[i]))
+        return RELEARNING;
+    return is_shown ? HELD : REST;
+}
+
+/* Writes value, baseline, uncertainty and noise, (n,) float each, then touched, held, why, forced and live, (n,) bytes. */
+static void show(struct baseline *b, float *to) {
+    const struct baseline a = *b; /* no store can change it */
+    const int64_t n = b->n;
+    float *value = to, *baseline = to + n, *uncertainty = to + 2 * n, *noise = to + 3 * n;
+    uint8_t *touched = (uint8_t *)(to + 4 * n), *held = touched + n, *why = held + n, *forced = why + n;
+    int64_t number, i;
+    for (number = 0; number < b->n_runs; number++) {
+        const struct run *run = &b->runs[number];
+        const float common = (float)b->patches[run->patch].variance;
+        INDEPENDENT
+        for (i = run->first; i < run->last; i++) {
+            baseline[i] = a.level[i] + a.left[i];
+            uncertainty[i] = sqrtf(a.variance[i] + a.gain[i] * a.gain[i] * common);
+            noise[i] = sqrtf(a.noise2[i]);
+        }
+    }
+    for (i = 0; i < n; i++) { /* the present load of some is gone while the smoothed one is not */
+        const float known = a.live[i] ? a.deviation[i] : a.smooth[i];
+        const float least = lowest(a.off[i], FALLEN * load_of(&a, a.smooth[i]));
+        touched[i] = a.touched[i] && load_of(&a, known) >= least;
+        value[i] = !touched[i] ? 0.0f : a.is_signed ? known : highest(known, 0);
+        why[i] = why_of(&a, i, touched[i]);
+        held[i] = b->is_held ? 1 : a.held[i];
+    }
+    memcpy(forced, b->forced, (size_t)n);
+    memset(b->forced, 0, (size_t)n);
+    memcpy(forced + n, b->live, (size_t)n);
+}
+
+void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values, const uint8_t *usable,
+                              const uint8_t *jumped, float *to) {
+    double passed_s, smoothing;
+    float rustle_share;
+    int64_t i;
+    if (!b->has_time || time_ns < b->time_ns)
+        time_ns = b->has_time ? b->time_ns : time_ns;
+    passed_s = b->has_time ? (double)(time_ns - b->time_ns) / 1e9 : 0;
+    b->time_ns = time_ns;
+    b->has_time = 1;
+    take_in(b, values, usable, jumped, passed_s);
+    if (!b->all_ready) {
+        measure(b, time_ns, passed_s);
+        for (i = 0; i < b->n; i++)
+            b->live[i] = b->ready[i] & b->at_end[i];
+    }
+    compare(b);
+    smoothing = b->smooth_s > 0 ? passed_share(passed_s, b->smooth_s) : 1;
+    rustle_share = (float)fmax(0.5, sqrt(smoothing / (2 - smoothing)));
+    follow_common(b, passed_s);
+    follow_touches(b, passed_s);
+    hold_near(b, passed_s);
+    follow_falls(b, rustle_share, passed_s);
+    if (!b->is_held)
+        learn(b, rustle_share, passed_s);
+    if (!b->is_signed)
+        follow_remainders(b, passed_s);
+    show(b, to);
+}
+
+/* Takes the present values as the rest, of all taxels or (0 or more) of a patch; returns their number, or why not. */
+int64_t skinware_baseline_tare(struct baseline *b, int64_t patch) {
+    int64_t i, number = 0, n_fresh = 0;
+    for (i = 0; i < b->n; i++) {
+        b->flag[i] = b->seen[i] && (patch < 0 || b->patch[i] == patch);
+        number += b->flag[i];
+        n_fresh += b->flag[i] && !b->ready[i];
+    }
+    if (!number)
+        return NO_VALUE;
+    if (n_fresh && least_on(b) <= 0)
+        return NO_NOISE;
+    for (i = 0; i < b->n; i++) {
+        if (!b->flag[i])
+            continue;
+        if (!b->ready[i])
+            b->noise2[i] = least_noise2(b, b->last[i]);
+        put_at(b, i, b->ready[i] && isfinite(b->level[i]) ? b->level[i] + b->smooth[i] : b->last[i]);
+        b->ready[i] = 1;
+        forget_touch(b, i);
+        b->settling_s[i] = 0;
+    }
+    return number;
+}
+
+/* Forgets where the common modes are, after a time without data: the next frames find them again. */
+void skinware_baseline_lose_common(struct baseline *b) {
+    int64_t i;
+    for (i = 0; i < b->n_patches; i++)
+        b->patches[i].sums[0] = b->patches[i].sums[1] = 0;
+    for (i = 0; i < b->n; i++) {
+        struct patch *p = &b->patches[b->patch[i]];
+        p->sums[0] += b->noise2[i] > 0;
+        p->sums[1] += b->noise2[i] > 0 ? (double)b->noise2[i] : 0;
+    }
+    for (i = 0; i < b->n_patches; i++)
+        b->patches[i].variance = b->patches[i].sums[1] / fmax(b->patches[i].sums[0], 1);
+}

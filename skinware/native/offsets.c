@@ -1,0 +1,208 @@
+/*
+ * Predict what each taxel reads at rest, and how uncertain that is: a Kalman filter for each taxel, one common mode for
+ * each patch. A value is offset + noise + load. Between two frames the offset moves by the gain of the taxel times the
+ * move of the mode, and by a drift of its own.
+ */
+
+#include "baseline.h"
+
+#define MEDIAN2 0.455 /* median of the square of a standard normal deviate */
+#define LEAST 1e-30   /* keeps divisors above 0 */
+
+enum { WEIGHT, REACH, FOUND, FREE };
+
+static void step_mode(struct patch *p, double passed_s) {
+    const double weights = fmax(p->sums[WEIGHT], LEAST);
+    const double reach = fmax(p->sums[REACH], (double)LEAST_GAIN * weights);
+    const double precision = fmax(reach * reach / weights, LEAST);
+    const int is_known = p->sums[FREE] > FEW_TAXELS;
+    const double ahead = is_known ? p->rate * passed_s : 0;
+    const double found = p->sums[FOUND] / reach - ahead;
+    const double trust = is_known ? 1 - FEW_TAXELS / p->sums[FREE] : 0;
+    double total, most, share, news;
+    p->variance += p->agility * passed_s;
+    if (is_known) {
+        p->unknown_s = 0;
+    } else {
+        p->variance += p->rate2 * (2 * p->unknown_s + passed_s) * passed_s;
+        p->unknown_s += passed_s;
+    }
+    total = p->variance + 1 / precision;
+    most = (double)DRIFT_SIGMA * sqrt(total);
+    share = trust * p->variance / total;
+    news = share * fmin(fmax(found, -most), most);
+    p->move = ahead + news;
+    p->sure = ahead + share * news;
+    p->variance *= 1 - share;
+    if (!is_known)
+        return;
+    if (found * found != MEDIAN2 * total)
+        p->agility *= exp(fmin(passed_s / MATCH_S, 1) * (found * found > MEDIAN2 * total ? 1 : -1));
+    p->agility = fmax(p->agility, 1e-5 / precision);
+    p->known_s += passed_s;
+    p->rate += (p->move / passed_s - p->rate) * passed_share(passed_s, RATE_S);
+    p->rate2 += (p->rate * p->rate - p->rate2) * (passed_s / fmin(fmax(p->known_s, RATE_S), 10 * RATE_S));
+}
+
+/* Which taxels are at rest, and what they say of the mode: a taxel near a contact may bear a load that is no touch. */
+static void sum_run(struct baseline *b, const struct run *run, struct patch *p) {
+    const struct baseline a = *b; /* no store can change it */
+    const float common = (float)p->variance, low = -(float)b->off_sigma;
+    double weights = p->sums[WEIGHT], reach = p->sums[REACH], found = p->sums[FOUND], number = p->sums[FREE];
+    const int64_t first = run->first, last = run->last;
+    int64_t i;
+    INDEPENDENT
+    for (i = first; i < last; i++) {
+        const int lies_low = a.below[i] & (a.smooth[i] < low * sqrtf(a.noise2[i]));
+        a.flag[i] = a.live[i] & !a.touched[i] & (a.since_end_s[i] >= SETTLED_S) & !a.at_end[i] &
+                     (a.is_signed | (!a.sagging[i] & !lies_low));
+    }
+    INDEPENDENT
+    for (i = first; i < last; i++) {
+        const float on = a.on[i], hidden2 = a.held[i] ? on * on : 0.0f;
+        const float own = a.noise2[i] + a.variance[i];
+        const float limit = 2.0f * sqrtf(own + a.gain[i] * a.gain[i] * common);
+        const float weight = 1.0f / (own + hidden2), clipped = within(a.deviation[i], limit) * weight;
+        a.scratch[i] = a.flag[i] ? weight : 0.0f;
+        a.scratch[a.n + i] = a.flag[i] ? clipped : 0.0f;
+    }
+    for (i = first; i < last; i++) {
+        weights += (double)a.scratch[i];
+        reach += (double)(a.scratch[i] * a.gain[i]);
+        found += (double)a.scratch[a.n + i];
+        number += a.flag[i];
+    }
+    p->sums[WEIGHT] = weights, p->sums[REACH] = reach, p->sums[FOUND] = found, p->sums[FREE] = number;
+}
+
+/* Moves the offsets by the common mode, and takes that off the deviations. */
+void follow_common(struct baseline *b, double passed_s) {
+    const struct baseline a = *b; /* no store can change it */
+    int64_t number, i;
+    if (passed_s <= 0)
+        return;
+    for (number = 0; number < b->n_patches; number++)
+        for (i = 0; i < 4; i++)
+            b->patches[number].sums[i] = 0;
+    for (number = 0; number < b->n_runs; number++)
+        sum_run(b, &b->runs[number], &b->patches[b->runs[number].patch]);
+    for (number = 0; number < b->n_patches; number++)
+        step_mode(&b->patches[number], passed_s);
+    for (number = 0; number < b->n_runs; number++) {
+        const struct run *run = &b->runs[number];
+        const float move = (float)b->patches[run->patch].move, sure = (float)b->patches[run->patch].sure;
+        INDEPENDENT
+        for (i = run->first; i < run->last; i++) {
+            const float change = a.gain[i] * move, doubt = sure * a.gain_variance[i];
+            a.level[i] += change;
+            a.deviation[i] -= change;
+            a.variance[i] += sure * (2.0f * a.cross[i] + doubt);
+            a.cross[i] += doubt;
+        }
+    }
+}
+
+enum { NUMBER, BEYOND, NOISE2 };
+
+/* Adjusts what changes slowly: the drift of taxels by themselves, and the typical gain of a patch, which is 1. */
+static void tick(struct baseline *b, double passed_s) {
+    const double slowly = passed_share(passed_s, SLOW_S);
+    const float share = (float)(slowly / (2 - slowly));
+    const float forgets = (float)passed_share(b->tick_s, GAIN_LASTS_S);
+    int64_t number, i;
+    for (number = 0; number < b->n_patches; number++)
+        for (i = 0; i < 4; i++)
+            b->patches[number].sums[i] = 0;
+    for (i = 0; i < b->n; i++) {
+        struct patch *p = &b->patches[b->patch[i]];
+        const float deviation = sqrtf(b->variance[i] + b->gain[i] * b->gain[i] * (float)p->variance);
+        const float expected = (float)(1.5 * MEDIAN2) * (b->noise2[i] * share + deviation * deviation);
+        if (!b->flag[i])
+            continue;
+        p->sums[NUMBER] += 1;
+        p->sums[BEYOND] += b->slow[i] * b->slow[i] > expected;
+        p->sums[NOISE2] += (double)b->noise2[i];
+    }
+    for (number = 0; number < b->n_patches; number++) {
+        struct patch *p = &b->patches[number];
+        const double taxels = fmax(p->sums[NUMBER], 1), typical = p->sums[NOISE2] / taxels;
+        p->drift *= exp(b->tick_s / 10 * (2 * (p->sums[BEYOND] / taxels) - 1));
+        p->drift = fmin(fmax(p->drift, 1e-9 * typical), 1e-1 * typical);
+        p->sums[0] = p->sums[1] = 0;
+    }
+    for (i = 0; i < b->n; i++) {
+        struct patch *p = &b->patches[b->patch[i]];
+        const float forgotten = b->flag[i] ? forgets : 0.0f;
+        b->gain[i] += (1 - b->gain[i]) * forgotten;
+        b->gain_variance[i] += (GAIN_SPREAD2 - b->gain_variance[i]) * (2 * forgotten);
+        p->sums[0] += b->flag[i] ? (double)b->gain_before[i] : 0;
+        p->sums[1] += b->flag[i] ? (double)b->gain[i] : 0;
+    }
+    for (i = 0; i < b->n; i++) { /* the gains and the mode must not float apart */
+        const struct patch *p = &b->patches[b->patch[i]];
+        const float ratio = (float)(p->sums[1] > 0 ? p->sums[0] / fmax(p->sums[1], 1e-9) : 1);
+        b->gain[i] *= b->flag[i] ? ratio : 1.0f;
+        b->gain[i] = lowest(highest(b->gain[i], LEAST_GAIN), MOST_GAIN);
+        b->gain_before[i] = b->gain[i];
+    }
+}
+
+/*
+ * Corrects offsets and gains by the deviations of taxels at rest; the others become less certain. Only taxels far from a
+ * touch say something of gains and noise.
+ */
+void learn(struct baseline *b, float rustle_share, double passed_s) {
+    const struct baseline a = *b; /* no store can change it */
+    const double slowly_ = passed_share(passed_s, SLOW_S);
+    const float slowly = (float)slowly_, of_noise = (float)(slowly_ / (2 - slowly_));
+    const float floor = (float)fmin(passed_s / b->tau_s, 0.5), quick = (float)fmin(passed_s / RESETTLE_S, 0.5);
+    const float noise_share = (float)fmin(passed_s / NOISE_S, 0.1);
+    int64_t number, i;
+    for (number = 0; passed_s > 0 && number < b->n_runs; number++) {
+        const struct run *run = &b->runs[number];
+        const float grows = (float)b->patches[run->patch].drift * (float)passed_s;
+        INDEPENDENT
+        for (i = run->first; i < run->last; i++)
+            a.flag[i] = a.live[i] & !a.touched[i] & !a.sagging[i] & (a.since_end_s[i] >= SETTLED_S) &
+                         (load_of(&a, a.deviation[i]) < a.on[i]) & !a.at_end[i];
+        INDEPENDENT
+        for (i = run->first; i < run->last; i++) {
+            const int is_measured = a.flag[i], is_calm = is_measured & (fabsf(a.smooth[i]) < rustle_share * a.off[i]);
+            const float noise2 = a.noise2[i], cross = a.cross[i], variance = a.variance[i] + grows;
+            const float total = variance + noise2;
+            const float clipped = within(a.deviation[i], DRIFT_SIGMA * sqrtf(total));
+            const float innovation = is_measured ? clipped : 0.0f;
+            const float slow = a.slow[i], unlike = slow * slow / (noise2 * of_noise + variance);
+            const float least = a.used[i] > 0 ? quick : floor, kalman = variance / total;
+            const float faster = unlike > DRIFT_SIGMA * DRIFT_SIGMA ? highest(kalman, least) : kalman;
+            const float share = is_measured ? faster : 0.0f, keep = 1.0f - share;
+            const float of_cross = unlike < 4 * DRIFT_SIGMA * DRIFT_SIGMA ? cross / total : 0.0f;
+            const float of_gain = is_calm ? of_cross : 0.0f;
+            const float away = innovation - slow, slower = slow + away * (is_measured ? slowly : 0.0f);
+            a.level[i] += share * innovation;
+            a.gain[i] += of_gain * innovation;
+            a.gain_variance[i] -= of_gain * cross;
+            a.cross[i] = cross * keep;
+            a.variance[i] = keep * keep * variance + share * share * (is_measured ? noise2 : 0.0f);
+            a.slow[i] = slower;
+            a.noise2[i] = noise2 + (away * (innovation - slower) - noise2) * (is_calm ? noise_share : 0.0f);
+        }
+    }
+    if (passed_s > 0) {
+        b->tick_s += passed_s;
+        if (b->tick_s >= TICK_S) {
+            tick(b, passed_s);
+            b->tick_s = 0;
+        }
+    }
+    if (b->resolution > 0) {
+        const float least = least_noise2(b, 0.0f);
+        INDEPENDENT
+        for (i = 0; i < b->n; i++)
+            a.noise2[i] = highest(least, a.noise2[i]);
+    } else {
+        INDEPENDENT
+        for (i = 0; i < b->n; i++)
+            a.noise2[i] = highest(least_noise2(b, a.level[i]), a.noise2[i]);
+    }
+}

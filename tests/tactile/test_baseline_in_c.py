@@ -1,0 +1,149 @@
+"""Baselines in C do what their specification in numpy does, value by value."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from skinware.status import Status
+from skinware.tactile.baseline import Baseline, Calm
+from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.testing import World, bench_world, grid
+from tests.specification.baseline import SpecifiedBaseline
+
+N = 96
+_STEP_NS = 1_000_000_000
+
+
+class Both:
+    """A baseline and its specification, which see the same frames."""
+
+    def __init__(self, module: npt.ArrayLike, patch: npt.ArrayLike, **how: object) -> None:
+        self.ours = Baseline(module, patch, **how)  # type: ignore[arg-type]
+        self.specified = SpecifiedBaseline(module, patch, **how)  # type: ignore[arg-type]
+
+    def update(self, time_ns: int, values: npt.ArrayLike, *flags: npt.ArrayLike, jumped: npt.ArrayLike = False) -> Calm:
+        calm = self.ours.update(time_ns, values, *flags, jumped=jumped)
+        wanted = self.specified.update(time_ns, values, *flags, jumped=np.broadcast_to(jumped, len(calm.value)))
+        for name in ("touched", "held", "why", "forced", "usable"):
+            differ = np.flatnonzero(getattr(calm, name) != getattr(wanted, name))
+            assert not len(differ), f"{name} of {differ[:5]} at {time_ns / _STEP_NS:.2f} s"
+        for name in ("value", "baseline", "uncertainty", "noise"):
+            found, right = getattr(calm, name), getattr(wanted, name)
+            np.testing.assert_allclose(found, right, 1e-4, 1e-4, err_msg=f"{name} at {time_ns / _STEP_NS:.2f} s")
+        assert self.ours.refused_share == self.specified.refused_share
+        return calm
+
+    def set(self, settings: BaselineSettings) -> None:
+        self.ours.settings = self.specified.settings = settings
+
+    def compare_states(self) -> None:
+        ours, specified = self.ours.state(), self.specified.state()
+        assert ours.keys() == specified.keys()
+        for name, array in ours.items():
+            assert array.dtype == specified[name].dtype
+            np.testing.assert_allclose(array, specified[name], 1e-3, 1e-4, err_msg=name)
+
+    def restored(self, module: npt.ArrayLike, patch: npt.ArrayLike, rows: npt.NDArray[np.intp]) -> Both:
+        """The same with what these have learned."""
+        new = Both(module, patch)
+        assert new.ours.restore(self.ours.state(), rows) == new.specified.restore(self.specified.state(), rows)
+        return new
+
+
+def shuffled(seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Modules of twelve and patches of 48 taxels, whose taxels lie apart."""
+    order = np.random.default_rng(seed).permutation(N)
+    return order // 12, order // 48
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    module, patch = shuffled(seed) if seed % 2 else (np.arange(N) // 12, np.arange(N) // 48)
+    near = random.integers(-1, N, (N, 3)).astype(np.int32) if seed % 3 == 2 else None
+    resolution = 0.0 if seed == 4 else 1.0
+    both = Both(
+        *(module, patch),
+        signed=seed == 3,
+        neighbours=near,
+        resolution=resolution,
+        limits=(0.0, 90.0) if seed != 4 else (-np.inf, np.inf),
+        settings=BaselineSettings(calibrate_s=2.0, maximum_hold_s=6.0 if seed == 5 else None),
+    )
+    level, load, time_ns = np.full(N, 20.0), np.zeros(N), 0
+    rate_hz = 20.0
+    for number in range(1200):
+        time_ns += round(_STEP_NS / rate_hz)
+        level += 0.002 * (1 + 0.3 * (np.arange(N) % 7 - 3))
+        if number % 40 == 0:
+            rate_hz = float(random.choice([5, 20, 50, 100]))
+            first = int(random.integers(0, N - 3))
+            load = np.zeros(N)
+            load[first : first + 3] = random.choice([0, 4, 8, 25, 60, 200, -10])
+            module_step = 4.0 * (random.random() < 0.1)
+            level[module == random.integers(8)] += module_step
+        usable = random.random(N) > 0.05 * (number % 200 > 150)
+        values = (level + load + 0.8 * random.standard_normal(N)).clip(0, 90)
+        values = np.round(values) if resolution else values
+        values[random.random(N) < 0.002] = np.nan
+        jumped = (random.random(N) < 0.02) & (number % 100 == 99)
+        level[jumped] += 15
+        values[jumped] += 15
+        both.update(time_ns, values, usable, jumped=jumped)
+        if number in (500, 900):
+            assert both.ours.tare(number % 2) == both.specified.tare(number % 2)
+        if number in (600, 640):
+            both.ours.hold(number == 600)
+            both.specified.hold(number == 600)
+        if number == 700:
+            both.set(both.ours.settings.changed({"minimum_on": 5, "tau_s": 5}))
+        if number == 1000:
+            time_ns += 700 * _STEP_NS
+    both.compare_states()
+
+
+def test_a_restored_one_goes_on_alike() -> None:
+    module, patch = np.arange(N) // 12, np.arange(N) // 48
+    both, random = Both(module, patch), np.random.default_rng(1)
+    values = np.round(20 + 0.8 * random.standard_normal((600, N)))
+    values[150:350, 30:33] += 40
+    for number in range(300):
+        both.update((number + 1) * 50_000_000, values[number])
+    rows = np.where(np.arange(N) < 90, np.arange(N), -1)
+    both = both.restored(module, patch, rows)
+    for number in range(300, 600):
+        both.update((number + 1) * 50_000_000, values[number])
+    both.compare_states()
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_taxels_of_few_levels(levels: int) -> None:
+    both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(levels)
+    for number in range(600):
+        touched = np.arange(N) // 8 == number // 50
+        both.update((number + 1) * 50_000_000, levels * touched + (random.random(N) < 0.001))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("drift", ["slow", "fast"])
+def test_the_world_of_the_bench(drift: str) -> None:
+    world = bench_world(drift, 20)  # type: ignore[arg-type]
+    both = Both(world.surface.module, world.surface.patch)
+    for sample in world.samples(1000):
+        both.update(sample.time_ns, sample.values, sample.usable)
+    both.compare_states()
+
+
+def test_a_world_with_everything_that_goes_wrong() -> None:
+    world = World(grid(modules=4, patches=2), seed=3, drift_per_min=2, rate_hz=20, dtype=np.float32)
+    world.push(world.surface.position_m[5], 200, 8, 20)
+    world.stuck([1], 255)
+    world.noisy([2], 20)
+    world.missing(np.arange(24, 48), 3, 10, status=Status(0), value=np.nan)
+    world.missing(np.arange(24), 12, 14)
+    world.jump(np.arange(24, 48), 30, 16, suspect_s=1)
+    both = Both(world.surface.module, world.surface.patch)
+    for sample in world.samples(60):
+        both.update(sample.time_ns, sample.values, sample.usable)

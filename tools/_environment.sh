@@ -46,6 +46,6 @@ prepare_environment() {
         fi
     fi
     echo "installing skinware[$extra]" >&2
-    "$venv/bin/python" -m pip install --quiet --no-compile --editable "$project[$extra]" # Python compiles what it imports
+    "$venv/bin/python" -m pip install -qq --no-compile --editable "$project[$extra]" # Python compiles what it imports
     echo "$wanted $(compiled)" >"$stamp"
 }

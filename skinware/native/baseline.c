@@ -136,8 +136,9 @@ static void show(struct baseline *b, float *to) {
         const float common = (float)b->patches[run->patch].variance;
         INDEPENDENT
         for (i = run->first; i < run->last; i++) {
+            const float variance = a.variance[i] + a.gain[i] * a.gain[i] * common;
             baseline[i] = a.level[i] + a.left[i];
-            uncertainty[i] = sqrtf(a.variance[i] + a.gain[i] * a.gain[i] * common);
+            uncertainty[i] = a.ready[i] ? sqrtf(variance) : NAN;
             noise[i] = sqrtf(a.noise2[i]);
         }
     }

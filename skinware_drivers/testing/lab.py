@@ -126,7 +126,7 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
         mount -t devtmpfs dev all/dev && mkdir -p all/dev/shm all/dev/pts all/lib/modules/$(uname -r)
         mount --bind $modules all/lib/modules/$(uname -r)
         mount -t devpts -o ptmxmode=666 devpts all/dev/pts
-        for folder in dev/shm run tmp; do mount -t tmpfs tmpfs all/$folder; done
+        for folder in dev/shm run; do mount -t tmpfs tmpfs all/$folder; done
         for folder in proc sys; do mount --rbind /$folder all/$folder; done
     """
     within = f"""

@@ -357,7 +357,7 @@ class SpecifiedBaseline:
             touched,
             held,
             baseline,
-            offsets.uncertainty(),
+            np.where(self.ready, offsets.uncertainty(), np.float32(np.nan)),
             np.sqrt(offsets.noise2),
             why,
             forced,

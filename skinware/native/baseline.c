@@ -2,6 +2,7 @@
 
 #include "baseline.h"
 
+#include <float.h>
 #include <string.h>
 
 enum { REST, HELD, RELEARNING, COVERED, DOUBTED, SATURATED, NO_RESOLUTION }; /* skinware/tactile/rule.py: Why */
@@ -59,32 +60,48 @@ static void take_in(struct baseline *b, const float *values, const uint8_t *usab
                     double passed_s) {
     const struct baseline a = *b; /* no store can change it */
     const float most = (float)(FEW_LEVELS * b->resolution), passed = (float)passed_s, long_s = (float)b->forget_after_s;
-    int64_t i, few_levels = b->few_levels, all_ready = 1;
-    for (i = 0; i < b->n; i++) {
-        const int is_usable = isfinite(values[i]) && (!usable || usable[i]);
+    uint8_t above = 0, fresh = 0, rare = 0;
+    int64_t i;
+    INDEPENDENT
+    for (i = 0; i < a.n; i++) { /* at_end: which values are usable, until compare() */
+        a.at_end[i] = fabsf(values[i]) <= FLT_MAX;
         a.away_s[i] += passed;
-        a.live[i] = a.flag[i] = 0;
-        a.at_end[i] = (uint8_t)is_usable; /* until compare() */
-        if (is_usable) {
-            if (a.away_s[i] > long_s) {
-                a.ready[i] = 0;
-                a.level[i] = NAN;
-                forget_touch(b, i);
-            }
-            if (jumped && jumped[i] && a.ready[i]) {
-                a.level[i] += values[i] - a.last[i];
-                a.forced[i] = 1;
-            }
-            a.away_s[i] = 0;
-            a.last[i] = values[i];
-            a.seen[i] = 1;
-            few_levels &= !(fabsf(values[i]) > most);
-            a.live[i] = a.ready[i];
-            a.flag[i] = !a.ready[i];
-        }
-        all_ready &= a.ready[i];
     }
-    b->few_levels = few_levels, b->all_ready = all_ready;
+    for (i = 0; usable && i < a.n; i++)
+        a.at_end[i] &= usable[i] != 0;
+    INDEPENDENT
+    for (i = 0; i < a.n; i++)
+        rare |= a.at_end[i] & (a.away_s[i] > long_s);
+    for (i = 0; rare && i < a.n; i++) {
+        if (!a.at_end[i] || !(a.away_s[i] > long_s))
+            continue;
+        a.ready[i] = 0;
+        a.level[i] = NAN;
+        forget_touch(b, i);
+    }
+    for (i = 0; jumped && i < a.n; i++) {
+        if (!a.at_end[i] || !jumped[i] || !a.ready[i])
+            continue;
+        a.level[i] += values[i] - a.last[i];
+        a.forced[i] = 1;
+    }
+    INDEPENDENT
+    for (i = 0; i < a.n; i++) {
+        const int is_usable = a.at_end[i];
+        a.away_s[i] = is_usable ? 0.0f : a.away_s[i];
+        a.last[i] = is_usable ? values[i] : a.last[i];
+    }
+    INDEPENDENT
+    for (i = 0; i < a.n; i++) {
+        a.seen[i] |= a.at_end[i];
+        a.live[i] = a.at_end[i] & a.ready[i];
+        a.flag[i] = a.at_end[i] & (a.ready[i] ^ 1);
+        fresh |= a.ready[i] ^ 1;
+    }
+    for (i = 0; b->few_levels && !above && i < a.n; i++)
+        above |= a.at_end[i] & (fabsf(values[i]) > most);
+    b->few_levels &= !above;
+    b->all_ready = !fresh;
 }
 
 /* How far values are from their offsets, and from when on that is a touch. A value at an end of its range shows nothing. */
@@ -110,26 +127,15 @@ static void compare(struct baseline *b) {
     }
 }
 
-static uint8_t why_of(const struct baseline *b, int64_t i, int is_shown) {
-    if (b->few_levels && b->live[i])
-        return NO_RESOLUTION;
-    if (b->touched[i] && b->at_end[i])
-        return SATURATED;
-    if (b->returned[i])
-        return DOUBTED;
-    if (b->low[i])
-        return COVERED;
-    if (!b->ready[i] || (b->variance[i] > b->noise2[i] && !b->touched[i]))
-        return RELEARNING;
-    return is_shown ? HELD : REST;
-}
-
 /* Writes value, baseline, uncertainty and noise, (n,) float each, then touched, held, why, forced and live, (n,) bytes. */
 static void show(struct baseline *b, float *to) {
     const struct baseline a = *b; /* no store can change it */
     const int64_t n = b->n;
     float *value = to, *baseline = to + n, *uncertainty = to + 2 * n, *noise = to + 3 * n;
     uint8_t *touched = (uint8_t *)(to + 4 * n), *held = touched + n, *why = held + n, *forced = why + n;
+    uint8_t *const flag = a.flag;
+    const uint8_t few_levels = (uint8_t)(a.few_levels != 0), is_held = (uint8_t)(a.is_held != 0);
+    const float other_side = a.is_signed ? -1.0f : 1.0f, lowest_shown = a.is_signed ? -INFINITY : 0.0f;
     int64_t number, i;
     for (number = 0; number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
@@ -142,13 +148,33 @@ static void show(struct baseline *b, float *to) {
             noise[i] = sqrtf(a.noise2[i]);
         }
     }
+    INDEPENDENT
     for (i = 0; i < n; i++) { /* the present load of some is gone while the smoothed one is not */
-        const float known = a.live[i] ? a.deviation[i] : a.smooth[i];
-        const float least = lowest(a.off[i], FALLEN * load_of(&a, a.smooth[i]));
-        touched[i] = a.touched[i] && load_of(&a, known) >= least;
-        value[i] = !touched[i] ? 0.0f : a.is_signed ? known : highest(known, 0);
-        why[i] = why_of(&a, i, touched[i]);
-        held[i] = b->is_held ? 1 : a.held[i];
+        const float deviation = a.deviation[i], smooth = a.smooth[i], off = a.off[i];
+        const float known = a.live[i] ? deviation : smooth;
+        const float load = highest(known, known * other_side), smoothed = highest(smooth, smooth * other_side);
+        const float shown = highest(known, lowest_shown), least = lowest(off, FALLEN * smoothed);
+        value[i] = load >= least ? shown : 0.0f;
+        touched[i] = load >= least;
+        flag[i] = a.variance[i] > a.noise2[i];
+    }
+    INDEPENDENT
+    for (i = 0; i < n; i++)
+        value[i] = a.touched[i] ? value[i] : 0.0f;
+    INDEPENDENT
+    for (i = 0; i < n; i++) {
+        touched[i] &= a.touched[i];
+        held[i] = is_held | a.held[i];
+        flag[i] = (a.ready[i] ^ 1) | (flag[i] & (a.touched[i] ^ 1));
+    }
+    INDEPENDENT
+    for (i = 0; i < n; i++) { /* the last reason that holds */
+        uint8_t reason = touched[i] ? HELD : REST;
+        reason = flag[i] ? RELEARNING : reason;
+        reason = a.low[i] ? COVERED : reason;
+        reason = a.returned[i] ? DOUBTED : reason;
+        reason = (a.touched[i] & a.at_end[i]) ? SATURATED : reason;
+        why[i] = (few_levels & a.live[i]) ? NO_RESOLUTION : reason;
     }
     memcpy(forced, b->forced, (size_t)n);
     memset(b->forced, 0, (size_t)n);

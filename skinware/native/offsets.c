@@ -53,10 +53,13 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     int64_t i;
     INDEPENDENT
     for (i = first; i < last; i++) {
-        const int lies_low = a.below[i] & (a.smooth[i] < low * sqrtf(a.noise2[i]));
-        a.flag[i] = a.live[i] & !a.touched[i] & (a.since_end_s[i] >= SETTLED_S) & !a.at_end[i] &
-                     (a.is_signed | (!a.sagging[i] & !lies_low));
+        const float lowest_rest = low * sqrtf(a.noise2[i]), since_s = a.since_end_s[i];
+        const float least = a.below[i] ? lowest_rest : -INFINITY;
+        a.flag[i] = (a.smooth[i] >= least ? since_s : 0.0f) >= SETTLED_S;
     }
+    INDEPENDENT
+    for (i = first; i < last; i++)
+        a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1);
     INDEPENDENT
     for (i = first; i < last; i++) {
         const float on = a.on[i], hidden2 = a.held[i] ? on * on : 0.0f;
@@ -156,17 +159,22 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
     const double slowly_ = passed_share(passed_s, SLOW_S);
     const float slowly = (float)slowly_, of_noise = (float)(slowly_ / (2 - slowly_));
     const float floor = (float)fmin(passed_s / b->tau_s, 0.5), quick = (float)fmin(passed_s / RESETTLE_S, 0.5);
-    const float noise_share = (float)fmin(passed_s / NOISE_S, 0.1);
+    const float noise_share = (float)fmin(passed_s / NOISE_S, 0.1), other_side = b->is_signed ? -1.0f : 1.0f;
     int64_t number, i;
     for (number = 0; passed_s > 0 && number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
         const float grows = (float)b->patches[run->patch].drift * (float)passed_s;
+        const int64_t first = run->first, last = run->last;
         INDEPENDENT
-        for (i = run->first; i < run->last; i++)
-            a.flag[i] = a.live[i] & !a.touched[i] & !a.sagging[i] & (a.since_end_s[i] >= SETTLED_S) &
-                         (load_of(&a, a.deviation[i]) < a.on[i]) & !a.at_end[i];
+        for (i = first; i < last; i++) {
+            const float load = highest(a.deviation[i], a.deviation[i] * other_side), since_s = a.since_end_s[i];
+            a.flag[i] = (load < a.on[i] ? since_s : 0.0f) >= SETTLED_S;
+        }
         INDEPENDENT
-        for (i = run->first; i < run->last; i++) {
+        for (i = first; i < last; i++)
+            a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1);
+        INDEPENDENT
+        for (i = first; i < last; i++) {
             const int is_measured = a.flag[i], is_calm = is_measured & (fabsf(a.smooth[i]) < rustle_share * a.off[i]);
             const float noise2 = a.noise2[i], cross = a.cross[i], variance = a.variance[i] + grows;
             const float total = variance + noise2;

@@ -187,7 +187,9 @@ def _run_in_user_mode(script: Path, timeout_s: float) -> int:
         PATH={shlex.quote(_path())}
         bash {script}
         code=$?
-        mount -t hostfs -o {script.parent} none /mnt && echo $code >/mnt/{status.name}
+        for option in hostfs= ""; do # Linux 6.12 names the option, 6.1 does not
+            mount -t hostfs -o $option{script.parent} none /mnt 2>/dev/null && echo $code >/mnt/{status.name} && break
+        done
         echo 1 >/proc/sys/kernel/printk
         echo o >/proc/sysrq-trigger
         sleep 60

@@ -179,26 +179,21 @@ def _run_in_machine(flavour: str, script: Path, timeout_s: float) -> int:
 
 def _run_in_user_mode(script: Path, timeout_s: float) -> int:
     """Boot User-Mode Linux, whose own exit status says nothing: the guest writes the command's into a file."""
-    status = script.with_name("status")
-    first = script.with_name("init")
+    place, status, first = script.parent, script.with_name("status"), script.with_name("init")
     first.write_text(f"""#!/bin/bash
         exec >/dev/console 2>&1
         stty -onlcr </dev/console
         PATH={shlex.quote(_path())}
         bash {script}
         code=$?
-        for option in hostfs= ""; do # Linux 6.12 names the option, 6.1 does not
-            mount -t hostfs -o $option{script.parent} none /mnt 2>/dev/null && echo $code >/mnt/{status.name} && break
-        done
-        echo 1 >/proc/sys/kernel/printk
+        (mount -t hostfs -o hostfs={place} none /mnt || mount -t hostfs -o {place} none /mnt) 2>/dev/null
+        echo $code >/mnt/{status.name} # Linux 6.12 wants the name of the option, 6.1 refuses it
         echo o >/proc/sysrq-trigger
         sleep 60
     """)
     first.chmod(0o755)
     kernel = [_which(USER_KERNEL) or "", "rootfstype=hostfs", "rootflags=/", "ro", "mem=2G", f"init={first}"]
-    booted = boot(
-        [*kernel, "con=null", "con0=null,fd:1", "quiet"], {**os.environ, "TMPDIR": str(script.parent)}, timeout_s
-    )
+    booted = boot([*kernel, "con=null", "con0=null,fd:1", "quiet"], {**os.environ, "TMPDIR": str(place)}, timeout_s)
     return int(status.read_text()) if status.exists() else booted or 1
 
 

@@ -217,7 +217,7 @@ def test_what_was_felt_before_a_stop_is_not_sent_after_it() -> None:
         each.run_ms(3025)
         each.send(0x207, "07 01")
         each.run_ms(4000)
-    reference.hardware.set_triangle(7, 0, "ack", reference.now_ns)  # changes nothing, but all is computed anew
+    reference.hardware.set_triangle(7, 0, "ack", reference.now_ns)  # changes nothing, but all is computed again
     for each in (rig, reference):
         each.send(0x207, "07 00")
     assert rig.run_ms(1000) == reference.run_ms(1000)

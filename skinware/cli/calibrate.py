@@ -16,6 +16,9 @@ from skinware.cli._terminal import say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from skinware.cli._gathering import Gathering
     from skinware.structure import Structure
     from skinware.tactile.calibration.placing import Placement
@@ -161,7 +164,10 @@ def touch(
     """Find the places of sensors from presses at points that a service publishes.
 
     A press is a touch whose point rests for 0.2 s. Wrong presses are found and left out. With the shapes of the
-    modules, places are twice as good, untouched sensors are placed too, and normals are known.
+    modules, places are twice as good, untouched sensors are placed too, and normals are known. Drift, lag and play of
+    the tool are corrected where the presses show them; press each place at different times and from all directions.
+
+    Exit status: 0 the places can be trusted, 1 they are written, and cannot.
     """
     from skinware.tactile.calibration.placing import place
     from skinware.tactile.calibration.state import PressSession
@@ -172,9 +178,12 @@ def touch(
     session_of = partial(PressSession, wanted=touches)
     where = (service, poses_namespace, column, (3,))
     with _opened(file, session_of, how, where) as (gathering, session):
-        shapes = None if layout is None else _shapes(gathering.structure, gathering.type_name, layout)
+        structure, type_name, shapes, layout_m, is_here = gathering.structure, gathering.type_name, None, None, False
+        if layout is not None:
+            shapes = _shapes(structure, type_name, layout)
+            layout_m, is_here = _layout(structure, type_name, layout, frame or service)
         gathering.run(_PRESS, how.share, how.duration_s)
-        placement = place(session.presses, shapes, offset_m=offset_m)
+        placement = place(session.presses, shapes, offset_m=offset_m, layout_m=layout_m, is_here=is_here)
         _write(file, gathering, placement, frame or service, pitch_m)
     _report_placed(how.as_json, file, placement, {}, "")
 
@@ -369,6 +378,20 @@ def _opened(
         yield gathering, session
 
 
+def _layout(structure: Structure, type_name: str, layout: Path, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
+    """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
+    from collections import Counter
+
+    import numpy as np
+
+    from skinware.geometry import read_geometry
+
+    places = read_geometry(layout).of(structure, type_name)
+    frames = Counter(places.frame[places.known].tolist())
+    here = frame if frame in frames else max(frames, key=lambda name: frames[name])
+    return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
+
+
 def _shapes(structure: Structure, type_name: str, layout: Path) -> Mapping[int, Shape]:
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.shapes import shapes_of
@@ -394,11 +417,13 @@ def _write(file: Path, gathering: Gathering, placement: Placement, frame: str, p
 
 def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
     known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
+    tool, residual_mm = placement.tool, _MM * placement.spread_m
     figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
-    text = (
-        f"{file}: {known} sensors placed, {wrong} presses left out, residual {_MM * placement.spread_m:.1f} mm{words}"
-    )
-    say(as_json, {"event": "done", "file": str(file), **figures, **also}, text)
+    of_tool = {"corrected": tool.found, "doubts": tool.doubts, "unchecked_m": tool.unchecked}
+    text = f"{file}: {known} sensors placed, {wrong} presses left out, residual {residual_mm:.1f} mm{words}"
+    text = "\n".join([text, *tool.words()])
+    say(as_json, {"event": "done", "file": str(file), **figures, **of_tool, **also}, text)
+    click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)
 
 
 def main() -> None:

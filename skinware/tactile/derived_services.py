@@ -20,10 +20,9 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
-from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
-from skinware.tactile.health_service import RATE_HZ, HealthWriter
+from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
 from skinware.tactile.motion_service import NAME, MotionWriter
 from skinware.tactile.neighbours import Table, neighbours, posed
 from skinware.tactile.onsets import Onsets

@@ -19,8 +19,8 @@ from skinware.state import count_statuses, state_name
 from skinware.status import BusReason, BusState, PatchState, Status, load_report
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
-from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import ChainHealth
 from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, HealthSeen, PatchSeen, TaxelFault
 
 _HOUR_S = 3600

@@ -92,6 +92,45 @@ def presses(surface: Surface, seed: int, *, each: int = 5, pose_noise_m: float =
     return Presses.of_arrays(said, load)
 
 
+@dataclass(frozen=True)
+class Tool:
+    """Errors of the points of presses, one each 3 s.
+
+    Attributes:
+        drift_m: from the first press to the last.
+        step_m: of the points after 55 % of the presses.
+        scale: of the points about the origin.
+        offset_m: of all points.
+        lag_s: by which points are old.
+        play_m: between points from opposite directions.
+    """
+
+    drift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    step_m: float = 0.0
+    scale: float = 1.0
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lag_s: float = 0.0
+    play_m: float = 0.0
+
+
+def with_tool(surface: Surface, given: Presses, seed: int, tool: Tool, *, in_order: bool = False) -> Presses:
+    """The same presses by such a tool, in any order or (``in_order``) taxel by taxel, from all directions."""
+    random, m = np.random.default_rng([seed, 5]), len(given)
+    order = np.arange(m) if in_order else random.permutation(m)
+    number = np.argsort(order)[given.press]
+    rows = np.argsort(number, kind="stable")
+    true, time_s = given.pose[order], 3.0 * np.arange(m)
+    nearest = np.argmin(np.linalg.norm(true[:, None] - surface.position_m, axis=2), axis=1)
+    way = np.einsum("mi,mij->mj", random.standard_normal((m, 2)), tangents(surface.position_m)[nearest])
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    velocity = way * random.uniform(0, 0.008, m)[:, None]
+    past = time_s[:, None] / time_s[-1]
+    said = tool.scale * true + tool.offset_m + past * tool.drift_m + (past > 0.55) * [tool.step_m, 0, 0]
+    said -= tool.lag_s * velocity + tool.play_m / 2 * way
+    motion = np.column_stack([time_s, velocity, way])
+    return Presses(given.n, said, number[rows], given.taxel[rows], given.load[rows], motion)
+
+
 def off_m(surface: Surface, position_m: ArrayF) -> ArrayF:
     """(n,) from the true places; NaN where none was found."""
     distance: ArrayF = np.linalg.norm(position_m - surface.position_m, axis=1)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware.tactile.calibration.placing import Press, Presses, PressFinder, place
+from skinware.tactile.calibration.placing import Press, Presses, place
 from skinware.tactile.calibration.results import confidence_of
 from skinware.tactile.calibration.shapes import shapes_of
+from skinware.tactile.calibration.state import PressFinder
 from skinware.tactile.testing import Surface, arm, triangles
 from tests.tactile import calibrating
 from tests.tactile.calibrating import DATA, PARTS, PITCH_M, off_m, part, presses, shapes

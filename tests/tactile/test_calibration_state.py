@@ -74,6 +74,6 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         file.write_bytes(bad)
         with pytest.raises(ConfigurationError, match=r"state\.npz cannot be read"):
             restore_session(file, PressSession(4), "pressure", UID)
-    np.savez(file, version=np.array(2))
+    np.savez(file, version=np.array(1))
     with pytest.raises(ConfigurationError, match="another version"):
         restore_session(file, PressSession(4), "pressure", UID)

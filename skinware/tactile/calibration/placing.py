@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Self
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware.tactile.calibration.shapes import Shape, fitted
+from skinware.tactile.calibration.tool import Moves, Smoother, ToolErrors, compare_with_layout, regress
 
 ArrayF = npt.NDArray[np.float64]
 ArrayI = npt.NDArray[np.int64]
@@ -27,8 +27,8 @@ _PRECISE_M = 0.0035
 _LEAST_PRESSES = 2
 _PARTS = 10
 """Parts of the presses that are left out in turn, for the expected error."""
-_BIAS_M, _PRECISE_BIAS_M = 0.001, 0.0003
-"""Bias of places that more presses do not lower: skins end, gains differ."""
+_BIAS_M, _PRECISE_BIAS_M, _BIAS_OF_SHAPES = 0.001, 0.0004, 0.6
+"""Bias of places that more presses do not lower: skins end, gains differ. Shapes leave a share of it."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Placement:
         pressed: (n,) number of presses that each has felt.
         residual_m: (m,) distance of the point of each press from the centre of its taxels.
         wrong: (m,) bool, presses that were left out.
+        tool: the errors of the tool that the presses show.
     """
 
     position_m: ArrayF
@@ -50,6 +51,7 @@ class Placement:
     pressed: ArrayI
     residual_m: ArrayF
     wrong: npt.NDArray[np.bool_]
+    tool: ToolErrors = field(default_factory=ToolErrors)
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
@@ -64,13 +66,22 @@ class Placement:
         return float(np.median(counting)) if len(counting) else float("nan")
 
 
-def place(presses: Presses, shapes: Mapping[int, Shape] | None = None, *, offset_m: float = 0.0) -> Placement:
-    """Find the places of the taxels.
+def place(
+    presses: Presses,
+    shapes: Mapping[int, Shape] | None = None,
+    *,
+    offset_m: float = 0.0,
+    layout_m: ArrayF | None = None,
+    is_here: bool = True,
+) -> Placement:
+    """Find the places of the taxels, and the errors of the tool.
 
     Args:
         presses: presses with points.
         shapes: shapes of modules, by number; None: not known.
         offset_m: from the taxels outwards to the points: the probe's radius and the cover. It needs normals.
+        layout_m: (n, 3) where a layout puts the taxels, in one coordinate frame; None: there is none.
+        is_here: whether that is the coordinate frame of the points.
 
     Raises:
         ConfigurationError: the presses have no points; an offset without normals.
@@ -78,29 +89,53 @@ def place(presses: Presses, shapes: Mapping[int, Shape] | None = None, *, offset
     if presses.pose.ndim != 2:
         raise ConfigurationError("presses with whole poses place a finger and modules: see place_finger")
     shapes = shapes or {}
-    position = _medians(presses)
-    trust = np.ones(len(presses))
-    for _ in range(_ROUNDS):
-        residual = _residuals(presses, position)
-        trust = _trust(residual)
-        is_precise = _spread(residual, trust) < _PRECISE_M
-        position, normal = _places(presses, trust, shapes, is_precise)
-    error = _errors(presses, trust, shapes, is_precise, position)
+    position, _, trust, is_precise = _settled(presses, {})
+    error = _errors(presses, trust, {}, is_precise, position)
+    of_tool = regress(Moves(presses.pose, *presses.moves), trust, error, *_smoothers(presses, trust))
+    presses, tool = replace(presses, pose=presses.pose - of_tool.shift_m), of_tool.tool
+    position, normal, trust, is_precise = _settled(presses, shapes)
+    error = np.hypot(_errors(presses, trust, shapes, is_precise, position), of_tool.error_m)
+    residual = _residuals(presses, position)
+    if layout_m is not None:
+        modules = [shape.taxel for shape in shapes.values()]
+        tool = compare_with_layout(tool, position, layout_m, modules, of_tool.error_m, is_here=is_here)
     if offset_m:
         if not np.isfinite(normal).all(axis=1).any():
             raise ConfigurationError(
                 "an offset of the points needs the layout of modules with normals: which way is out?"
             )
         position = np.where(np.isfinite(normal), position - offset_m * normal, position)
-    return Placement(position, normal, error, presses.times_pressed, residual, trust <= 0)
+    return Placement(position, normal, error, presses.times_pressed, residual, trust <= 0, tool)
+
+
+def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[ArrayF, ArrayF, ArrayF, bool]:
+    """(n, 3) places, (n, 3) normals, (m,) the weight of each press, and whether points are precise."""
+    position = _medians(presses)
+    for _ in range(_ROUNDS):
+        residual = _residuals(presses, position)
+        trust = _trust(residual)
+        is_precise = _spread(residual, trust) < _PRECISE_M
+        position, normal = _places(presses, trust, shapes, is_precise)
+    return position, normal, trust, is_precise
+
+
+def _smoothers(presses: Presses, trust: ArrayF) -> tuple[Smoother, Smoother]:
+    """Means of features of presses over the taxels, and what differs from the centre of these means."""
+    weight = trust[presses.press] * presses.load
+
+    def means(of: ArrayF) -> ArrayF:
+        return _means(presses, weight, of)
+
+    def left(of: ArrayF) -> ArrayF:
+        return of - _centres(presses, means(of))
+
+    return means, left
 
 
 def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool) -> tuple[ArrayF, ArrayF]:
     """(n, 3) places, and (n, 3) normals: weighted means, and fitted shapes."""
     weight = trust[presses.press] * (presses.load**2 if is_precise else presses.load)
-    position = _means(presses, weight)
-    if is_precise:
-        position = _unbiased(presses, trust, weight, position)
+    position = _unbiased(presses, trust, weight) if is_precise else _means(presses, weight, presses.pose)
     normal = np.full_like(position, np.nan)
     total, squares = (np.bincount(presses.taxel, of, presses.n) for of in (weight, weight**2))
     presses_each = total**2 / np.where(squares > 0, squares, 1)  # of equal weight, that would count as much
@@ -111,11 +146,12 @@ def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_pre
     return position, normal
 
 
-def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF, position: ArrayF) -> ArrayF:
+def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF) -> ArrayF:
     """(n, 3) places without the bias of the mean of a bell whose presses lie more to one side.
 
     The bell is as wide as the presses of a taxel typically spread; its gain does not matter.
     """
+    position = _means(presses, weight, presses.pose)
     off = presses.pose[presses.press] - position[presses.taxel]
     squares = np.nan_to_num((off**2).sum(axis=1))
     each = np.bincount(presses.taxel, weight, presses.n)
@@ -123,7 +159,7 @@ def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF, position: ArrayF)
     if not len(width):
         return position
     bell = trust[presses.press] * np.exp(-squares / max(float(np.median(width)), _LEAST_SPREAD_M**2))
-    return 2 * position - _means(presses, bell)
+    return 2 * position - _means(presses, bell, presses.pose)
 
 
 def _medians(presses: Presses) -> ArrayF:
@@ -146,16 +182,17 @@ def _medians(presses: Presses) -> ArrayF:
 
 def _residuals(presses: Presses, position: ArrayF) -> ArrayF:
     """(m,) distance of the point of each press from the centre of the taxels that felt it; inf without any."""
-    known = np.isfinite(position[presses.taxel]).all(axis=1)
-    press, taxel, load = presses.press[known], presses.taxel[known], presses.load[known]
-    m = len(presses)
-    total = np.bincount(press, load, m)
-    with np.errstate(invalid="ignore"):
-        centre = (
-            np.stack([np.bincount(press, load * position[taxel, axis], m) for axis in range(3)], 1) / total[:, None]
-        )
-    residual = np.linalg.norm(presses.pose - centre, axis=1)
+    residual = np.linalg.norm(presses.pose - _centres(presses, position), axis=1)
     return np.where(np.isnan(residual), np.inf, residual)
+
+
+def _centres(presses: Presses, of: ArrayF) -> ArrayF:
+    """(m, k) the means of (n, k) features over the taxels that felt each press, weighted by load; NaN without any."""
+    known = np.isfinite(of[presses.taxel]).all(axis=1)
+    press, taxel, load = presses.press[known], presses.taxel[known], presses.load[known]
+    total = np.bincount(press, load, len(presses))
+    sums = [np.bincount(press, load * column[taxel], len(presses)) for column in of.T]
+    return np.where(total > 0, sums, np.nan).T / np.where(total > 0, total, 1)[:, None]
 
 
 def _spread(residual: ArrayF, trust: ArrayF) -> float:
@@ -174,12 +211,11 @@ def _trust(residual: ArrayF) -> ArrayF:
     return trust
 
 
-def _means(presses: Presses, weight: ArrayF) -> ArrayF:
-    """(n, 3) the weighted means of the points; NaN with too few presses, or felt from the side alone."""
+def _means(presses: Presses, weight: ArrayF, of: ArrayF) -> ArrayF:
+    """(n, k) means of (m, k) features over presses; NaN with too few presses, or felt from the side alone."""
     total = np.bincount(presses.taxel, weight, presses.n)
     count = np.bincount(presses.taxel, weight > 0, presses.n)
-    points = presses.pose[presses.press]
-    sums = np.stack([np.bincount(presses.taxel, weight * points[:, axis], presses.n) for axis in range(3)], 1)
+    sums = np.stack([np.bincount(presses.taxel, weight * column[presses.press], presses.n) for column in of.T], 1)
     enough = (total > 0) & (count >= _LEAST_PRESSES) & (presses.times_pressed > 0)
     return np.where(enough[:, None], sums / np.where(enough, total, 1)[:, None], np.nan)
 
@@ -194,7 +230,8 @@ def _errors(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_pre
     changes = np.array(squares)
     known = np.isfinite(changes).sum(axis=0)
     mean = np.nansum(changes, axis=0) / np.maximum(known, 1)
-    error = np.sqrt((_PARTS - 1) * mean + (_PRECISE_BIAS_M if is_precise else _BIAS_M) ** 2)
+    bias_m = (_PRECISE_BIAS_M if is_precise else _BIAS_M) * (_BIAS_OF_SHAPES if shapes else 1)
+    error = np.sqrt((_PARTS - 1) * mean + bias_m**2)
     return np.where(np.isfinite(position).all(axis=1) & (known > 0), error, np.nan)
 
 
@@ -206,11 +243,13 @@ class Press:
         pose: (3,) its point, m; or (4, 4) pose of the carrier of the finger, homogeneous, m.
         taxel: (k,) the taxels that feel it.
         load: (k,) their loads, above 0.
+        motion: (7,) its time, s, its velocity while it rests, m/s, and the way from which it came, of length 1.
     """
 
     pose: ArrayF
     taxel: ArrayI
     load: ArrayF
+    motion: ArrayF = field(default_factory=lambda: np.full(7, np.nan))
 
 
 @dataclass(frozen=True)
@@ -223,6 +262,7 @@ class Presses:
         press: (k,) int64, in ascending order: the press of each pair of a press and a taxel that feels it.
         taxel: (k,) int64, its taxel.
         load: (k,) its load, above 0.
+        motion: (m, 7) as of a :class:`Press`, NaN where not known; (0, 7): not known at all.
 
     Raises:
         ConfigurationError: the arrays do not fit each other.
@@ -233,8 +273,11 @@ class Presses:
     press: ArrayI
     taxel: ArrayI
     load: ArrayF
+    motion: ArrayF = field(default_factory=lambda: np.zeros((0, 7)))
 
     def __post_init__(self) -> None:
+        if self.motion.shape not in ((0, 7), (len(self.pose), 7)):
+            raise ConfigurationError(f"motion of {len(self.pose)} presses: give ({len(self.pose)}, 7)")
         if self.pose.ndim not in (2, 3) or self.pose.shape[1:] not in ((3,), (4, 4)):
             raise ConfigurationError(f"poses of presses: give (m, 3) or (m, 4, 4), not {self.pose.shape}")
         if not len(self.press) == len(self.taxel) == len(self.load):
@@ -273,7 +316,18 @@ class Presses:
             np.concatenate([self.press, np.full(len(press.taxel), len(self))]),
             np.concatenate([self.taxel, press.taxel]),
             np.concatenate([self.load, press.load]),
+            np.concatenate([self._motion, press.motion[None]]),
         )
+
+    @property
+    def _motion(self) -> ArrayF:
+        return self.motion if len(self.motion) else np.full((len(self), 7), np.nan)
+
+    @property
+    def moves(self) -> tuple[ArrayF, ArrayF, ArrayF]:
+        """(m,) the times, (m, 3) the velocities and (m, 3) the ways of the presses; NaN: not known."""
+        motion = self._motion
+        return motion[:, 0], motion[:, 1:4], motion[:, 4:]
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -284,75 +338,3 @@ class Presses:
         most = np.zeros(len(self))
         np.maximum.at(most, self.press, self.load)
         return np.bincount(self.taxel[self.load >= most[self.press] / 2], minlength=self.n)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PressSettings:
-    """The conditions of a steady press.
-
-    Attributes:
-        hold_s: how long it lasts.
-        steady: share by which its load may change meanwhile.
-        still_m: how far its point may move meanwhile, m.
-    """
-
-    hold_s: float = 0.2
-    steady: float = 0.3
-    still_m: float = 0.002
-
-
-@dataclass
-class PressFinder:
-    """Finds presses in frames: one each time that something comes to rest on the skin.
-
-    Attributes:
-        settings: the conditions of a press.
-        held: whether the last press that was found still goes on.
-    """
-
-    settings: PressSettings = field(default_factory=PressSettings)
-    held: bool = False
-    _window: list[tuple[int, ArrayF, ArrayF]] = field(default_factory=list)
-    _found_at_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
-
-    def update(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> Press | None:
-        """Take a frame, and return the press that is complete with it.
-
-        Args:
-            time_ns: of the frame.
-            load: (n,) 0 where nothing touches, NaN where it is not known.
-            pose: (3,) or (4, 4), at that time; None or not finite: not known.
-        """
-        loads = np.nan_to_num(np.asarray(load, np.float64), posinf=0.0)
-        total = float(loads.sum())
-        if pose is None or not np.isfinite(pose).all() or total <= 0:
-            self._window.clear()
-            self.held = self.held and total > 0
-            return None
-        settings = self.settings
-        if self._window:
-            _, first_load, first_pose = self._window[0]
-            first = float(first_load.sum())
-            is_steady = abs(total - first) <= settings.steady * max(total, first)
-            if not is_steady or np.linalg.norm(_point(pose) - _point(first_pose)) > settings.still_m:
-                self._window.clear()
-        if self.held and np.linalg.norm(_point(pose) - _point(self._found_at_m)) > 2 * settings.still_m:
-            self.held = False
-        self._window.append((time_ns, loads, np.array(pose, np.float64)))
-        if self.held or time_ns - self._window[0][0] < settings.hold_s * NS_PER_S:
-            if self.held:
-                del self._window[:-1]
-            return None
-        mean = np.mean([each for _, each, _ in self._window], axis=0)
-        at = np.mean([each for _, _, each in self._window], axis=0)
-        at = self._window[-1][2] if at.ndim == 2 else at  # rotations have no mean
-        self._window.clear()
-        self.held, self._found_at_m = True, at
-        taxel = np.flatnonzero(mean > 0)
-        return Press(at, taxel, mean[taxel])
-
-
-def _point(pose: ArrayF) -> ArrayF:
-    """(3,) the point, or the origin of the pose."""
-    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
-    return point

@@ -79,7 +79,7 @@ def placed_comment(structure: Structure, type_name: str, placement: Placement) -
     index = structure.patch_of(type_name)
     wrong = int(placement.wrong.sum())
     presses, residual = f"{len(placement.residual_m)} presses, {wrong} of them left out", 1e3 * placement.spread_m
-    lines = [f"{presses}; median residual of the others {residual:.1f} mm"]
+    lines = [f"{presses}; median residual of the others {residual:.1f} mm", *placement.tool.words()]
     for patch, name in enumerate(structure.patch_names):
         of_patch = index == patch
         known = of_patch & placement.known

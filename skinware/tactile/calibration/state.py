@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,95 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
 from skinware.tactile.calibration.force import ForceData
-from skinware.tactile.calibration.placing import Presses, PressFinder, PressSettings
+from skinware.tactile.calibration.placing import Press, Presses
 from skinware.tactile.calibration.topology import ENOUGH_FRAMES, StrokeSums
 
 ArrayF = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressSettings:
+    """The conditions of a steady press.
+
+    Attributes:
+        hold_s: how long it lasts.
+        steady: share by which its load may change meanwhile.
+        still_m: how far its point may move meanwhile, m.
+    """
+
+    hold_s: float = 0.2
+    steady: float = 0.3
+    still_m: float = 0.002
+
+
+@dataclass
+class PressFinder:
+    """Finds presses in frames: one each time that something comes to rest on the skin.
+
+    Attributes:
+        settings: the conditions of a press.
+        held: whether the last press that was found still goes on.
+    """
+
+    settings: PressSettings = field(default_factory=PressSettings)
+    held: bool = False
+    _window: list[tuple[int, ArrayF, ArrayF]] = field(default_factory=list)
+    _found_at_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
+    _passed_m: list[ArrayF] = field(default_factory=list)
+    """The last two points of its way that are apart by more than it may move while it rests."""
+
+    def update(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> Press | None:
+        """Take a frame, and return the press that is complete with it.
+
+        Args:
+            time_ns: of the frame.
+            load: (n,) 0 where nothing touches, NaN where it is not known.
+            pose: (3,) or (4, 4), at that time; None or not finite: not known.
+        """
+        loads = np.nan_to_num(np.asarray(load, np.float64), posinf=0.0)
+        total = float(loads.sum())
+        self._follow(pose)
+        if pose is None or not np.isfinite(pose).all() or total <= 0:
+            self._window.clear()
+            self.held = self.held and total > 0
+            return None
+        settings = self.settings
+        if self._window:
+            _, first_load, first_pose = self._window[0]
+            first = float(first_load.sum())
+            is_steady = abs(total - first) <= settings.steady * max(total, first)
+            if not is_steady or np.linalg.norm(_point(pose) - _point(first_pose)) > settings.still_m:
+                self._window.clear()
+        if self.held and np.linalg.norm(_point(pose) - _point(self._found_at_m)) > 2 * settings.still_m:
+            self.held = False
+        self._window.append((time_ns, loads, np.array(pose, np.float64)))
+        if self.held or time_ns - self._window[0][0] < settings.hold_s * NS_PER_S:
+            if self.held:
+                del self._window[:-1]
+            return None
+        seconds = (time_ns - self._window[0][0]) / NS_PER_S
+        velocity = (_point(pose) - _point(self._window[0][2])) / seconds
+        way = self._passed_m[1] - self._passed_m[0] if len(self._passed_m) == 2 else np.full(3, np.nan)
+        motion = np.concatenate([[time_ns / NS_PER_S], velocity, way / np.linalg.norm(way)])
+        mean = np.mean([each for _, each, _ in self._window], axis=0)
+        at = np.mean([each for _, _, each in self._window], axis=0)
+        at = self._window[-1][2] if at.ndim == 2 else at  # rotations have no mean
+        self._window.clear()
+        self.held, self._found_at_m = True, at
+        taxel = np.flatnonzero(mean > 0)
+        return Press(at, taxel, mean[taxel], motion)
+
+    def _follow(self, pose: ArrayF | None) -> None:
+        if pose is None or not np.isfinite(pose).all():
+            self._passed_m.clear()
+        elif not self._passed_m or np.linalg.norm(_point(pose) - self._passed_m[-1]) > self.settings.still_m:
+            self._passed_m = [*self._passed_m[-1:], _point(pose).copy()]
+
+
+def _point(pose: ArrayF) -> ArrayF:
+    """(3,) the point, or the origin of the pose."""
+    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
+    return point
 
 
 class Session(ABC):
@@ -104,10 +190,10 @@ class PressSession(Session):
         return {"presses": len(self.presses)}
 
     def arrays(self) -> Arrays:
-        return {name: getattr(self.presses, name) for name in ("pose", "press", "taxel", "load")}
+        return {name: getattr(self.presses, name) for name in _OF_PRESSES}
 
     def restore(self, arrays: Arrays) -> None:
-        known = Presses(self._n, *(arrays[name] for name in ("pose", "press", "taxel", "load")))
+        known = Presses(self._n, *(arrays[name] for name in _OF_PRESSES))
         if known.pose.shape[1:] != self._pose_shape:
             raise ConfigurationError(f"it has poses of shape {known.pose.shape[1:]}")
         self.presses = known
@@ -208,7 +294,8 @@ class ForceSession(Session):
 
 ENOUGH_PRESSED = 100
 """Frames with a load after which a taxel has enough for a curve."""
-_VERSION = 1
+_VERSION = 2
+_OF_PRESSES = ("pose", "press", "taxel", "load", "motion")
 _ARRAYS = "gathered/"
 
 

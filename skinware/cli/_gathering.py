@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -143,9 +145,47 @@ class Gathering:
             ServiceTimeout: the driver is silent.
             KeyboardInterrupt: Ctrl-C.
         """
-        try:
+        with self._kept():
             self._run(what_to_do, share, duration_s)
             self._report_coverage()
+
+    def weigh(self, weight_n: float, duration_s: float, source: ForceSource) -> None:
+        """Ask for a known weight, and gather while it rests. Baselines are measured before, and followed until Enter.
+
+        Args:
+            weight_n: the weight, N.
+            duration_s: how long it rests.
+            source: pairs it with the temperature.
+
+        Raises:
+            ServiceTimeout: the driver is silent.
+            KeyboardInterrupt: Ctrl-C.
+        """
+        with self._kept():
+            self._wait_for_rest()
+            echo(f"lay {weight_n:g} N on the skin, and press Enter", err=True)
+            if sys.stdin is not None and sys.stdin.isatty():
+                for frame in frames_until(self._reader, enter_pressed):
+                    self.source.loads(frame)
+            source.weight_n, time_is_over = weight_n, after(duration_s)
+            felt = np.zeros(len(self._uid), bool)
+            try:
+                for frame in frames_until(self._reader, time_is_over):
+                    loads = self.source.loads(frame)
+                    self._session.take(frame.acquired_ns, loads, source.newest())
+                    felt |= loads > 0
+            finally:
+                self._save()
+            if not felt.any():
+                cli.warn(f"no sensor felt {weight_n:g} N: it does not count")
+            elif not self._as_json:
+                echo(f"{weight_n:g} N: {plural(int(felt.sum()), 'sensor')} felt it")
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        """Say on Ctrl-C where the gathered data are."""
+        try:
+            yield
         except KeyboardInterrupt:
             if self._as_json:
                 print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})

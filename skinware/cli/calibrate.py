@@ -31,7 +31,7 @@ _PUSH = "press the skin through the reference, with forces that rise, rest and f
 _PRESS = "press the skin at known places; hold each for a moment"
 
 
-_output = cli.output_option("File to write.", name="file", metavar="GEOMETRY", required=True)
+_output = cli.output_option("File to write.", name="file", metavar="FILE", required=True)
 _pitch = click.option(
     "--pitch",
     "pitch_m",
@@ -52,9 +52,7 @@ _gathering = cli.options(
         help="Stop when this part of the sensors has enough.",
     ),
     cli.duration_option("Gather for SECONDS at most; 0: use the state file as it is."),
-    click.option(
-        "--state", metavar="FILE", type=cli.FILE, help="File of gathered data.  [default: GEOMETRY.state.npz]"
-    ),
+    click.option("--state", metavar="FILE", type=cli.FILE, help="File of gathered data.  [default: output.state.npz]"),
     click.option("--fresh", is_flag=True, help="Begin with nothing, and ignore that file."),
     cli.namespace_option,
     cli.json_option,
@@ -329,9 +327,7 @@ def force(
     with _opened(file, ForceSession, how, where) as (gathering, session):
         source = gathering.poses = ForceSource(gathering.source, gathering.poses)
         for weight_n in newtons:
-            click.pause(f"lay {weight_n:g} N on the skin, and press Enter ...", err=True)
-            source.weight_n = weight_n
-            gathering.run(f"{weight_n:g} N for {weight_s:g} s", 2.0, weight_s)
+            gathering.weigh(weight_n, weight_s, source)
         if not newtons:
             gathering.run(_PUSH, how.share, how.duration_s)
         structure, type_name = gathering.structure, gathering.type_name

@@ -305,3 +305,11 @@ def test_forces_from_gathered_frames(tmp_path: Path, capsys: pytest.CaptureFixtu
     general, *own = read_curves(file)
     assert (general.unit, general.uid, len(own)) == ("N", None, 4)
     assert np.interp(40, general.x, general.y) == pytest.approx(1, rel=0.1)
+
+
+def test_a_weight_that_no_sensor_feels_does_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with publishing(calm_skin(triangles(1))):
+        weights = ["force", "-o", str(tmp_path / "curves.toml"), "--newtons", "1", "--weight-s", "0.5"]
+        assert exit_status(command, weights) == 2
+    said = capsys.readouterr().err
+    assert said.index("lay 1 N on the skin") < said.index("no sensor felt 1 N") < said.index("0 frames with a load")

@@ -97,6 +97,19 @@ def test_forces_that_do_not_follow_the_reference_are_doubted() -> None:
     assert doubt.startswith("it misses the reference by ")
 
 
+def test_a_few_weights_give_curves_and_are_doubted() -> None:
+    """Taxels that are always pressed together have any gains that fit: none of them falls."""
+    weight_n = np.repeat([1.0, 3.0, 6.0], 100)
+    time_s = np.arange(300) / RATE_HZ + 20 * np.repeat([0, 1, 2], 100)
+    random = np.random.default_rng(1)
+    load = np.rint(np.outer(weight_n, [20, 19, 1, 2]) + random.standard_normal((300, 4))).clip(0)
+    fit = fit_force(ForceData(time_s, load, weight_n, np.full(300, np.nan)))
+    assert len(fit.curves(UID)) == 1 + TAXELS
+    assert np.nanmin(fit.gain) >= 0.1
+    assert fit.presses == 3
+    assert any(doubt.startswith("3 presses") for doubt in fit.doubts)
+
+
 def test_beyond_the_knots_the_uncertainty_is_not_known() -> None:
     table = CurveTable(fit_force(pressed(1, 120.0)).curves(UID), "pressure", UID)
     values = np.array([10, 10, 10, 1e4], np.float32)

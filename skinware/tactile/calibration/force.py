@@ -27,8 +27,12 @@ _CREEPS_S = (3.0, 10.0, 30.0, 100.0)
 _PARTS = 10
 """Parts of the frames that are left out in turn, for the uncertainty."""
 _GAIN_SPREAD = 0.3
+_LEAST_GAIN = 0.1
+"""Taxels that are always pressed together may have any gains that fit, even below 0."""
 _ROUNDS = 4
 _LEAST_FRAMES = 200
+_FEW_PRESSES, _APART_S = 8, 0.3
+"""Presses that a fit needs to be trusted, and seconds without any load between two."""
 _LEAST_WARMTH_K = 2.0
 """Kelvin by which the temperature must change, or its influence is not known."""
 _LEAST_SHARE = 0.1
@@ -64,6 +68,7 @@ class ForceFit:
         reach_n: the largest force of the reference, N.
         hysteresis: the largest part of the range by which rising and falling load differ.
         held: share of the frames, unseen by the fit, whose error is within 1.96 standard deviations.
+        presses: number of presses that were apart in time.
     """
 
     curve: Curve
@@ -72,6 +77,7 @@ class ForceFit:
     reach_n: float
     hysteresis: float
     held: float
+    presses: int
 
     @property
     def doubts(self) -> list[str]:
@@ -81,6 +87,8 @@ class ForceFit:
             doubts.append(f"it misses the reference by {100 * self.residual_n / self.reach_n:.0f} % of its range")
         if not 0.9 <= self.held <= 0.98:
             doubts.append(f"its intervals hold {100 * self.held:.0f} % instead of 95 %")
+        if self.presses < _FEW_PRESSES:
+            doubts.append(f"{self.presses} presses do not show its errors, nor how they differ: give {_FEW_PRESSES}")
         return doubts
 
     def curves(self, uid: npt.NDArray[np.uint64]) -> tuple[Curve, ...]:
@@ -118,7 +126,8 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
     ones = np.ones(len(pressed))
     best = min(problems, key=lambda problem: problem.cost(problem.weights(ones), ones))
     gain, weights = best.solve(best.every)
-    error, residual, held = _errors(best)
+    presses = 1 + int((np.diff(data.time_s[used]) > _APART_S).sum())
+    error, residual, held = _errors(best, presses)
     reach, y = float(data.force_n[used].max()), np.append(0, np.cumsum(weights[: len(knots) - 1] * np.diff(knots)))
     lag, creep, by_warmth = weights[len(knots) - 1 :]
     curve = Curve(
@@ -138,7 +147,7 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
     )
     of_all = np.full(data.load.shape[1], np.nan)
     of_all[pressed] = gain
-    return ForceFit(curve, of_all, residual, reach, curve.hysteresis or 0.0, held)
+    return ForceFit(curve, of_all, residual, reach, curve.hysteresis or 0.0, held, presses)
 
 
 def _lived(time_s: ArrayF, load: ArrayF, play: float, creep_s: float) -> ArrayF:
@@ -201,11 +210,12 @@ class _Trial:
             left = self.force_n[rows] - each @ gain
             ridge = float((left**2).mean()) / _GAIN_SPREAD**2 * np.eye(len(gain))
             gain = np.linalg.solve(each.T @ each + ridge, each.T @ self.force_n[rows] + ridge.sum(axis=1))
+            gain = np.clip(gain, _LEAST_GAIN, 1 / _LEAST_GAIN)
             weights = self.weights(gain, rows)
         return gain, weights
 
 
-def _errors(problem: _Trial) -> tuple[tuple[float, float], float, float]:
+def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, float]:
     """Standard deviation of a taxel at 0 N and its growth with the force; the whole residual; the share that it holds.
 
     Deviations of the taxels of a contact add up to the deviation of its force.
@@ -221,7 +231,6 @@ def _errors(problem: _Trial) -> tuple[tuple[float, float], float, float]:
     slopes = np.maximum(np.linalg.lstsq(terms, left, rcond=None)[0], 0)
     slopes[0] = max(slopes[0], _LEAST_SHARE * float(left.mean() / problem.number.mean()))
     deviation = terms @ slopes
-    presses = 1 + int((np.diff((problem.force_n > problem.force_n.mean() / 2).astype(int)) > 0).sum())
     level = min(0.95 + math.sqrt(0.05 * 0.95 / presses) / 2, 0.99)  # the fewer presses, the less sure is a quantile
     scale = float(np.quantile(left[::2] / deviation[::2], level)) / 1.96
     held = float((left[1::2] <= 1.96 * scale * deviation[1::2]).mean())

@@ -119,12 +119,12 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
         found = topology_of(session.sums, pitch_m)
         groups = unrolled_groups(gathering.structure, gathering.type_name, found)
         file.write_text(geometry_to_toml(groups, unrolled_comment(found)), encoding="utf-8")
-    pieces = np.bincount(found.piece[found.piece >= 0]).tolist()
-    say(
-        how.as_json,
-        {"event": "done", "file": str(file), "placed": sum(pieces), "pieces": pieces, "neighbours": len(found.pairs)},
-        f"{file}: {sum(pieces)} sensors in {plural(len(pieces), 'piece')}, {len(found.pairs)} pairs of neighbours",
-    )
+    pieces, placed = np.bincount(found.piece[found.piece >= 0]).tolist(), int(found.linked.sum())
+    loose = sum(pieces) - placed
+    words = f"{file}: {placed} sensors in {plural(len(pieces), 'piece')}, {len(found.pairs)} pairs of neighbours"
+    words += f"; {loose} not placed: stroke from the rest of their piece to them and back" if loose else ""
+    done = {"placed": placed, "loose": loose, "pieces": pieces, "neighbours": len(found.pairs)}
+    say(how.as_json, {"event": "done", "file": str(file), **done}, words)
 
 
 @command.command(

@@ -9,6 +9,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.calibration.checking import Finding, check_file, check_strokes
+from skinware.tactile.calibration.results import unrolled_comment
 from skinware.tactile.calibration.shapes import rigid
 from skinware.tactile.calibration.topology import MOST_TAXELS, StrokeSums, Topology, topology_of, unrolled_m
 from skinware.tactile.testing import Surface, arm, triangles
@@ -96,6 +97,20 @@ def test_without_strokes_there_is_nothing() -> None:
     assert topology.piece.tolist() == [-1] * 5
     with pytest.raises(ConfigurationError, match="at most"):
         StrokeSums.empty(MOST_TAXELS + 1)
+
+
+def test_parts_that_were_hardly_felt_together_are_not_put_anywhere() -> None:
+    """Two rows of a piece that a single weak touch joins: how far they are apart is not known."""
+    sums = StrokeSums.empty(9)
+    at = np.concatenate([np.arange(5), 20 + np.arange(4)])
+    for middle in np.linspace(-1, 25, 400):
+        sums.add(np.where(abs(at - middle) < 2, 50 * np.exp(-((at - middle) ** 2) / 2), 0))
+    sums.add(np.array([0, 0, 0, 0, 35.0, 35.0, 0, 0, 0]))
+    topology = topology_of(sums)
+    assert topology.piece.tolist() == [0] * 9
+    assert topology.linked.tolist() == [True] * 5 + [False] * 4
+    assert "Not placed: 4 that were hardly felt together" in unrolled_comment(topology)
+    assert np.isfinite(unrolled_m(topology, np.arange(5))).all()
 
 
 def checked(surface: Surface, said: np.ndarray, topology: Topology) -> list[Finding]:

@@ -63,13 +63,14 @@ def unrolled_groups(structure: Structure, type_name: str, topology: Topology) ->
     """
     groups: list[GeometryGroup] = []
     for piece in range(topology.n_pieces):
-        taxels = np.flatnonzero(topology.piece == piece)
+        is_known = (topology.piece == piece) & topology.linked
+        taxels = np.flatnonzero(is_known)
         position = np.full((len(topology.piece), 3), np.nan)
         position[taxels, :2], position[taxels, 2] = unrolled_m(topology, taxels), 0
         normal = np.full_like(position, np.nan)
         groups += [
             _group(structure, type_name, module, rows, position, normal, f"piece {piece + 1}")
-            for module, rows in _by_module(structure, type_name, topology.piece == piece)
+            for module, rows in _by_module(structure, type_name, is_known)
         ]
     return groups
 
@@ -94,11 +95,12 @@ def placed_comment(structure: Structure, type_name: str, placement: Placement) -
 def unrolled_comment(topology: Topology) -> str:
     """Return the contents of a file of maps in words."""
     sizes = ", ".join(str(int((topology.piece == piece).sum())) for piece in range(topology.n_pieces))
-    lost = int((topology.piece < 0).sum())
+    lost, loose = int((topology.piece < 0).sum()), int(((topology.piece >= 0) & ~topology.linked).sum())
     return (
         "Found by stroking alone: each piece of skin is unrolled onto a plane of its own, and may be mirrored.\n"
         f"Pieces: {topology.n_pieces}, of {sizes or 'no'} sensors; not known: {lost};"
         f" neighbours: {len(topology.pairs)} pairs"
+        + (f"\nNot placed: {loose} that were hardly felt together with the rest of their piece" if loose else "")
     )
 
 

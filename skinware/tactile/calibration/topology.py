@@ -107,11 +107,14 @@ class Topology:
         pairs: (k, 2) int64, neighbours, the lower number first.
         distance_m: (n, n), m, straight distances of pairs that are near enough; inf of all others.
         piece: (n,) int64, the piece of skin of each, from the largest, 0; -1: touched too little.
+        linked: (n,) bool, which are in the largest part of their piece that measured distances link; too little was
+            felt between this part and the others of the piece to say where they are.
     """
 
     pairs: ArrayI
     distance_m: ArrayF
     piece: ArrayI
+    linked: npt.NDArray[np.bool_]
 
     @property
     def n_pieces(self) -> int:
@@ -145,7 +148,14 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
     component, _ = Components(n, neighbours_of_pairs(near, n)).of(rows)
     _, number, size = np.unique(component, return_inverse=True, return_counts=True)
     piece[rows] = np.argsort(np.argsort(-size, kind="stable"))[number]
-    return Topology(np.column_stack([one, other]), distance, piece)
+    measured = np.column_stack(np.nonzero(np.triu(np.isfinite(distance))))
+    part, _ = Components(n, neighbours_of_pairs(measured, n)).of(rows)
+    _, part, size = np.unique(part, return_inverse=True, return_counts=True)
+    linked = np.zeros(n, bool)
+    for number in range(int(piece.max(initial=-1)) + 1):
+        own = np.flatnonzero(piece[rows] == number)
+        linked[rows[own]] = part[own] == part[own][np.argmax(size[part[own]])]
+    return Topology(np.column_stack([one, other]), distance, piece, linked)
 
 
 def _scale(far: ArrayF, pitch_m: float) -> float:
@@ -181,12 +191,11 @@ def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
 
     Args:
         topology: their topology.
-        taxels: (k,) taxels of one piece.
+        taxels: (k,) linked taxels of one piece.
     """
     ways = topology.geodesics_m(taxels)
     if len(taxels) == 1:
         return np.zeros((1, 2))
-    ways[~np.isfinite(ways)] = ways[np.isfinite(ways)].max()
     places = _scaled(ways)
     measured = np.isfinite(topology.distance_m[np.ix_(taxels, taxels)])
     typical = float(np.median(ways[measured])) if measured.any() else 1.0

@@ -136,7 +136,7 @@ def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[st
         (["-n", "0"], 2, "-n"),
         (["--rate", "0", "here"], 2, "rate of 0.0 Hz"),
         (["--rate", "nan", "here"], 2, "rate of nan Hz"),
-        (["--type", "presure", "here"], 2, "it has: pressure, temperature"),
+        (["--type", "presure", "here"], 2, "There are: pressure, temperature"),
         (["contacts"], 1, "'contacts' is not a driver"),
     ],
 )

@@ -131,6 +131,16 @@ def test_files_and_folders_that_a_page_names_exist(page: str) -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
+def test_files_that_the_comments_of_c_code_name_exist() -> None:
+    modules = "".join(f"/{path}\n" for path in ROOT.rglob("*.py") if ".venv" not in path.parts)
+    named = {
+        (source.name, name)
+        for source in (*ROOT.glob("skinware*/native/*.[ch]"), *ROOT.glob("skinware*/include/*.h"))
+        for name in re.findall(r"[\w/]+\.py\b", source.read_text())
+    }
+    assert [(source, name) for source, name in sorted(named) if f"/{name}\n" not in modules] == []
+
+
 def fenced(page: Path, language: str) -> list[str]:
     """The text of every block of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)

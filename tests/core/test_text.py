@@ -3,12 +3,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from skinware.text import age_text, count_text, nearest_name, plural, rate_text, table, wrapped
-
-
-def test_an_unknown_name_is_answered_with_those_there_are() -> None:
-    assert nearest_name("arn", ["leg", "arm", "leg"]) == "; did you mean 'arm'? There are: leg, arm"
-    assert nearest_name("x", []) == "; there are: none"
+from skinware.text import age_text, count_text, plural, rate_text, table, wrapped
 
 
 @pytest.mark.parametrize(

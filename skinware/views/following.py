@@ -18,6 +18,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
+from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
 from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
@@ -89,15 +90,6 @@ class Newest:
         structure = self.frame.structure
         module = structure.sensor_module[quantity.where]
         return np.bincount(module, loads, structure.n_modules).astype(np.float64)
-
-    def contact_of(self, quantity: Quantity) -> npt.NDArray[np.int16] | None:
-        """Return (n,) int16, row of the contact of each sensor, negative without one; None without contacts."""
-        sample = self.contacts
-        if sample is None or sample.source.type_name != quantity.type.name:
-            return None
-        if not np.array_equal(sample.source.uid, self.frame.structure.sensor_uid[quantity.where]):
-            return None
-        return sample.contacts.contact_of
 
 
 class ShownDriver:
@@ -221,6 +213,10 @@ class Follower:
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
+
+    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
+        """Return the reader of the service of contacts on a driver."""
+        return self._services.contacts_reader(driver)
 
     def take(self, period_ns: int) -> list[ShownDriver]:
         """Take newer snapshots without waiting.

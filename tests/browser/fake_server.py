@@ -304,10 +304,12 @@ class FakeServer:
                 for i in range(driver.n)
             ]
             return {"names": {"driver": op["driver"], "type": op["type"], "of": names}}
-        if op["op"] == "series":
-            t = np.linspace(-10, 0, 500, dtype=np.float32)
-            value = (40 + 30 * np.sin(t + op["position"]) ** 8 + 1.5 * np.sin(37 * t)).astype(np.float32)
-            return {"series": {"driver": op["driver"], "position": op["position"], "time_s": t, "value": value}}
+        if op["op"] == "plot":
+            t = np.linspace(-10, 0, 500)
+            value = np.repeat(40 + 30 * np.sin(t) ** 8 + 1.5 * np.sin(37 * t), len(op["lines"]))
+            time_ns = MONOTONIC_NS + time.monotonic_ns() + (1e9 * t).astype(np.int64)
+            block = {"number": op["number"], "of": "driver", "lines": list(range(len(op["lines"])))}
+            return {"plots": {"missed": 0, "blocks": [block | {"time_ns": time_ns, "values": value}]}}
         return {}
 
     def _exact(self, number: int, position: int) -> Header:

@@ -49,8 +49,12 @@ export class Tree {
   #folded = new Map(); // key -> bool, where a person said so
   #shown = [];
 
-  /** @param {(row: ?object) => void} choose called with the row that is clicked; null if it was selected already. */
-  constructor(host, choose) {
+  /**
+   * @param {(row: ?object) => void} choose called with the row that is clicked; null if it was selected already.
+   * @param {(element: HTMLElement, find: () => object) => void} equip called with each new element.
+   */
+  constructor(host, choose, equip = () => {}) {
+    this.equip = equip;
     this.host = host;
     this.choose = choose;
     this.selected = null;
@@ -111,6 +115,7 @@ export class Tree {
       if (row.level > 2) element.dataset.patch = row.name;
       element.addEventListener("click", (event) => this.#click(element.dataset.key, event.target));
       this.#rows.set(row.key, element);
+      this.equip(element, () => this.find(element.dataset.key));
     }
     const [fold, sign, name, state, figures] = element.children;
     const own = badness(row.report.state);

@@ -104,12 +104,14 @@ class ShownDriver:
         newest: its newest snapshot; None before the first.
         status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
+        since_ns: when each of its problems was first seen, by what it is; see :func:`skinware.views.tree.problems_of`.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
         self.number, self.live, self.namespace = number, live, namespace
         self.life = STARTING
         self.changes = 0
+        self.since_ns: dict[tuple[object, ...], int] = {}
         self.taken_ns = self._judged_ns = 0
         self._calm_pair: tuple[Structure | None, Structure | None, bool] = (None, None, False)
         self.newest: Newest | None = None

@@ -21,9 +21,10 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.views import looks
 from skinware.views.access import Access, AccessRefused
+from skinware.views.advice import DoctorProgram
 from skinware.views.following import Follower
 from skinware.views.recording import RecordingProgram, ReplayControl
-from skinware.views.tree import problem_of_all
+from skinware.views.tree import NOTE, problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
 PAGE = Path(__file__).parent / "page"
@@ -53,13 +54,20 @@ class ViewServer:
     Args:
         follower: of the drivers; used in the event loop's thread only.
         recording: that viewers may begin and end; None: they may not record.
+        doctor: that is asked for advice; None: without it.
     """
 
     def __init__(
-        self, follower: Follower, access: Access, recording: RecordingProgram | None = None, page: Path = PAGE
+        self,
+        follower: Follower,
+        access: Access,
+        recording: RecordingProgram | None = None,
+        page: Path = PAGE,
+        doctor: DoctorProgram | None = None,
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._replay = ReplayControl()
+        self._doctor = doctor or DoctorProgram((), follower.namespace.name)
         self._viewers: set[Viewer] = set()
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._news = asyncio.Event()
@@ -94,6 +102,8 @@ class ViewServer:
                 for viewer in self._viewers:
                     viewer.plots.take()
                 self._replay.follow(self._follower.drivers)
+                problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
+                self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 self._wake()
             await asyncio.sleep(_TICK_S)
 
@@ -103,6 +113,7 @@ class ViewServer:
             self._server.close()
             with contextlib.suppress(TimeoutError):  # of connections that stay silent
                 await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
+        await self._doctor.close()
         if self._recording is not None:
             await self._recording.close()
 
@@ -219,6 +230,7 @@ class ViewServer:
 
     def _besides(self) -> dict[str, Any]:
         besides: dict[str, Any] = {"recording": None, "replay": self._replay.state, "marks": list(self._marks)}
+        besides["findings"] = self._doctor.findings
         if self._recording is not None:
             besides["recording"] = self._recording.state
             if self._recording.problem is not None:

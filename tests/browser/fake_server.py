@@ -219,6 +219,7 @@ class FakeServer:
         self.muted = False
         self.links: list[Header] = []
         self.names: list[str] = []
+        self.findings: list[Header] = []
         self.files: dict[str, bytes] = {}
         self._server = serve(
             self._talk, "127.0.0.1", port, process_request=self._file, compression=None, ping_interval=None
@@ -282,6 +283,7 @@ class FakeServer:
                         "problems": [p for d in self.drivers for p in d.problems],
                         "recording": self.extra.get("recording"),
                         "replay": self.extra.get("replay"),
+                        "findings": self.findings,
                     }
                 header.update({k: v for k, v in self.extra.items() if k not in ("recording", "replay")})
                 header.update(answers)

@@ -10,6 +10,7 @@ import pytest
 
 from skinware import Namespace, Status
 from skinware.geometry import Geometry
+from skinware.realtime import now_ns
 from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import history
@@ -280,6 +281,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         stale = next(problem for problem in page.state["problems"] if problem["text"].startswith("board 10 is stale"))
         assert (stale["bus"], stale["patch"]) == ("can1", "board 10")
         lost = next(problem for problem in page.state["problems"] if "frames dropped" in problem["text"])
-        assert set(lost) == {"severity", "driver", "text"}  # of none alone
+        assert set(lost) == {"severity", "driver", "text", "since_ns"}  # of none alone
+        assert 0 < int(lost["since_ns"]) <= now_ns()
         assert (page.state["recording"], page.state["replay"]) == (None, None)
         assert json.dumps(page.state)

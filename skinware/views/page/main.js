@@ -19,7 +19,7 @@ import { pick } from "./picking.js";
 import { Plotting } from "./plotting.js";
 import { savePicture, showRecording } from "./keeping.js";
 import { Probes } from "./probes.js";
-import { Problems } from "./problems.js";
+import { explained, Problems } from "./problems.js";
 import { sheetsOf, taxelsOf, typesOf, whyEmpty } from "./selection.js";
 import { Skin } from "./skin.js";
 import { Stage } from "./stage.js";
@@ -178,16 +178,18 @@ function restructured() {
 
 function takeState(state) {
   for (const driver of state.drivers ?? []) states.set(driver.id, driver);
-  now.problems = (state.problems ?? []).map(({ severity, driver, bus, patch, text }) => {
+  const seen = (state.problems ?? []).map(({ severity, driver, bus, patch, text, since_ns }) => {
     const { name = driver, key = null } = skin.drivers.get(driver) ?? {};
     const named = name === null || name === undefined ? text : `${name}: ${text}`;
-    return { severity, text: named, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    const place = { driver: name, bus, patch, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    return { severity, text: named, since_ns: since_ns && Number(since_ns), ...place };
   });
+  now.problems = explained(seen, state.findings ?? []);
   if (now.recording && !state.recording) notify(`The recording is in ${now.recording.file}`);
   now.recording = state.recording ?? null;
   plotting.takeState(state);
   tree.update(skin, states);
-  list.update(now.problems);
+  list.update(now.problems, plotting.now_ns);
   replay.update(state.replay);
   showRecording(byId("record"), now.recording);
 }

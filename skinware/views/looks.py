@@ -114,12 +114,6 @@ class QuantityPicture(NamedTuple):
     """The shear that 127 means."""
 
 
-class Wiped(NamedTuple):
-    touched: int
-    of: int
-    running: bool
-
-
 class Look:
     """The choices of one viewer, and what its pictures remember from snapshot to snapshot.
 
@@ -200,21 +194,6 @@ class Look:
             levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
         shear, longest = _shear(newest, quantity, memory)
         return QuantityPicture(quantity, levels, scale, shear, longest)
-
-    def wiped(self, drivers: list[ShownDriver]) -> Wiped | None:
-        """Return the progress of the wipe test; None without one."""
-        if self.mode != "wipe":
-            return None
-        touched = n = 0
-        for driver in drivers:
-            quantity = self.quantity_of(driver)
-            if quantity is None:
-                continue
-            n += len(quantity)
-            memory, name = self._memory_of(driver), quantity.type.name
-            if memory.wipe is not None:
-                touched += len(quantity) - len(memory.wipe.never_moved(name, memory.rest.noise(name)))
-        return Wiped(touched, n, self._wiping)
 
     def _memory_of(self, driver: ShownDriver) -> Memory:
         memory = self._memories.get(driver.number)

@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.tactile.motion_service import MotionSample
 from skinware.views import looks
-from skinware.views.following import Follower, ShownDriver
+from skinware.views.following import Follower, Newest, ShownDriver
 from skinware.views.live import places_of
+from skinware.views.quantities import Quantity
 from skinware.views.scene import Scene
 from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
 
@@ -140,6 +142,7 @@ class Viewer:
         return {
             "protocol": PROTOCOL,
             "namespaces": [namespace.name for namespace in namespaces],
+            "names": list(follower.names),
             "drivers": [_driver(driver, scene, blobs) for driver in follower.drivers],
             "links": [
                 {
@@ -163,11 +166,6 @@ class Viewer:
             return
         header["pictures"] = pictures
         header["mode"] = self.look.mode
-        header["contacts"] = [one for driver in self._follower.drivers for one in self._contacts(driver)]
-        header["regions"] = [one for driver in self._follower.drivers for one in _regions(driver)]
-        wiped = self.look.wiped(self._follower.drivers)
-        if wiped is not None:
-            header["wipe"] = wiped._asdict()
 
     def _picture(self, driver: ShownDriver, blobs: Blobs) -> dict[str, Any] | None:
         picture, newest = self.look.picture(driver), driver.newest
@@ -183,6 +181,8 @@ class Viewer:
             "scale": picture.scale,
             "unit": quantity.type.unit,
             "levels": blobs.add(picture.levels, "u1"),
+            "contacts": self._contacts(driver, quantity, newest),
+            "regions": [] if newest.motion is None else _regions(newest.motion),
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
@@ -199,10 +199,9 @@ class Viewer:
             shown["status"] = blobs.add(status, "u1")
         return shown
 
-    def _contacts(self, driver: ShownDriver) -> list[dict[str, Any]]:
-        quantity, newest = self.look.quantity_of(driver), driver.newest
-        frame = None if newest is None else newest.contacts
-        if quantity is None or frame is None or frame.source.type_name != quantity.type.name:
+    def _contacts(self, driver: ShownDriver, quantity: Quantity, newest: Newest) -> list[dict[str, Any]]:
+        frame = newest.contacts
+        if frame is None or frame.source.type_name != quantity.type.name:
             return []
         laid_out = self._follower.scene.of(driver.name, quantity.name).position
         contacts = []
@@ -214,7 +213,6 @@ class Viewer:
             contacts.append(
                 {
                     "id": contact.id,
-                    "driver": driver.number,
                     "sensor": sensor,
                     "kind": contact.kind.name.lower(),
                     "position": position.tolist(),
@@ -272,14 +270,10 @@ class Viewer:
         return {"drivers": drivers, "problems": worst_first(problems)}
 
 
-def _regions(driver: ShownDriver) -> list[dict[str, Any]]:
-    motion = None if driver.newest is None else driver.newest.motion
-    if motion is None:
-        return []
+def _regions(motion: MotionSample) -> list[dict[str, Any]]:
     return [
         {
             "name": region.name,
-            "driver": driver.number,
             "value": region.load,
             "unit": motion.source.unit,
             "touched": region.contacts > 0,
@@ -306,6 +300,7 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "offset": quantity.type.offset,
                 "minimum": quantity.type.minimum,
                 "maximum": quantity.type.maximum,
+                "touch": quantity.is_touch,
                 "n": len(quantity),
                 "index": blobs.add(index, "<u4"),
                 "uid": blobs.add(structure.sensor_uid[index], "<u8"),

@@ -193,16 +193,15 @@ def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch
         page.say("tare")
         page.pull_picture(condition=lambda picture: not picture["levels"].any())
         page.say("look", mode="wipe")
-        turn = page.pull_until(lambda turn: "wipe" in turn)
-        assert turn["wipe"] == {"touched": 0, "of": 20, "running": True}
+        page.pull_until(lambda turn: turn.header.get("mode") == "wipe")
+        assert not page.pull_picture()["levels"].any()
         skin.values = touched
-        turn = page.pull_until(lambda turn: turn.header.get("wipe", {}).get("touched"))
-        assert turn["wipe"] == {"touched": 4, "of": 20, "running": True}
+        page.pull_picture(condition=lambda picture: picture["levels"].any())
         skin.values = np.full(24, 240)
         picture = page.pull_picture()
         assert np.flatnonzero(picture["levels"] == 250).tolist() == [4, 5, 6, 7]
         page.say("wipe", action="start")
-        page.pull_until(lambda turn: turn.header.get("wipe") == {"touched": 0, "of": 20, "running": True})
+        page.pull_picture(condition=lambda picture: not picture["levels"].any())
 
 
 def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace) -> None:
@@ -228,9 +227,8 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         value[[2, 3]] = 60
         contacts.publish(value, value > 0, 10**9)
         page.say("look", mode="change")
-        turn = page.pull_until(lambda turn: turn.header.get("contacts"))
-        (contact,) = turn["contacts"]
-        assert (contact["driver"], contact["taxels"], contact["kind"]) == (0, 2, "touch")
+        (contact,) = page.pull_picture(condition=lambda picture: picture["contacts"])["contacts"]
+        assert (contact["taxels"], contact["kind"]) == (2, "touch")
         assert contact["load"] == pytest.approx(120)
         middle = geometry.position_m[[2, 3]].mean(axis=0) + np.array([1, 2, 3])
         assert contact["position"] == pytest.approx(middle.tolist(), abs=1e-6)
@@ -240,6 +238,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         assert picture["totals"].tolist() == [120, 0]  # by module
         assert page.status[0, "pressure"][9] & Status.UNHEALTHY
         assert types(page)["pressure"]["placed"]
+        assert {name: told["touch"] for name, told in types(page).items()} == {"pressure": True, "temperature": False}
 
 
 def test_shear_is_how_far_two_axes_are_from_rest(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:

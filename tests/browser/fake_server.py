@@ -219,6 +219,7 @@ class FakeServer:
         self.muted = False
         self.links: list[Header] = []
         self.names: list[str] = []
+        self.findings: list[Header] = []
         self.files: dict[str, bytes] = {}
         self._server = serve(
             self._talk, "127.0.0.1", port, process_request=self._file, compression=None, ping_interval=None
@@ -282,6 +283,7 @@ class FakeServer:
                         "problems": [p for d in self.drivers for p in d.problems],
                         "recording": self.extra.get("recording"),
                         "replay": self.extra.get("replay"),
+                        "findings": self.findings,
                     }
                 header.update({k: v for k, v in self.extra.items() if k not in ("recording", "replay")})
                 header.update(answers)
@@ -304,10 +306,12 @@ class FakeServer:
                 for i in range(driver.n)
             ]
             return {"names": {"driver": op["driver"], "type": op["type"], "of": names}}
-        if op["op"] == "series":
-            t = np.linspace(-10, 0, 500, dtype=np.float32)
-            value = (40 + 30 * np.sin(t + op["position"]) ** 8 + 1.5 * np.sin(37 * t)).astype(np.float32)
-            return {"series": {"driver": op["driver"], "position": op["position"], "time_s": t, "value": value}}
+        if op["op"] == "plot":
+            t = np.linspace(-10, 0, 500)
+            value = np.repeat(40 + 30 * np.sin(t) ** 8 + 1.5 * np.sin(37 * t), len(op["lines"]))
+            time_ns = MONOTONIC_NS + time.monotonic_ns() + (1e9 * t).astype(np.int64)
+            block = {"number": op["number"], "of": "driver", "lines": list(range(len(op["lines"])))}
+            return {"plots": {"missed": 0, "blocks": [block | {"time_ns": time_ns, "values": value}]}}
         return {}
 
     def _exact(self, number: int, position: int) -> Header:

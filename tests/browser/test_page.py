@@ -113,8 +113,8 @@ def test_taxels_are_read_and_pinned_without_a_mouse(page: Page, server: FakeServ
     page.keyboard.press("p")
     until(page, "skin.pins.join() === '0,1'")
     assert asked(server, "exact")[-1]["sensors"] == [[0, 1]]
-    wait_until(lambda: {"op": "series", "driver": 0, "position": 1} in server.ops)
-    until(page, "document.querySelector('[data-role=pin] polyline').getAttribute('points')")
+    wait_until(lambda: {"driver": 0, "position": 1} in asked(server, "plot")[-1]["lines"])
+    until(page, "document.querySelector('[data-role=pin] path').getAttribute('d')")
     page.keyboard.press("Escape")
     until(page, "!skin.pins.length && skin.hovered === null")
     wait_until(lambda: asked(server, "exact")[-1]["sensors"] == [])

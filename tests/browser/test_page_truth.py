@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from tests.browser.browsing import tell, until
-from tests.browser.fake_server import FakeDriver, FakeServer
+from skinware import PatchState, Status
+from tests.browser.browsing import PATIENCE_MS, tell, until
+from tests.browser.fake_server import MONOTONIC_NS, FakeDriver, FakeServer
+from tests.browser.sleeve import Sleeve
 
 OpenPage = Callable[..., Page]
 OPTIONS = "[...document.querySelectorAll('#types option')].map(option => option.text)"
@@ -125,3 +128,56 @@ def test_a_wipe_test_is_of_what_is_selected_and_of_touch(page: Page, server: Fak
     page.keyboard.press("Escape")
     choose(page, "default/warm")
     until(page, f"({EMPTY}).includes('nothing to wipe over') && skin.wipe.of === 0")
+
+
+def test_a_problem_says_since_when_and_what_helps(page: Page, server: FakeServer, sheet: FakeDriver) -> None:
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    since_ns = str(MONOTONIC_NS + time.monotonic_ns() - 3600 * 10**9)
+    place = {"driver": 0, "bus": "can0", "patch": "board 9"}
+    sheet.problems = [{"severity": "warning", "text": "board 9 is stale", "since_ns": since_ns} | place]
+    finding = {"severity": "warning", "where": "driver sheet, bus can0, board 9", "what": "a board is silent"}
+    advice = {"evidence": "newest data 3.2 s old", "action": "check its cable", "commands": ["skin-top sheet"]}
+    other = {
+        "severity": "error",
+        "where": "permissions",
+        "what": "no rights",
+        "evidence": "",
+        "action": "",
+        "commands": [],
+    }
+    server.findings = [finding | advice, other, other | {"severity": "note", "what": "no trouble"}]
+    problems = page.locator("[data-role=problems]")
+    until(page, "skin.problems.join() === 'permissions: no rights,sheet: board 9 is stale'")
+    until(page, "document.getElementById('problems').innerText.includes('for 60 min')")
+    problems.get_by_text("What to do").last.click()
+    for text in ("a board is silent: newest data 3.2 s old", "check its cable", "skin-top sheet"):
+        assert text in problems.inner_text()
+    problems.get_by_role("button", name="Copy skin-top sheet").click()
+    until(page, "document.getElementById('problems').innerText.includes('Copied')")
+    assert tell(page, "navigator.clipboard.readText()") == "skin-top sheet"
+    assert "no trouble" not in problems.inner_text()
+
+
+def test_only_what_is_fresh_is_green_and_a_dead_driver_is_one_line(page: Page, sheet: FakeDriver) -> None:
+    green = """[...document.querySelectorAll('[data-role=row]')].filter(row => {
+        const [r, g, b] = getComputedStyle(row.querySelector('.sign')).color.match(/[0-9]+/g).map(Number);
+        return g > r + 40 && g > b + 40;
+    }).map(row => row.dataset.key.split('/').slice(1).join('/'))"""
+    until(page, f"({green}).filter(key => key.startsWith('sheet')).length === 4")
+    sheet.status[45] = 64  # suspect
+    until(page, f"({green}).filter(key => key.startsWith('sheet')).join() === 'sheet/can0/board 8'")
+    sheet.state = "dead"
+    rows = "[...document.querySelectorAll('[data-role=row]')].map(row => row.dataset.key)"
+    until(page, f"({rows}).filter(key => key.startsWith('default/sheet')).join() === 'default/sheet'")
+    page.locator("[data-role=row][data-key='default/sheet'] .fold").click()
+    until(page, f"({rows}).filter(key => key.startsWith('default/sheet')).length === 4")
+
+
+def test_the_doctor_is_asked_about_a_problem(sleeve: Sleeve, address: str, open_page: OpenPage) -> None:
+    sleeve.patch_state[2] = PatchState.STALE
+    sleeve.status[sleeve.structure.patch_index(2)] = Status.STALE
+    page = open_page(f"{address}#names=0")
+    until(page, "document.querySelector('#problems code')?.textContent.startsWith('skin-')", within_ms=4 * PATIENCE_MS)
+    sleeve.patch_state[2] = PatchState.LIVE
+    sleeve.status[:] = 0
+    until(page, "!document.querySelector('#problems code') && document.getElementById('problems').hidden")

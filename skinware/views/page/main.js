@@ -13,12 +13,13 @@ import { fillHelp, onKeys } from "./keys.js";
 import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
-import { Names } from "./names.js";
+import { Names, partAt } from "./names.js";
 import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
+import { Plotting } from "./plotting.js";
 import { savePicture, showRecording } from "./keeping.js";
 import { Probes } from "./probes.js";
-import { Problems } from "./problems.js";
+import { explained, Problems } from "./problems.js";
 import { sheetsOf, taxelsOf, typesOf, whyEmpty } from "./selection.js";
 import { Skin } from "./skin.js";
 import { Stage } from "./stage.js";
@@ -37,6 +38,7 @@ const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
 const system = matchMedia("(prefers-color-scheme: light)");
 
+let wasPaused = false;
 const skin = new Skin();
 const past = new Past();
 const states = new Map();
@@ -83,17 +85,24 @@ const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${loca
   turn,
 });
 const send = (op) => link.send(op);
-const probes = new Probes(send);
-const cards = new Cards(byId("tip"), byId("pins"), (probe) => pin(probe));
-const tree = new Tree(byId("tree"), choose);
+const probes = new Probes(send, () => plotting.ask());
+const plotting = new Plotting(byId("plots"), { send, skin, probes, stage, notify, rewind: { get isPaused() { return rewind.isPaused; }, get at_s() { return rewind.at_s; } } });
+const cards = new Cards(byId("tip"), byId("pins"), plotting, (probe) => pin(probe));
+const tree = new Tree(byId("tree"), choose, (row, find) => plotting.draggable(row, () => plotting.row(find())));
 const bar = new Bar(byId("bar"));
 const list = new Problems(byId("problems"), (key) => choose(tree.find(key) ?? null));
-const touches = new Touches(byId("contacts"), byId("regions"));
+const touches = new Touches(byId("contacts"), byId("regions"), (row, contactOf) => {
+  const lineOf = () => plotting.contact(contactOf().of, contactOf());
+  plotting.draggable(row, lineOf);
+  row.addEventListener("click", () => plotting.strips.add(lineOf()));
+  row.addEventListener("keydown", (event) => event.key === "Enter" && plotting.strips.add(lineOf()));
+});
 const legend = new Legend((scale) => {
   view.scale = scale;
   look();
 });
 const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: byId("when") }, past, () => {
+  if (rewind.isPaused !== wasPaused) plotting.strips.freeze((wasPaused = rewind.isPaused));
   show();
   showFigures();
 });
@@ -138,7 +147,8 @@ function turn(message) {
   if (header.error) notify(header.error);
   if (skin.take(header, taken.blob)) restructured();
   if (header.state) takeState(header.state);
-  probes.take(taken, performance.now());
+  probes.take(header);
+  plotting.take(taken);
   if (!rewind.isPaused) {
     remember(header.pictures);
     if (header.pictures || header.state || header.skin) show();
@@ -156,6 +166,7 @@ function restructured() {
   }
   sheetsChanged();
   probes.find(skin, wanted.pins ?? probes.keys);
+  plotting.ask(true);
   wanted.pins = null;
   tree.update(skin, states);
   if (wanted.selected) tree.select(wanted.selected);
@@ -167,15 +178,18 @@ function restructured() {
 
 function takeState(state) {
   for (const driver of state.drivers ?? []) states.set(driver.id, driver);
-  now.problems = (state.problems ?? []).map(({ severity, driver, bus, patch, text }) => {
+  const seen = (state.problems ?? []).map(({ severity, driver, bus, patch, text, since_ns }) => {
     const { name = driver, key = null } = skin.drivers.get(driver) ?? {};
     const named = name === null || name === undefined ? text : `${name}: ${text}`;
-    return { severity, text: named, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    const place = { driver: name, bus, patch, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    return { severity, text: named, since_ns: since_ns && Number(since_ns), ...place };
   });
+  now.problems = explained(seen, state.findings ?? []);
   if (now.recording && !state.recording) notify(`The recording is in ${now.recording.file}`);
   now.recording = state.recording ?? null;
+  plotting.takeState(state);
   tree.update(skin, states);
-  list.update(now.problems);
+  list.update(now.problems, plotting.now_ns);
   replay.update(state.replay);
   showRecording(byId("record"), now.recording);
 }
@@ -199,13 +213,15 @@ function show() {
 
 /** The contacts of the moment that is looked at; those of a silent driver are over. */
 function contacts() {
-  return stage.sheets.flatMap(({ driver, shown }) => (driver.isOld && !rewind.isPaused ? [] : shown.contacts ?? []));
+  const shown = stage.sheets.filter(({ driver }) => !driver.isOld || rewind.isPaused);
+  return shown.flatMap(({ driver, shown: { contacts = [] } }) => contacts.map((one) => ({ ...one, of: driver })));
 }
 
 /** Bring everything beside the picture up to date. */
 function showFigures() {
   now.figures_ms = performance.now();
   const isPast = rewind.isPaused;
+  plotting.strips.draw();
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
   bar.update(skin, states, stage);
   const row = selected();
@@ -326,6 +342,7 @@ function setTheme(theme, isChosen) {
   setText(byId("theme"), theme === "dark" ? "Light" : "Dark");
   stage.setTheme(theme);
   legend.setTheme(theme);
+  plotting.strips.theme = theme;
   if (isChosen) storeTheme(theme);
   showFigures();
 }
@@ -366,6 +383,19 @@ function release() {
   showFigures();
 }
 
+/** Plot what is pointed at, or what is selected. */
+function plot() {
+  const row = selected();
+  const line = probes.hovered ? plotting.taxel(probes.hovered) : row && plotting.row(row);
+  if (line) plotting.strips.add(line);
+  else notify("Point at a taxel, or select a driver or board, to plot it.");
+}
+
+function picture(kind) {
+  const drivers = stage.sheets.map(({ driver }) => driver.key);
+  savePicture(kind, stage, overlay, view.theme, `${MODES[view.mode]}. ${plotting.footer(drivers)}`);
+}
+
 let keepTimer = 0;
 
 /** Keep the view in the address, once it stays as it is. */
@@ -394,6 +424,8 @@ onPointer(byId("stage"), {
     cards.place(x, y, stage.width, stage.height);
   },
   click: (x, y) => {
+    const part = view.names && partAt(names.place(stage), x, y);
+    if (part) return plotting.strips.add(plotting.part(part));
     const found = pick(stage, stage.sheets, x, y);
     if (found) pin(found);
   },
@@ -401,7 +433,7 @@ onPointer(byId("stage"), {
 const clicks = {
   tare: () => send({ op: "tare" }),
   record: () => send({ op: "record", action: now.recording ? "stop" : "start" }),
-  picture: () => savePicture(stage, overlay),
+  picture: () => picture("png"),
   theme: () => setTheme(view.theme === "dark" ? "light" : "dark", true),
   help: () => {
     fillHelp(byId("keys"), view.theme);
@@ -425,6 +457,9 @@ onKeys({
   "]": () => rewind.isPaused && rewind.scroll(rewind.at_s + SCROLL_S),
   r: clicks.record,
   s: clicks.picture,
+  S: () => picture("svg"),
+  g: plot,
+  m: () => plotting.mark(),
   f: () => frameAll(),
   ArrowLeft: () => stage.orbit(-TURN, 0),
   ArrowRight: () => stage.orbit(TURN, 0),
@@ -454,7 +489,7 @@ onKeys({
   "?": clicks.help,
 });
 
-window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts });
+window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts, plotting });
 setTheme(view.theme, false);
 look();
 addEventListener("hashchange", () => location.reload()); // another address was typed

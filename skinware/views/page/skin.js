@@ -98,6 +98,7 @@ class Driver {
     this.id = table.id;
     this.name = table.name;
     this.namespace = table.namespace;
+    this.type = table.type;
     this.key = keyOf(table);
     this.generation = table.generation;
     this.buses = table.buses ?? [];

@@ -7,7 +7,9 @@ const CONTACTS = ["", "", "load", "mm/s", "s"];
 const LOAD = CONTACTS.indexOf("load");
 
 export class Touches {
-  constructor(contacts, regions) {
+  /** @param {(row: HTMLElement, contactOf: () => object) => void} equip called with each new row of a contact. */
+  constructor(contacts, regions, equip) {
+    this.equip = equip;
     this.contacts = contacts;
     this.regions = regions;
     this.contactRows = h("tbody");
@@ -23,6 +25,8 @@ export class Touches {
   update(contacts, regions) {
     setHidden(this.contacts, this.contacts.hidden && !contacts.length); // once there were some, it stays
     const load = inUnit(contacts);
+    this.shown = contacts;
+    while (this.contactRows.rows.length < contacts.length) this.contactRows.append(this.#row());
     setText(this.contactHead.cells[LOAD], load.unit ? `load, ${load.unit}` : "load");
     fill(
       this.contactRows,
@@ -41,6 +45,12 @@ export class Touches {
       this.regionRows,
       regions.map(({ name, value, unit, touched }) => [name, region.write(value, unit), touched ? "◉ touched" : ""]),
     );
+  }
+
+  #row() {
+    const row = h("tr", { tabindex: 0, title: "Plot its load (Enter)" });
+    this.equip(row, () => this.shown[row.sectionRowIndex]);
+    return row;
   }
 }
 

@@ -1,8 +1,8 @@
 """Reflexes: the age of a frame when a reader learns of a touch in it, through skin-calm, beside busy processes.
 
 A driver of some taxels is pressed twice a second. The age is measured from the commit of the frame in which the touch
-is found (its second one) to the event in the reader: that of skinware.tactile, or examples/reflex.c. Driver, service and
-reader are a process each; with the real-time profile they are ahead of everything else.
+is found (its second one) to the event in the reader: that of skinware.tactile, or examples/reflex.c. Driver, service
+and reader are a process each; with the real-time profile they are ahead of everything else.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.status import age_limit_ns
 from skinware.structure import Structure
+from skinware.text import nearest_name
 
 log = logging.getLogger("skinware.skin")
 
@@ -116,8 +117,8 @@ class Skin:
         try:
             return self._drivers.readers[driver]
         except KeyError:
-            there_are = ", ".join(self._drivers.readers) or "none"
-            raise ServiceNotFound(f"no driver {driver!r} in this skin now; it has: {there_are}") from None
+            others = nearest_name(driver, self._drivers.readers)
+            raise ServiceNotFound(f"no driver {driver!r} in this skin now{others}") from None
 
     def read(
         self,

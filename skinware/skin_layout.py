@@ -14,6 +14,7 @@ from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.matrices import Matrices, ModuleKey
 from skinware.structure import Structure
+from skinware.text import nearest_name
 
 
 def _module_keys(driver: str, structure: Structure) -> list[ModuleKey]:
@@ -59,8 +60,8 @@ class SkinLayout:
         try:
             return self._parts[type_name]
         except KeyError:
-            there_are = ", ".join(self.types) or "none (no driver runs)"
-            raise StructureError(f"no sensor type {type_name!r} in this skin; it has: {there_are}") from None
+            others = nearest_name(type_name, self.types) if self.types else ": no driver runs"
+            raise StructureError(f"no sensor type {type_name!r} in this skin{others}") from None
 
     @cached_property
     def patches(self) -> tuple[str, ...]:

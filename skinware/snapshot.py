@@ -12,6 +12,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, StructureError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.skin_layout import SkinLayout
+from skinware.text import nearest_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +34,7 @@ class Snapshot:
             StructureError: no such driver in this snapshot; the message lists those there are.
         """
         if driver not in self.layout.drivers:
-            there_are = ", ".join(self.layout.drivers) or "none"
-            raise StructureError(f"no driver {driver!r} in this snapshot; it has: {there_are}")
+            raise StructureError(f"no driver {driver!r} in this snapshot{nearest_name(driver, self.layout.drivers)}")
         return self.samples[self.layout.drivers.index(driver)]
 
     @property

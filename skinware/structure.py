@@ -17,6 +17,7 @@ from skinware.matrices import Matrices
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import LONGEST_PERIOD_S, age_limit_ns
+from skinware.text import nearest_name
 
 VALUE_DTYPES = tuple(np.dtype(code) for code in ("u1", "<i2", "<u2", "<i4", "<f4"))
 """The dtypes that values of a service may have."""
@@ -293,9 +294,7 @@ class Structure:
         for candidate in self.types:
             if candidate.name == name:
                 return candidate
-        raise StructureError(
-            f"no sensor type {name!r} in this skin; it has: {', '.join(t.name for t in self.types) or 'none'}"
-        )
+        raise StructureError(f"no sensor type {name!r} in this skin{nearest_name(name, [t.name for t in self.types])}")
 
     def index(self, type_name: str) -> Index:
         """Return positions in a frame of all sensors of a type, in frame order.

@@ -1,4 +1,4 @@
-"""Write numbers, times, tables and the text of others as people read them. Pure functions.
+"""Write numbers, times, tables, names and the text of others as people read them. Pure functions.
 
 All commands and views use these, so that an age or a count looks the same everywhere.
 """
@@ -6,7 +6,7 @@ All commands and views use these, so that an age or a count looks the same every
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from skinware.status import Status
 
@@ -16,6 +16,16 @@ NOT_FRESH = "not fresh"
 
 _BETWEEN = "  "
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def nearest_name(wrong: str, right: Iterable[str]) -> str:
+    """Return the end of an error message about an unknown name: the nearest name that exists, and all that do."""
+    import difflib
+
+    names = [*dict.fromkeys(right)]
+    nearest = difflib.get_close_matches(wrong, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}? There" if nearest else "; there"
+    return f"{hint} are: {', '.join(names) or 'none'}"
 
 
 def age_text(age_ns: float | None) -> str:

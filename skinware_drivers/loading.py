@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import skinware
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import check_name
-from skinware_drivers.options.declared import SOURCE_SUFFIX, is_file, nearest_name
+from skinware.text import nearest_name
+from skinware_drivers.options.declared import SOURCE_SUFFIX, is_file
 
 _OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__file__))
 _PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first
@@ -61,7 +62,7 @@ def load(kind: ClassKind, name: str) -> type[Any]:
     known = registered(kind.group)
     if name not in known:
         raise ConfigurationError(
-            f"there is no {kind.word} {name!r}{nearest_name(name, known)}. One of yours: give its file, as"
+            f"there is no {kind.word} {name!r}{nearest_name(name, sorted(known))}. One of yours: give its file, as"
             f" ./{name}{SOURCE_SUFFIX}, or install its package: pip install -e ."
         )
     entry = known[name]

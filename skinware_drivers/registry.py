@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 from skinware.errors import ConfigurationError
+from skinware.text import nearest_name
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import CHOOSE, Bus, chosen_by
 from skinware_drivers.bus_names import BusName, parse_bus_name
 from skinware_drivers.loading import ClassKind, load, registered
-from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"

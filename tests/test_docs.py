@@ -131,6 +131,13 @@ def test_files_and_folders_that_a_page_names_exist(page: str) -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
+def test_files_that_the_comments_of_c_code_name_exist() -> None:
+    modules = "".join(f"/{path}\n" for path in ROOT.rglob("*.py") if ".venv" not in path.parts)
+    for source in ROOT.glob("skinware*/native/*.[ch]"):
+        named = re.findall(r"[\w/]+\.py\b", source.read_text())
+        assert [name for name in named if f"/{name}\n" not in modules] == [], source
+
+
 def fenced(page: Path, language: str) -> list[str]:
     """The text of every block of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)

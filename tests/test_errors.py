@@ -220,7 +220,7 @@ def serving(ask: Callable[[ServiceReader[Sample]], object]) -> object:
 
 @produces
 def RequestRefused(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    return serving(lambda reading: reading.call("opne"))
+    return serving(lambda reading: reading.call("tare"))
 
 
 @produces

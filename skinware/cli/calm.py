@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +104,7 @@ def command(
     from skinware.tactile.chain_state import default_path
     from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
+    from skinware.text import nearest_name
     from skinware.views.robot import read_robot
 
     cli.log_to_stderr(verbose)
@@ -128,10 +128,7 @@ def command(
     )
     services = source.services()
     if name not in services:
-        nearest = difflib.get_close_matches(name, services, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
-        others = ", ".join(services) or "none"
-        cli.warn(f"waiting for driver {name!r} in {source.name!r}{hint} There are: {others}")
+        cli.warn(f"waiting for driver {name!r} in {source.name!r}{nearest_name(name, services)}")
     with cli.signals_end(service.stop):
         report = (lambda: _report_status(service)) if as_json else lambda: None
         service.run(report, on_ready=lambda: _report_ready(service, as_json))

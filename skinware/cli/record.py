@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import select
@@ -56,9 +57,12 @@ def on_enter(call: Callable[[], object]) -> Iterator[None]:
         thread.join()
 
 
-def _interrupt_at_eof() -> None:
-    sys.stdin.read()  # the kernel closes it when the other program is killed
-    os.kill(os.getpid(), signal.SIGINT)
+def _listen_until_eof(mark: Callable[[str, int], object]) -> None:
+    for line in sys.stdin:
+        with contextlib.suppress(ValueError, KeyError):
+            told = json.loads(line)
+            mark(str(told["text"]), int(told["time_ns"]))
+    os.kill(os.getpid(), signal.SIGINT)  # the kernel closes it when the other program is killed
 
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
@@ -163,7 +167,7 @@ def command(
     report = _Progress(recorder, target, path, as_json)
     keys = on_enter(recorder.save) if last_s is not None else contextlib.nullcontext()
     if until_eof:
-        threading.Thread(target=_interrupt_at_eof, daemon=True).start()
+        threading.Thread(target=_listen_until_eof, args=(recorder.mark,), daemon=True).start()
     with cli.signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
         report.ready(names, place.name, is_past=last_s is not None)
         try:

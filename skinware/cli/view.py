@@ -134,6 +134,7 @@ def command(
 
 
 async def _serve(follower: Follower, access: Access, host: str, port: int | None, ready: Callable[[int], None]) -> None:
+    from skinware.views.advice import DoctorProgram
     from skinware.views.recording import RecordingProgram
     from skinware.views.server import ViewServer, show
 
@@ -141,7 +142,9 @@ async def _serve(follower: Follower, access: Access, host: str, port: int | None
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     program = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
-    server = ViewServer(follower, access, RecordingProgram(program, follower.namespace.name, follower.names))
+    namespace = follower.namespace.name
+    doctor = DoctorProgram((sys.executable, "-m", "skinware_drivers.cli.doctor"), namespace)
+    server = ViewServer(follower, access, RecordingProgram(program, namespace, follower.names), doctor=doctor)
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:

@@ -24,6 +24,7 @@ from skinware.memory.futex import fence
 from skinware.memory.locks import Descriptor, Process, ProcessWatch, has_ended, is_locked, this_process, try_lock
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
+from skinware.text import nearest_name
 
 OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_LEAST = file_layout.COLUMN_OFFSET
@@ -329,7 +330,7 @@ def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
 
 def _not_found(namespace: Namespace, name: str) -> str:
     others = namespace.services()
-    there_are = f"; it has: {', '.join(others)}" if others else ", nor another; start a driver (skin-driver --bus ...)"
+    there_are = nearest_name(name, others) if others else ", nor another; start a driver (skin-driver --bus ...)"
     return f"no service {name!r} in namespace {namespace.name!r}{there_are}"
 
 

@@ -23,6 +23,7 @@ void skinware_baseline_begin(struct baseline *b) {
         b->level[i] = b->noise2[i] = b->last[i] = b->noted[i] = b->first[i] = NAN;
         b->gain[i] = b->gain_before[i] = 1;
         b->gain_variance[i] = GAIN_SPREAD2;
+        b->noise_s[i] = NOISE_S;
         b->since_fall_s[i] = b->since_end_s[i] = INFINITY;
     }
     for (i = 0; i < b->n_patches; i++)
@@ -53,6 +54,7 @@ void put(struct baseline *b, int64_t taxel, float by) {
     put_at(b, taxel, b->level[taxel] + by);
     b->deviation[taxel] -= by;
     b->smooth[taxel] -= by;
+    b->onset[taxel] -= by;
 }
 
 /* Takes a frame in. A taxel that sends again after too long is measured again. */
@@ -226,8 +228,10 @@ int64_t skinware_baseline_tare(struct baseline *b, int64_t patch) {
     for (i = 0; i < b->n; i++) {
         if (!b->flag[i])
             continue;
-        if (!b->ready[i])
+        if (!b->ready[i]) {
             b->noise2[i] = least_noise2(b, b->last[i]);
+            b->noise_s[i] = 0;
+        }
         put_at(b, i, b->ready[i] && isfinite(b->level[i]) ? b->level[i] + b->smooth[i] : b->last[i]);
         b->ready[i] = 1;
         forget_touch(b, i);

@@ -31,7 +31,7 @@
 /* The first measurement */
 
 #define BLOCKS 10             /* parts of calibrate_s: the median over ten survives a touch of a third of the time */
-#define BLOCK_FRAMES 4        /* frames of a part at least, as a variance of fewer says nothing */
+#define BLOCK_FRAMES 4        /* values of a taxel in a part at least, as a variance of fewer says nothing */
 #define ENOUGH_BLOCKS 6       /* parts in which a taxel must have data */
 #define MOVED_SHARE 0.05      /* share of the taxels that may move; where more do, those that move have to wait */
 
@@ -45,7 +45,8 @@
 #define MATCH_S 2.0           /* seconds in which the agility of the common mode changes e-fold until it explains moves */
 #define RATE_S 30.0           /* seconds over which the speed of the common drift is averaged */
 #define SLOW_S 5.0            /* seconds: deviations that last longer are drift of the taxel, quicker ones are noise */
-#define NOISE_S 60.0          /* seconds: time constant of the noise, which changes with temperature and motors */
+#define NOISE_S 60.0f         /* seconds: time constant of the noise, which changes with temperature and motors */
+#define FEWEST 0.1f           /* weight of one frame in the noise, at most */
 #define TICK_S 1.0            /* seconds between adjustments of what changes slowly */
 
 /* Contacts */
@@ -61,6 +62,7 @@
 #define STEP_OVER_ON 3.0f     /* thresholds: a module whose taxels all rise alike by less moved its own baseline */
 #define ALIKE 0.3f            /* share of the median: taxels that are nearer to it moved alike */
 #define MOST_ALIKE 0.5        /* share of the taxels of a module that have to */
+#define AT_ONCE 0.25          /* share of a rise that may come after its first frame: what rises farther is pressed */
 #define SAG_RETURNS_S 0.6f    /* seconds from the end of a contact until the cover around it is back */
 #define SAG_RETURNS_BY 1.5f   /* times the sag: a value that rises farther (and a threshold) is a touch */
 #define SAG_SHARE 0.3f        /* share of the largest load in the patch: a pressed cover sinks around by no more */
@@ -94,7 +96,7 @@ struct module {
     double touched; /* number of its taxels */
     double near;    /* 1: something touches it */
     double looked;  /* 1: a touch on it is looked at again */
-    double median, slow, on, number, alike; /* of a module that is looked at */
+    double median, onset, slow, on, off, number, alike; /* of a module that is looked at */
 };
 
 struct baseline {
@@ -118,11 +120,13 @@ struct baseline {
     int64_t block_ns, block_frames, n_blocks; /* the tenth that is being measured, and how many are over */
 
     float *level, *gain, *variance, *cross, *gain_variance, *noise2; /* offset, its gain, and how uncertain both are */
+    float *noise_s;                             /* for how long the noise has been measured */
     float *slow;                                /* deviation at rest, over some seconds */
     float *gain_before;                         /* gain at the last tick */
     float *last, *away_s;                       /* newest value, and time since */
     float *smooth, *peak, *contact_s;           /* deviation, smoothed; highest load and age of a touch */
     float *settling_s;                          /* time for which it is still held */
+    float *onset;                               /* deviation in the first frame above the threshold of the end */
     float *below_s, *down_s, *sunk, *dip, *dip_s;
     float *used, *left, *steady, *used_then, *since_fall_s, *noted, *since_end_s;
     float *first; /* value in the first frame of the measurement */

@@ -159,7 +159,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
     const double slowly_ = passed_share(passed_s, SLOW_S);
     const float slowly = (float)slowly_, of_noise = (float)(slowly_ / (2 - slowly_));
     const float floor = (float)fmin(passed_s / b->tau_s, 0.5), quick = (float)fmin(passed_s / RESETTLE_S, 0.5);
-    const float noise_share = (float)fmin(passed_s / NOISE_S, 0.1), other_side = b->is_signed ? -1.0f : 1.0f;
+    const float passed = (float)passed_s, other_side = b->is_signed ? -1.0f : 1.0f;
     int64_t number, i;
     for (number = 0; passed_s > 0 && number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
@@ -186,6 +186,8 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
             const float share = is_measured ? faster : 0.0f, keep = 1.0f - share;
             const float of_cross = unlike < 4 * DRIFT_SIGMA * DRIFT_SIGMA ? cross / total : 0.0f;
             const float of_gain = is_calm ? of_cross : 0.0f;
+            const float known_s = lowest(a.noise_s[i] + (is_calm ? passed : 0.0f), NOISE_S);
+            const float of_square = lowest(passed / known_s, FEWEST);
             const float away = innovation - slow, slower = slow + away * (is_measured ? slowly : 0.0f);
             a.level[i] += share * innovation;
             a.gain[i] += of_gain * innovation;
@@ -193,7 +195,8 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
             a.cross[i] = cross * keep;
             a.variance[i] = keep * keep * variance + share * share * (is_measured ? noise2 : 0.0f);
             a.slow[i] = slower;
-            a.noise2[i] = noise2 + (away * (innovation - slower) - noise2) * (is_calm ? noise_share : 0.0f);
+            a.noise2[i] = noise2 + (away * (innovation - slower) - noise2) * (is_calm ? of_square : 0.0f);
+            a.noise_s[i] = known_s;
         }
     }
     if (passed_s > 0) {

@@ -84,7 +84,7 @@ static float *block_at(const struct baseline *b, int64_t number) {
 static int add(struct baseline *b, int64_t time_ns) {
     const int64_t n = b->n, block_ns = llrint(b->calibrate_s * 1e9 / BLOCKS);
     float *sums = block_at(b, b->n_blocks), *difference = b->scratch + n;
-    int64_t i;
+    int64_t i, n_values = 0, with_values = 0;
     if (b->n_blocks == 0 && b->block_frames == 0)
         b->block_ns = time_ns;
     if (b->block_frames == 0)
@@ -111,9 +111,11 @@ static int add(struct baseline *b, int64_t time_ns) {
         sums[DD * n + i] += d * d;
         sums[DC * n + i] += d * c;
         sums[CC * n + i] += c * c;
+        n_values += (int64_t)sums[COUNT * n + i];
+        with_values += sums[COUNT * n + i] > 0;
     }
     b->block_frames++;
-    if (time_ns - b->block_ns < block_ns || b->block_frames < BLOCK_FRAMES)
+    if (time_ns - b->block_ns < block_ns || n_values < BLOCK_FRAMES * with_values)
         return 0;
     b->n_blocks++;
     b->block_ns = time_ns;

@@ -25,7 +25,7 @@ typedef struct turn {
     int64_t cpu_ns; /* of this thread at the end; 0: not asked for */
 } turn;
 
-/* Where a reader is, between two calls. skinware/memory/take.py has the same fields, also of skinware_native_take. */
+/* Where a reader is, between two calls. skinware/memory/ring_reader.py has the same fields, also of skinware_native_take. */
 typedef struct skinware_native_reader {
     skinware__ring ring;
     uint64_t last;       /* sequence of the sample that was taken last; 0: the next turn is Python's */

@@ -85,6 +85,8 @@ static int64_t judge(struct baseline *b, double passed_s) {
     for (i = 0; i < b->n; i++) {
         const int high = (load_of(&a, a.deviation[i]) > a.off[i]) & a.live[i], was_high = a.high[i];
         a.high[i] = a.live[i] ? (uint8_t)high : a.high[i];
+        if (high && !was_high)
+            a.onset[i] = a.deviation[i];
         if (high && !a.touched[i] && (was_high || passed_s >= QUICK_S) && load_of(&a, a.smooth[i]) > a.on[i])
             begin_touch(b, i, load_of(&a, a.smooth[i]));
         if (a.touched[i])
@@ -118,7 +120,8 @@ static int64_t judge(struct baseline *b, double passed_s) {
 static void let_go(struct baseline *b) {
     int64_t i, k;
     for (k = 0; k < b->n_touched; k++) {
-        const float left = b->smooth[i = b->list[k]];
+        const float smooth = b->smooth[i = b->list[k]], now = b->deviation[i];
+        const float left = fabsf(now) < fabsf(smooth) ? now : smooth; /* the smoothed one may still fall */
         const int is_too_long = b->contact_s[i] > (float)b->maximum_hold_s;
         if (!b->flag[i])
             continue;
@@ -130,23 +133,30 @@ static void let_go(struct baseline *b) {
     }
 }
 
+enum { LATER = 1, NOW = 2 }; /* when a module is looked at: a moment after a touch began, or as it begins */
+
 static int64_t find_new_modules(struct baseline *b, double passed_s) {
     int64_t k, found = 0;
     for (k = 0; k < b->n_modules; k++)
         b->modules[k].looked = b->modules[k].number = b->modules[k].alike = 0;
-    for (k = 0; k < b->n_touched; k++)
-        if (is_looked_at(b, b->list[k], passed_s) == 1)
-            b->modules[b->module[b->list[k]]].looked = 1, found++;
+    for (k = 0; k < b->n_touched; k++) {
+        const int64_t i = b->list[k];
+        struct module *m = &b->modules[b->module[i]];
+        if (is_looked_at(b, i, passed_s) == 1)
+            m->looked = LATER, found++;
+        else if (b->touched[i] && b->contact_s[i] <= (float)passed_s)
+            m->looked = fmax(m->looked, NOW), found++;
+    }
     return found;
 }
 
 /* Whether the values of a taxel moved like the typical ones of its module. */
 static int is_alike(const struct baseline *b, int64_t i) {
     const float median = (float)b->modules[b->module[i]].median;
-    return b->flag[i] && fabsf(b->smooth[i] - median) < highest(ALIKE * median, 0.5f * b->on[i]);
+    return b->flag[i] && fabsf(b->deviation[i] - median) < highest(ALIKE * median, 0.5f * b->on[i]);
 }
 
-/* Moves the offsets of modules whose taxels rose alike, suddenly and by little: their board moved its own baseline. */
+/* Moves the offsets of modules whose taxels rose alike, at once and by little: their board moved its own baseline. */
 static void follow_steps(struct baseline *b, double passed_s) {
     const int64_t stride = sizeof(struct module) / sizeof(double);
     int64_t i, k;
@@ -154,24 +164,31 @@ static void follow_steps(struct baseline *b, double passed_s) {
         return;
     for (i = 0; i < b->n; i++)
         b->flag[i] = b->live[i] && b->modules[b->module[i]].looked > 0;
-    medians(b, b->module, b->n_modules, b->smooth, b->flag, &b->modules->median, stride);
+    medians(b, b->module, b->n_modules, b->deviation, b->flag, &b->modules->median, stride);
     medians(b, b->module, b->n_modules, b->slow, b->flag, &b->modules->slow, stride);
     medians(b, b->module, b->n_modules, b->on, b->flag, &b->modules->on, stride);
+    medians(b, b->module, b->n_modules, b->off, b->flag, &b->modules->off, stride);
     for (i = 0; i < b->n; i++) {
         b->modules[b->module[i]].number += b->flag[i];
         b->modules[b->module[i]].alike += is_alike(b, i);
+        b->flag[i] &= b->high[i];
     }
+    medians(b, b->module, b->n_modules, b->onset, b->flag, &b->modules->onset, stride);
     for (k = 0; k < b->n_modules; k++) {
         struct module *m = &b->modules[k];
         const float median = (float)m->median, on = (float)m->on;
-        m->looked = m->number >= 4 && m->alike >= MOST_ALIKE * m->number && (float)m->slow < 0.3f * median &&
-                    median > OFF_TO_ON * on && median < STEP_OVER_ON * on;
+        const int is_over = m->looked == LATER || fabs(m->onset - m->median) < AT_ONCE * m->median;
+        m->looked = m->number >= 4 && m->alike >= MOST_ALIKE * m->number && (float)m->slow < 0.3f * median && is_over &&
+                    median > OFF_TO_ON * on && median < STEP_OVER_ON / OFF_TO_ON * (float)m->off;
     }
     for (i = 0; i < b->n; i++) {
-        if (!b->flag[i] || !b->modules[b->module[i]].looked)
+        const struct module *m = &b->modules[b->module[i]];
+        if (!b->live[i] || !m->looked || b->deviation[i] < 0.5f * (float)m->median)
             continue;
-        put(b, i, (float)b->modules[b->module[i]].median);
-        if (b->smooth[i] < b->off[i])
+        put(b, i, (float)m->median);
+        b->variance[i] += ALIKE * ALIKE * (float)(m->median * m->median);
+        b->smooth[i] = b->deviation[i];
+        if (b->smooth[i] < b->on[i])
             end_touch(b, i);
     }
 }

@@ -20,6 +20,7 @@ from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of
 from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
+from skinware.text import nearest_name
 from skinware.transfer.collecting import LIVE, PAUSED
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot, RecordedSnapshot
 
@@ -164,8 +165,7 @@ class Recording:
             ConfigurationError: the recording has none; the message lists its services.
         """
         if name not in self._services:
-            there_are = ", ".join(self.services) or "none"
-            raise ConfigurationError(f"no service {name!r} in {self.path}; there are: {there_are}")
+            raise ConfigurationError(f"no service {name!r} in {self.path}{nearest_name(name, self.services)}")
         service = self._services[name]
         return Track(self, name, service.frame_channel, service.generations)
 

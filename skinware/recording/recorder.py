@@ -148,6 +148,11 @@ class Recorder:
         """Write the chunks in memory (:class:`skinware.recording.files.Past`); from any thread or signal handler."""
         self._coder.jobs.put(self._coder.save)
 
+    def mark(self, text: str, time_ns: int) -> None:
+        """Record an event ``mark`` that happened at a time, CLOCK_MONOTONIC; from any thread."""
+        event = {"event": "mark", "service": "", "time_ns": time_ns, "text": text}
+        self._coder.jobs.put(partial(self._coder.add_json, EVENTS, event, time_ns))
+
     # -- the collector's listener ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:

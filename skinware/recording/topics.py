@@ -25,6 +25,7 @@ _EVENT = {
         "count": {"type": "integer", "description": "missed: how many samples"},
         "before": {"type": "integer", "description": "missed: sequence of the sample after them"},
         "why": {"type": "string", "description": "unreadable: the reason"},
+        "text": {"type": "string", "description": "mark: what a person marked"},
         "for_ns": {"type": "integer", "description": "suspended: for how long"},
         "by_ns": {"type": "integer", "description": "clock_stepped: by how much"},
     },

@@ -17,6 +17,7 @@ from typing import BinaryIO
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording.reading import Recording
 from skinware.recording.wire_tracks import WireItem, WireTrack
+from skinware.text import nearest_name
 from skinware.wire import IS_CUT, IS_FD, candump_line, channel_name
 
 SOCKETCAN, SERIAL = 227, 147
@@ -119,8 +120,8 @@ def _export(
     recorded = {wire.driver for wire in recording.wires}
     for driver in chosen.drivers:
         if recorded and driver not in recorded:
-            there_are = ", ".join(sorted(recorded))
-            raise ConfigurationError(f"{recording.path}: no wire of {driver!r} in it; there are: {there_are}")
+            others = nearest_name(driver, sorted(recorded))
+            raise ConfigurationError(f"{recording.path}: no wire of {driver!r} in it{others}")
     exported = Exported()
     wires: _Wires = []
     for wire, name in _named(recording):

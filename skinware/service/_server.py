@@ -30,6 +30,7 @@ from skinware.service.messages import (
     decode_arguments,
     receive,
 )
+from skinware.text import nearest_name
 
 _MAX_PEERS = 64
 _MAX_PEERS_OF_A_STRANGER = 16
@@ -284,9 +285,10 @@ class RequestServer(ForkGuard):
         elif ask.operation == ACQUIRE:
             return request
         elif ask.operation not in self.operations:
-            there_are = ", ".join(self.operations) or "none"
             why = f" ({self.why_no_others})" if self.why_no_others else ""
-            request.fail(f"no operation {ask.operation!r}{why}; there are: {there_are}", "refused")
+            request.fail(
+                f"no operation {ask.operation!r}{why}{nearest_name(ask.operation, self.operations)}", "refused"
+            )
         elif peer.is_stranger and (why := _too_costly(ask.arguments)):
             request.fail(f"{ask.operation}: {why}", "refused")
         elif (arguments := decode_arguments(ask.arguments)) is None:

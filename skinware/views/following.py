@@ -18,6 +18,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
+from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
 from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
@@ -90,15 +91,6 @@ class Newest:
         module = structure.sensor_module[quantity.where]
         return np.bincount(module, loads, structure.n_modules).astype(np.float64)
 
-    def contact_of(self, quantity: Quantity) -> npt.NDArray[np.int16] | None:
-        """Return (n,) int16, row of the contact of each sensor, negative without one; None without contacts."""
-        sample = self.contacts
-        if sample is None or sample.source.type_name != quantity.type.name:
-            return None
-        if not np.array_equal(sample.source.uid, self.frame.structure.sensor_uid[quantity.where]):
-            return None
-        return sample.contacts.contact_of
-
 
 class ShownDriver:
     """A driver as all viewers see it.
@@ -112,12 +104,14 @@ class ShownDriver:
         newest: its newest snapshot; None before the first.
         status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
+        since_ns: when each of its problems was first seen, by what it is; see :func:`skinware.views.tree.problems_of`.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
         self.number, self.live, self.namespace = number, live, namespace
         self.life = STARTING
         self.changes = 0
+        self.since_ns: dict[tuple[object, ...], int] = {}
         self.taken_ns = self._judged_ns = 0
         self._calm_pair: tuple[Structure | None, Structure | None, bool] = (None, None, False)
         self.newest: Newest | None = None
@@ -221,6 +215,10 @@ class Follower:
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
+
+    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
+        """Return the reader of the service of contacts on a driver."""
+        return self._services.contacts_reader(driver)
 
     def take(self, period_ns: int) -> list[ShownDriver]:
         """Take newer snapshots without waiting.

@@ -208,6 +208,10 @@ class TactileServices:
         calm = None if self._calm is None else self._calm.get(driver)
         return None if calm is None or calm.frame is None or calm.frame.stale else calm.frame
 
+    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
+        found = (reader for source in self._contacts for reader in source.readers.values())
+        return next((reader for reader in found if reader.source.driver == driver), None)
+
     def contacts_of(self, driver: str) -> ContactsSample | None:
         return next((sample for source in self._contacts if (sample := source.of(driver)) is not None), None)
 

@@ -20,7 +20,8 @@ DEFAULT_FPS = 30.0
 
 
 MOST_EXACT = 32
-"""Sensors whose exact values are sent, at most."""
+"""Sensors whose exact values are sent, and lines of plots, at most."""
+MOST_MODULES = 4096
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
 
@@ -55,11 +56,27 @@ class Names(msgspec.Struct, tag_field="op", tag="names"):
     type: str
 
 
-class Series(msgspec.Struct, tag_field="op", tag="series"):
-    """Ask for the last seconds of a sensor."""
+class Line(msgspec.Struct, frozen=True):
+    """A line of a plot: a taxel, the sum of modules, or the load of a contact."""
 
     driver: Number
-    position: Number
+    position: Number | None = None
+    type: str = ""
+    modules: Annotated[tuple[Number, ...], msgspec.Meta(max_length=MOST_MODULES)] = ()
+    contact: Number | None = None
+
+
+class Plot(msgspec.Struct, tag_field="op", tag="plot"):
+    """Choose the lines of which every sample is sent, with a number of this choice."""
+
+    number: Number
+    lines: Annotated[list[Line], msgspec.Meta(max_length=MOST_EXACT)]
+
+
+class Mark(msgspec.Struct, tag_field="op", tag="mark"):
+    """Mark an event, now, also in the recording."""
+
+    text: Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class Tare(msgspec.Struct, tag_field="op", tag="tare"):
@@ -83,7 +100,7 @@ class Replay(msgspec.Struct, tag_field="op", tag="replay"):
     value: int | float | bool | None = None
 
 
-Operation = Next | Choose | Exact | Names | Series | Tare | Wipe | Record | Replay
+Operation = Next | Choose | Exact | Names | Plot | Mark | Tare | Wipe | Record | Replay
 _DECODER = msgspec.json.Decoder(Operation)
 
 
@@ -112,12 +129,6 @@ class QuantityPicture(NamedTuple):
     """(n, 2) int8; None where there is no shear."""
     longest_shear: float
     """The shear that 127 means."""
-
-
-class Wiped(NamedTuple):
-    touched: int
-    of: int
-    running: bool
 
 
 class Look:
@@ -200,21 +211,6 @@ class Look:
             levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
         shear, longest = _shear(newest, quantity, memory)
         return QuantityPicture(quantity, levels, scale, shear, longest)
-
-    def wiped(self, drivers: list[ShownDriver]) -> Wiped | None:
-        """Return the progress of the wipe test; None without one."""
-        if self.mode != "wipe":
-            return None
-        touched = n = 0
-        for driver in drivers:
-            quantity = self.quantity_of(driver)
-            if quantity is None:
-                continue
-            n += len(quantity)
-            memory, name = self._memory_of(driver), quantity.type.name
-            if memory.wipe is not None:
-                touched += len(quantity) - len(memory.wipe.never_moved(name, memory.rest.noise(name)))
-        return Wiped(touched, n, self._wiping)
 
     def _memory_of(self, driver: ShownDriver) -> Memory:
         memory = self._memories.get(driver.number)

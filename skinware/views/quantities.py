@@ -12,7 +12,7 @@ import numpy.typing as npt
 from skinware._columns import Index
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
-from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
+from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.neighbours import pitch_m
@@ -23,6 +23,7 @@ HIGHEST = 250
 NO_VALUE = 255
 WITHOUT_VALUE = Status.NO_ACK | Status.MASKED | Status.NEVER_SEEN | Status.NOT_CONNECTED
 """A sensor with one of these bits has no value that means anything."""
+_NO_TOUCH = {t.id for t in (TEMPERATURE, *ACCELERATION, *ANGULAR_RATE)}
 _LONGEST = 127
 _STEEPEST = float(np.finfo(np.float32).max)
 
@@ -50,6 +51,11 @@ class Quantity:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @property
+    def is_touch(self) -> bool:
+        """Whether a touch changes its values."""
+        return self.type.id not in _NO_TOUCH
 
     @cached_property
     def pitch_m(self) -> float:

@@ -66,6 +66,18 @@ class RecordingProgram:
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
+    def mark(self, text: str, time_ns: int) -> bool:
+        """Write an event into the recording, and return whether there is one.
+
+        Args:
+            time_ns: when it happened, CLOCK_MONOTONIC.
+        """
+        process = self._process
+        if process is None or process.stdin is None or process.stdin.is_closing():
+            return False
+        process.stdin.write(json.dumps({"text": text, "time_ns": time_ns}).encode() + b"\n")
+        return True
+
     async def close(self) -> None:
         """End the recording, and wait for the end."""
         if self._running is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import mimetypes
+from collections import deque
 from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
@@ -17,12 +18,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.views import looks
 from skinware.views.access import Access, AccessRefused
+from skinware.views.advice import DoctorProgram
 from skinware.views.following import Follower
 from skinware.views.recording import RecordingProgram, ReplayControl
-from skinware.views.tree import problem_of_all
+from skinware.views.tree import NOTE, problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
 PAGE = Path(__file__).parent / "page"
@@ -31,6 +33,7 @@ PAGE = Path(__file__).parent / "page"
 _TICK_S = 0.01
 _LONGEST_TURN_S = 0.5
 _MOST_VIEWERS = 32
+_MOST_MARKS = 64
 _LONGEST_OPERATION = 1 << 16
 _CLOSE_TIMEOUT_S = 1.0
 """Time for a viewer to close its connection."""
@@ -51,14 +54,22 @@ class ViewServer:
     Args:
         follower: of the drivers; used in the event loop's thread only.
         recording: that viewers may begin and end; None: they may not record.
+        doctor: that is asked for advice; None: without it.
     """
 
     def __init__(
-        self, follower: Follower, access: Access, recording: RecordingProgram | None = None, page: Path = PAGE
+        self,
+        follower: Follower,
+        access: Access,
+        recording: RecordingProgram | None = None,
+        page: Path = PAGE,
+        doctor: DoctorProgram | None = None,
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._replay = ReplayControl()
+        self._doctor = doctor or DoctorProgram((), follower.namespace.name)
         self._viewers: set[Viewer] = set()
+        self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._news = asyncio.Event()
         self._server: Server | None = None
 
@@ -88,7 +99,11 @@ class ViewServer:
                 for driver in self._follower.take(period_ns):
                     for viewer in self._viewers:
                         viewer.look.follow(driver)
+                for viewer in self._viewers:
+                    viewer.plots.take()
                 self._replay.follow(self._follower.drivers)
+                problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
+                self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 self._wake()
             await asyncio.sleep(_TICK_S)
 
@@ -98,6 +113,7 @@ class ViewServer:
             self._server.close()
             with contextlib.suppress(TimeoutError):  # of connections that stay silent
                 await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
+        await self._doctor.close()
         if self._recording is not None:
             await self._recording.close()
 
@@ -139,6 +155,7 @@ class ViewServer:
                 await self._serve(viewer, connection)
         finally:
             self._viewers.discard(viewer)
+            viewer.plots.close()
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
         """Carry out the operations of a viewer, and send it a turn for each one that it asks for."""
@@ -185,8 +202,12 @@ class ViewServer:
                 viewer.choose(operation)
             case looks.Exact():
                 viewer.pin(operation.sensors)
-            case looks.Names() | looks.Series():
+            case looks.Names():
                 viewer.ask(operation)
+            case looks.Plot():
+                viewer.plot(operation)
+            case looks.Mark():
+                self._mark(operation.text)
             case looks.Tare():
                 viewer.tare()
             case looks.Wipe():
@@ -201,12 +222,20 @@ class ViewServer:
             case _:
                 raise ConfigurationError("this server cannot do that")
 
+    def _mark(self, text: str) -> None:
+        """Mark an event for all viewers, and in the recording if one is made."""
+        time_ns = now_ns()
+        in_recording = self._recording is not None and self._recording.mark(text, time_ns)
+        self._marks.append({"time_ns": str(time_ns), "text": text, "is_recorded": in_recording})
+
     def _besides(self) -> dict[str, Any]:
-        recording, replay = self._recording, self._replay.state
-        if recording is None:
-            return {"recording": None, "replay": replay}
-        problem = [] if recording.problem is None else [problem_of_all(f"recording: {recording.problem}")]
-        return {"recording": recording.state, "replay": replay, "problems": problem}
+        besides: dict[str, Any] = {"recording": None, "replay": self._replay.state, "marks": list(self._marks)}
+        besides["findings"] = self._doctor.findings
+        if self._recording is not None:
+            besides["recording"] = self._recording.state
+            if self._recording.problem is not None:
+                besides["problems"] = [problem_of_all(f"recording: {self._recording.problem}")]
+        return besides
 
 
 async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:

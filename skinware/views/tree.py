@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.realtime import now_ns
 from skinware.state import (
     DEAD,
     LIVE,
@@ -83,34 +84,42 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
 
 
 def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any]]:
-    """Return the problems of a driver, each with its severity (``error``, ``warning`` or ``note``) and its place."""
-    found: list[dict[str, Any]] = []
+    """Return the problems of a driver, each with its severity (``error``, ``warning`` or ``note``) and its place.
 
-    def add(severity: str, text: str, **where: str) -> None:
-        found.append({"severity": severity, "driver": driver.number, **where, "text": text})
+    A driver without news has this one problem. ``since_ns`` is when the problem was first seen, CLOCK_MONOTONIC.
+    """
+    found: list[dict[str, Any]] = []
+    before, driver.since_ns = driver.since_ns, {}
+
+    def add(kind: str, severity: str, text: str, **where: str) -> None:
+        known = driver.number, severity, kind, *where.values()
+        driver.since_ns[known] = before.get(known) or now_ns()
+        since = {"since_ns": str(driver.since_ns[known])}
+        found.append({"severity": severity, "driver": driver.number, **where, "text": text, **since})
 
     if report.life != LIVE:
-        add(*_LIVES.get(report.life, (NOTE, report.life)))
-    if report.life not in WITHOUT_NEWS:
-        for bus in report.buses:
-            reason = f": {words(bus.reason)}" if bus.reason else ""
-            if bus.state != LIVE:
-                add(ERROR, f"{bus.name} is {bus.state}{reason}", bus=bus.name)
-            elif reason:
-                add(WARNING, f"{bus.name}{reason}", bus=bus.name)
-        for patch in report.patches:
-            if patch.state != LIVE:
-                age = "" if patch.age_ns is None else f", its newest data is {age_text(patch.age_ns)} old"
-                on = report.buses[patch.bus].name
-                add(WARNING, f"{patch.name} is {patch.state}{age}", bus=on, patch=patch.name)
+        add(report.life, *_LIVES.get(report.life, (NOTE, report.life)))
+    if report.life in WITHOUT_NEWS:
+        return found
+    for bus in report.buses:
+        reason = f": {words(bus.reason)}" if bus.reason else ""
+        if bus.state != LIVE:
+            add(bus.state, ERROR, f"{bus.name} is {bus.state}{reason}", bus=bus.name)
+        elif reason:
+            add(reason, WARNING, f"{bus.name}{reason}", bus=bus.name)
+    for patch in report.patches:
+        if patch.state != LIVE:
+            age = "" if patch.age_ns is None else f", its newest data is {age_text(patch.age_ns)} old"
+            on = report.buses[patch.bus].name
+            add(patch.state, WARNING, f"{patch.name} is {patch.state}{age}", bus=on, patch=patch.name)
     for bit, (severity, text) in _STATUSES.items():
         sensors = np.flatnonzero(driver.status & np.uint8(bit))
         if len(sensors) and driver.frame is not None:
             shares = f"{count_text(len(sensors))} of {plural(driver.structure.n_sensors, 'sensor')}"
-            add(severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
+            add(text, severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
     dropped = sum(bus.counters.get("dropped", 0) for bus in report.buses)
     if dropped:
-        add(NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
+        add("dropped", NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
     return found
 
 

@@ -13,11 +13,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.tactile.motion_service import MotionSample
 from skinware.views import looks
-from skinware.views.following import Follower, ShownDriver
+from skinware.views.following import Follower, Newest, ShownDriver
 from skinware.views.live import places_of
+from skinware.views.plots import Plots
+from skinware.views.quantities import Quantity
 from skinware.views.scene import Scene
 from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
 
@@ -63,7 +65,8 @@ class Viewer:
         self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
         self._asked = False
-        self._questions: list[looks.Names | looks.Series] = []
+        self._questions: list[looks.Names] = []
+        self.plots = Plots(follower)
         self._error: str | None = None
 
     def choose(self, choice: looks.Choose) -> None:
@@ -82,7 +85,11 @@ class Viewer:
         """Send the exact values of these sensors, pairs of driver and position, in every turn."""
         self._exact, self._asked = sensors, True
 
-    def ask(self, question: looks.Names | looks.Series) -> None:
+    def plot(self, choice: looks.Plot) -> None:
+        """Send every sample of these lines from now on."""
+        self.plots.choose(choice.number, choice.lines, self._edition)
+
+    def ask(self, question: looks.Names) -> None:
         if len(self._questions) == _MOST_QUESTIONS:
             self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
         else:
@@ -97,6 +104,7 @@ class Viewer:
         return (
             self._asked
             or bool(self._questions)
+            or self.plots.has_news
             or self._error is not None
             or self._edition != self._follower.edition
             or any(self._changes.get(driver.number) != _seen(driver) for driver in self._follower.drivers)
@@ -119,10 +127,21 @@ class Viewer:
         if self._exact:
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         self._asked = False
-        firsts = {type(question): question for question in reversed(self._questions)}.values()  # one of each kind
-        self._questions = [question for question in self._questions if question not in firsts]
-        for question in firsts:
-            header |= self._answer(question, blobs)
+        if self._questions:
+            header |= self._answer(self._questions.pop(0))
+        blocks = self.plots.blocks()
+        if blocks:
+            told = [
+                {
+                    "number": block.number,
+                    "of": block.of,
+                    "lines": block.lines,
+                    "time_ns": blobs.add(block.time_ns, "<i8"),
+                    "values": blobs.add(block.values, "<f8"),
+                }
+                for block in blocks
+            ]
+            header["plots"] = {"missed": self.plots.missed, "blocks": told}
         if self._error is not None:
             header["error"], self._error = self._error, None
         lives = [driver.life for driver in self._follower.drivers]
@@ -140,6 +159,7 @@ class Viewer:
         return {
             "protocol": PROTOCOL,
             "namespaces": [namespace.name for namespace in namespaces],
+            "names": list(follower.names),
             "drivers": [_driver(driver, scene, blobs) for driver in follower.drivers],
             "links": [
                 {
@@ -163,11 +183,6 @@ class Viewer:
             return
         header["pictures"] = pictures
         header["mode"] = self.look.mode
-        header["contacts"] = [one for driver in self._follower.drivers for one in self._contacts(driver)]
-        header["regions"] = [one for driver in self._follower.drivers for one in _regions(driver)]
-        wiped = self.look.wiped(self._follower.drivers)
-        if wiped is not None:
-            header["wipe"] = wiped._asdict()
 
     def _picture(self, driver: ShownDriver, blobs: Blobs) -> dict[str, Any] | None:
         picture, newest = self.look.picture(driver), driver.newest
@@ -183,15 +198,14 @@ class Viewer:
             "scale": picture.scale,
             "unit": quantity.type.unit,
             "levels": blobs.add(picture.levels, "u1"),
+            "contacts": self._contacts(driver, quantity, newest),
+            "regions": [] if newest.motion is None else _regions(newest.motion),
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
         totals = None if self.look.mode == "wipe" else newest.totals(quantity)
         if totals is not None:
             shown["totals"] = blobs.add(totals, "<f4")
-        contact_of = newest.contact_of(quantity)
-        if contact_of is not None and (contact_of >= 0).any():
-            shown["contact_of"] = blobs.add(contact_of, "i1")
         status, key = newest.status[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):
@@ -199,10 +213,9 @@ class Viewer:
             shown["status"] = blobs.add(status, "u1")
         return shown
 
-    def _contacts(self, driver: ShownDriver) -> list[dict[str, Any]]:
-        quantity, newest = self.look.quantity_of(driver), driver.newest
-        frame = None if newest is None else newest.contacts
-        if quantity is None or frame is None or frame.source.type_name != quantity.type.name:
+    def _contacts(self, driver: ShownDriver, quantity: Quantity, newest: Newest) -> list[dict[str, Any]]:
+        frame = newest.contacts
+        if frame is None or frame.source.type_name != quantity.type.name:
             return []
         laid_out = self._follower.scene.of(driver.name, quantity.name).position
         contacts = []
@@ -214,7 +227,6 @@ class Viewer:
             contacts.append(
                 {
                     "id": contact.id,
-                    "driver": driver.number,
                     "sensor": sensor,
                     "kind": contact.kind.name.lower(),
                     "position": position.tolist(),
@@ -249,17 +261,14 @@ class Viewer:
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
 
-    def _answer(self, question: looks.Names | looks.Series, blobs: Blobs) -> dict[str, Any]:
+    def _answer(self, question: looks.Names) -> dict[str, Any]:
         driver = self._follower.get(question.driver)
-        try:
-            if driver is None:
-                raise ConfigurationError(f"no driver {question.driver}")
-            if isinstance(question, looks.Names):
-                return {"names": _names(driver, question.type)}
-            return {"series": _series(driver, question.position, blobs)}
-        except ConfigurationError as error:
-            self.refuse(str(error))
+        quantity = None if driver is None else driver.quantity(question.type)
+        if driver is None or quantity is None:
+            self.refuse(f"no {question.type!r} of a driver {question.driver}")
             return {}
+        names = driver.structure.sensor_names(quantity.type.name)
+        return {"names": {"driver": driver.number, "type": quantity.name, "of": names}}
 
     def _state(self, problems: list[dict[str, Any]]) -> dict[str, Any]:
         if self._follower.problem is not None:
@@ -272,14 +281,10 @@ class Viewer:
         return {"drivers": drivers, "problems": worst_first(problems)}
 
 
-def _regions(driver: ShownDriver) -> list[dict[str, Any]]:
-    motion = None if driver.newest is None else driver.newest.motion
-    if motion is None:
-        return []
+def _regions(motion: MotionSample) -> list[dict[str, Any]]:
     return [
         {
             "name": region.name,
-            "driver": driver.number,
             "value": region.load,
             "unit": motion.source.unit,
             "touched": region.contacts > 0,
@@ -306,6 +311,7 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "offset": quantity.type.offset,
                 "minimum": quantity.type.minimum,
                 "maximum": quantity.type.maximum,
+                "touch": quantity.is_touch,
                 "n": len(quantity),
                 "index": blobs.add(index, "<u4"),
                 "uid": blobs.add(structure.sensor_uid[index], "<u8"),
@@ -338,27 +344,4 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
             {"name": name, "patch": patch, "kind": kind}
             for name, patch, kind in zip(structure.module_names, structure.module_patch.tolist(), kinds, strict=True)
         ],
-    }
-
-
-def _names(driver: ShownDriver, type_name: str) -> dict[str, Any]:
-    quantity = driver.quantity(type_name)
-    if quantity is None:
-        raise ConfigurationError(f"no {type_name!r} in driver {driver.name!r}")
-    return {"driver": driver.number, "type": type_name, "of": driver.structure.sensor_names(quantity.type.name)}
-
-
-def _series(driver: ShownDriver, position: int, blobs: Blobs) -> dict[str, Any]:
-    structure = driver.structure
-    if position >= structure.n_sensors:
-        raise ConfigurationError(f"no sensor {position} in driver {driver.name!r}")
-    times_ns, raw = driver.past.series(position)
-    of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
-    newest_ns = times_ns[-1] if len(times_ns) else 0
-    return {
-        "driver": driver.number,
-        "position": position,
-        "newest_ns": str(newest_ns),
-        "time_s": blobs.add((times_ns - newest_ns) / NS_PER_S, "<f4"),
-        "value": blobs.add(raw * of_type.scale + of_type.offset, "<f4"),
     }

@@ -22,12 +22,12 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE
+from skinware.text import nearest_name
 from skinware_drivers import Link, Match, Notice, Options, Patch, Poll
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.fields import Reply
 from skinware_drivers.link import Heard
-from skinware_drivers.options import nearest_name
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -54,7 +54,7 @@ class CanopenOptions(Options, frozen=True):
         if len(set(self.nodes)) < len(self.nodes) or not set(self.nodes) <= set(range(FIRST_NODE, LAST_NODE + 1)):
             raise ConfigurationError(f"nodes {self.nodes}: give different ids of {FIRST_NODE} to {LAST_NODE}")
         if self.type not in CATALOGUE:
-            raise ConfigurationError(f"type {self.type!r}{nearest_name(self.type, CATALOGUE)}")
+            raise ConfigurationError(f"type {self.type!r}{nearest_name(self.type, sorted(CATALOGUE))}")
 
 
 class MappingChanged(BusError):

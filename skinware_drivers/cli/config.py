@@ -114,8 +114,8 @@ def _through_driver(
     yes: bool,
 ) -> dict[str, Any]:
     from skinware import DriverReader
+    from skinware.text import nearest_name
     from skinware_drivers.operations import operations_of
-    from skinware_drivers.options import nearest_name
     from skinware_drivers.registry import load_driver
 
     with DriverReader(owner.name, namespace=owner.namespace, announce=False) as reader:
@@ -130,7 +130,9 @@ def _through_driver(
         if operation not in offered:
             if known is not None and known.alone:
                 raise ConfigurationError(f"{operation} needs the bus without a driver: end {owner} first")
-            raise ConfigurationError(f"{owner} has no operation {operation!r}{nearest_name(operation, offered)}")
+            raise ConfigurationError(
+                f"{owner} has no operation {operation!r}{nearest_name(operation, sorted(offered))}"
+            )
         if bus is not None:
             arguments = {**arguments, "bus": bus}
         if known is None or not known.looks:

@@ -195,3 +195,7 @@ def _progress() -> Callable[[float], None]:
 
 def main() -> None:
     cli.run(command)
+
+
+if __name__ == "__main__":
+    main()

@@ -12,7 +12,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo
-from skinware_drivers.options.declared import nearest_name
+from skinware.text import nearest_name
 
 
 class Tool(NamedTuple):

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError, ConfigurationError, HandshakeTimeout
+from skinware.text import nearest_name
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.description import Patch
 from skinware_drivers.finding.guess import Traffic, patches_heard
 from skinware_drivers.link import Link
 from skinware_drivers.operations import check_arguments, operations_of
-from skinware_drivers.options import nearest_name
 
 
 @asynccontextmanager
@@ -94,7 +94,7 @@ async def carry_out(
     """
     declared = operations_of(type(adapter), alone=True)
     if operation not in declared:
-        raise ConfigurationError(f"no operation {operation!r}{nearest_name(operation, declared)}")
+        raise ConfigurationError(f"no operation {operation!r}{nearest_name(operation, sorted(declared))}")
     wanted = declared[operation]
     arguments = dict(arguments)
     patch_name = arguments.pop("patch", None)
@@ -145,8 +145,7 @@ def _meant(patches: Sequence[Patch], name: object) -> Sequence[Patch]:
         return patches
     meant = [patch for patch in patches if patch.name == name]
     if not meant:
-        there_are = ", ".join(patch.name for patch in patches) or "none"
-        raise ConfigurationError(f"no patch {name!r}; there are: {there_are}")
+        raise ConfigurationError(f"no patch {name!r}{nearest_name(str(name), [patch.name for patch in patches])}")
     return meant
 
 

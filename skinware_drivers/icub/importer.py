@@ -12,6 +12,7 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
 from skinware.tactile.regions import Region, regions_to_toml
+from skinware.text import nearest_name
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import (
     Drawing,
@@ -238,8 +239,8 @@ def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
         raise ConfigurationError(f"no device of type {' or '.join(DEVICE_TYPES)} in what was read")
     for name in names:
         if not any(device.name == name for device in found):
-            there_are = ", ".join(sorted(device.name for device in found))
-            raise ConfigurationError(f"--part {name}: there is none; there are: {there_are}")
+            others = nearest_name(name, sorted(device.name for device in found))
+            raise ConfigurationError(f"--part {name}: there is none{others}")
     return [device for device in found if not names or device.name in names]
 
 

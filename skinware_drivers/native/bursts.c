@@ -1,4 +1,4 @@
-/* Where one frame of the skin ends and the next begins: running/bursts.py and SkinState.show.
+/* Where one frame of the skin ends and the next begins: tests/specification/bursts.py.
  *
  * Updates are numbers; `list` holds those of the take in order of time. An element of `before` is what Bursts._previous
  * says of the update at the same place.

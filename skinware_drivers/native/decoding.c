@@ -1,4 +1,4 @@
-/* Frames in, updates out: SpecifiedDecoder.decode. */
+/* Frames in, updates out: tests/specification/decoding.py. */
 #include "inside.h"
 
 #include <stdlib.h>

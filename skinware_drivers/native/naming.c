@@ -1,4 +1,4 @@
-/* Whose is each frame, and of what kind: SpecifiedDecoder.name. */
+/* Whose is each frame, and of what kind: tests/specification/decoding.py. */
 #include "inside.h"
 
 static int64_t find_code(const int64_t *codes, int64_t n, int64_t code)

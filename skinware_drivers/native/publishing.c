@@ -1,4 +1,4 @@
-/* When a frame is published, and what it says: running/publisher.py and patch_timing.py. */
+/* When a frame is published, and what it says: running/publisher.py, tests/specification/publishing.py. */
 #include "inside.h"
 
 int64_t path_time_ns(const struct path *path)

@@ -8,7 +8,6 @@ from skinware_drivers.options.declared import (
     OptionsT,
     check_names,
     describe_options,
-    nearest_name,
     option_text,
     options_from_strings,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "OptionsT",
     "check_names",
     "describe_options",
-    "nearest_name",
     "option_text",
     "options_from_strings",
 ]

@@ -8,10 +8,9 @@ The fields of an options class carry a description::
 
 from __future__ import annotations
 
-import difflib
 import re
 import types
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Mapping, Set
 from typing import (
     Annotated,
     Any,
@@ -30,16 +29,9 @@ import msgspec
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
+from skinware.text import nearest_name
 
 SOURCE_SUFFIX = ".py"
-
-
-def nearest_name(wrong: str, right: Iterable[str]) -> str:
-    """Return the end of an error message about an unknown name: the nearest known one, and all known ones."""
-    names = sorted(right)
-    nearest = difflib.get_close_matches(wrong, names, n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
-    return f"{hint} Known: {', '.join(names) or 'none'}"
 
 
 def is_file(name: str) -> bool:
@@ -73,7 +65,7 @@ def options_from_strings(
     values: dict[str, Any] = {}
     for name, text in strings.items():
         if name not in fields:
-            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, [*fields, *beside])}")
+            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, sorted([*fields, *beside]))}")
         hint = hints[fields[name].name]
         try:
             values[fields[name].name] = msgspec.convert(_split(text, plain_type(hint)), hint, strict=False)

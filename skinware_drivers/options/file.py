@@ -27,8 +27,9 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
+from skinware.text import nearest_name
 from skinware.toml_text import Keys, TomlText, wrong_value
-from skinware_drivers.options.declared import is_file, nearest_name, options_from_strings
+from skinware_drivers.options.declared import is_file, options_from_strings
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -170,4 +171,4 @@ def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = ()) ->
     for key in data if isinstance(data, Mapping) else ():
         if key not in known:
             of_bus = f"bus {place[1] + 1}: " if len(place) > 1 and isinstance(place[1], int) else ""
-            raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, known)}", (*place, key))
+            raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, sorted(known))}", (*place, key))

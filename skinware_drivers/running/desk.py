@@ -12,6 +12,7 @@ from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import now_ns
 from skinware.service import Request, RequestServer
 from skinware.service.messages import ACQUIRE
+from skinware.text import nearest_name
 from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.running.bus_line import BusLine
@@ -139,14 +140,14 @@ class RequestDesk:
     def _meant(self, able: Sequence[BusLine], bus: object, patch: object) -> list[tuple[BusLine, Sequence[Patch]]]:
         lines = [line for line in able if bus in (None, line.name) and line.patches]
         if not lines:
-            there_are = ", ".join(line.name for line in able if line.patches) or "none"
-            raise ConfigurationError(f"no bus {bus!r} with patches; there are: {there_are}")
+            others = nearest_name(str(bus), [line.name for line in able if line.patches])
+            raise ConfigurationError(f"no bus {bus!r} with patches{others}")
         if patch is None:
             return [(line, line.patches or ()) for line in lines]
         meant = [(line, [p for p in line.patches or () if p.name == patch]) for line in lines]
         if not any(patches for _, patches in meant):
-            there_are = ", ".join(p.name for line in lines for p in line.patches or ())
-            raise ConfigurationError(f"no patch {patch!r}; there are: {there_are}")
+            others = nearest_name(str(patch), [p.name for line in lines for p in line.patches or ()])
+            raise ConfigurationError(f"no patch {patch!r}{others}")
         return [(line, patches) for line, patches in meant if patches]
 
 

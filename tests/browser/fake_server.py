@@ -69,12 +69,14 @@ class FakeDriver:
         self.levels = np.zeros(self.n, np.uint8)
         self.status = np.zeros(self.n, np.uint8)
         self.shear = np.zeros((self.n, 2), np.int8) if shear else None
-        self.type, self.unit = "pressure", "counts"
+        self.type, self.unit, self.is_touch = "pressure", "counts", True
         self.scale: tuple[float, float] = (0, 250)
         self.state = "live"
         self.generation = "1"
         self.sequence = 0
         self.problems: list[Header] = []
+        self.contacts: list[Header] = []
+        self.regions: list[Header] = []
         self.position, self.normal = self._places()
 
     def _places(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
@@ -105,6 +107,7 @@ class FakeDriver:
         kind: Header = {
             "name": self.type,
             "unit": self.unit,
+            "touch": self.is_touch,
             "scale": 1.0,
             "offset": 0.0,
             "minimum": 0,
@@ -150,6 +153,8 @@ class FakeDriver:
             "scale": list(self.scale),
             "unit": self.unit,
             "levels": self.levels,
+            "contacts": self.contacts,
+            "regions": self.regions,
             "status": self.status,
         }
         if self.shear is not None:
@@ -213,6 +218,8 @@ class FakeServer:
         self.turns = 0
         self.muted = False
         self.links: list[Header] = []
+        self.names: list[str] = []
+        self.findings: list[Header] = []
         self.files: dict[str, bytes] = {}
         self._server = serve(
             self._talk, "127.0.0.1", port, process_request=self._file, compression=None, ping_interval=None
@@ -266,6 +273,7 @@ class FakeServer:
                     told = self.version
                     drivers = [d.told() for d in self.drivers]
                     header["skin"] = {"namespaces": ["default"], "drivers": drivers, "links": self.links}
+                    header["skin"]["names"] = self.names
                 header["mode"] = self.look["mode"]
                 header["pictures"] = [d.picture() for d in self.drivers if d.state == "live"]
                 if last - state_at > 0.5:
@@ -275,6 +283,7 @@ class FakeServer:
                         "problems": [p for d in self.drivers for p in d.problems],
                         "recording": self.extra.get("recording"),
                         "replay": self.extra.get("replay"),
+                        "findings": self.findings,
                     }
                 header.update({k: v for k, v in self.extra.items() if k not in ("recording", "replay")})
                 header.update(answers)
@@ -297,10 +306,12 @@ class FakeServer:
                 for i in range(driver.n)
             ]
             return {"names": {"driver": op["driver"], "type": op["type"], "of": names}}
-        if op["op"] == "series":
-            t = np.linspace(-10, 0, 500, dtype=np.float32)
-            value = (40 + 30 * np.sin(t + op["position"]) ** 8 + 1.5 * np.sin(37 * t)).astype(np.float32)
-            return {"series": {"driver": op["driver"], "position": op["position"], "time_s": t, "value": value}}
+        if op["op"] == "plot":
+            t = np.linspace(-10, 0, 500)
+            value = np.repeat(40 + 30 * np.sin(t) ** 8 + 1.5 * np.sin(37 * t), len(op["lines"]))
+            time_ns = MONOTONIC_NS + time.monotonic_ns() + (1e9 * t).astype(np.int64)
+            block = {"number": op["number"], "of": "driver", "lines": list(range(len(op["lines"])))}
+            return {"plots": {"missed": 0, "blocks": [block | {"time_ns": time_ns, "values": value}]}}
         return {}
 
     def _exact(self, number: int, position: int) -> Header:

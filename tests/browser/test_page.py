@@ -113,8 +113,8 @@ def test_taxels_are_read_and_pinned_without_a_mouse(page: Page, server: FakeServ
     page.keyboard.press("p")
     until(page, "skin.pins.join() === '0,1'")
     assert asked(server, "exact")[-1]["sensors"] == [[0, 1]]
-    wait_until(lambda: {"op": "series", "driver": 0, "position": 1} in server.ops)
-    until(page, "document.querySelector('[data-role=pin] polyline').getAttribute('points')")
+    wait_until(lambda: {"driver": 0, "position": 1} in asked(server, "plot")[-1]["lines"])
+    until(page, "document.querySelector('[data-role=pin] path').getAttribute('d')")
     page.keyboard.press("Escape")
     until(page, "!skin.pins.length && skin.hovered === null")
     wait_until(lambda: asked(server, "exact")[-1]["sensors"] == [])
@@ -179,7 +179,7 @@ def test_a_replay_is_controlled(page: Page, server: FakeServer) -> None:
 def test_a_wipe_test_lists_what_was_not_touched(page: Page, server: FakeServer, driver: FakeDriver) -> None:
     driver.levels[:] = 250
     driver.levels[[3, 141]] = [249, 0]
-    server.extra["wipe"] = {"touched": 158, "of": 160}
+    server.look["mode"] = "wipe"
     page.locator(role("mode", "[data-mode=wipe]")).click()
     until(page, "skin.untouched.join() === '0,3,0,141'")
     with page.expect_download() as download:
@@ -202,11 +202,11 @@ def test_a_picture_shows_what_the_page_shows(page: Page, driver: FakeDriver) -> 
 
 def test_figures_of_contacts_and_regions_do_not_wrap(page: Page, server: FakeServer, driver: FakeDriver) -> None:
     """Also where their units differ, and are told beside each."""
-    contact = {"kind": "sliding", "load": 12345.6, "speed": 0.1234, "age_s": 0.456, "taxels": 9, "driver": 0}
+    contact = {"kind": "sliding", "load": 12345.6, "speed": 0.1234, "age_s": 0.456, "taxels": 9}
     place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "area_m2": 4e-4}
-    server.extra["contacts"] = [{"id": i, "unit": unit} | contact | place for i, unit in ((8, "counts"), (1234, "N"))]
-    server.extra["regions"] = [
-        {"name": name, "value": 12345.6, "unit": "counts", "speed": 0.0, "touched": True, "driver": 0}
+    driver.contacts = [{"id": i, "unit": unit} | contact | place for i, unit in ((8, "counts"), (1234, "N"))]
+    driver.regions = [
+        {"name": name, "value": 12345.6, "unit": "counts", "speed": 0.0, "touched": True}
         for name in ("palm", "the whole of the left forearm")
     ]
     until(page, "skin.contacts.length === 2")
@@ -223,8 +223,8 @@ def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: Fa
     before = look(page)
     driver.shear[60:70] = 100
     contact = {"id": 12, "kind": "hold", "load": 31.5, "unit": "counts", "speed": 0.0, "age_s": 2.0, "area_m2": 4e-4}
-    place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9, "driver": 0}
-    server.extra["contacts"] = [contact | place]
+    place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9}
+    driver.contacts = [contact | place]
     until(page, "skin.contacts.length === 1 && skin.contacts[0].id === 12")
     assert "load, counts\tmm/s\ts" in page.locator("#contacts").inner_text()
     assert "12\thold\t31.5\t0\t2" in page.locator("#contacts").inner_text()
@@ -297,6 +297,7 @@ def test_the_legend_is_of_what_is_shown(page: Page, server: FakeServer, in_newto
     page.get_by_text("finger", exact=True).first.click()
     until(page, f"!{LEGEND}.includes('sheet')")
     assert rows.all_inner_texts()[0].split() == ["0", "1.5", "N", "finger", "force_z"]
+    page.keyboard.press("Escape")
     page.locator("#types select").select_option("force_z")
     page.locator("#scale").wait_for(state="visible")
     assert page.locator("#unit").inner_text() == "N"

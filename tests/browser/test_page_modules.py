@@ -227,22 +227,65 @@ def test_a_bad_address_is_no_view(tell: Callable[..., Any], text: str) -> None:
     assert found["pins"] == []
 
 
-# -- spark.js, format.js -------------------------------------------------------------------------------------------
+# -- curves.js, series.js, spectrum.js, format.js ------------------------------------------------------------------
 
 
 def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> None:
-    """One sample among a thousand is not lost; what is older than the line is left out."""
-    line = "m.polyline(Float32Array.from(a[0]), Float32Array.from(a[1]), 100, 50, 10)"
-    times = [-12 + i * 0.01 for i in range(1201)]
-    values = [0.0] * 1201
-    values[0], values[700] = 99, 5
-    found = tell("spark.js", line, times, values)
-    assert (found["low"], found["high"]) == (0, 5)
-    points = [tuple(map(float, point.split(","))) for point in found["points"].split()]
-    assert min(y for _, y in points) == 3
-    assert all(0 <= x <= 100 for x, _ in points)
-    assert tell("spark.js", line, [], []) == {"points": "", "low": None, "high": None}
-    assert tell("spark.js", "m.polyline(Float32Array.of(-1, 0), Float32Array.of(NaN, NaN), 9, 9, 10).points") == ""
+    """One sample among a thousand is not lost; what is not in the window is left out; a gap stays one."""
+    window = "{from: 10, to: 20, width: 100}"
+    line = f"m.piecesOf(Float64Array.from(a[0]), Float64Array.from(a[1], x => x ?? NaN), {window})"
+    times = [8 + i * 0.01 for i in range(1301)]
+    values: list[float | None] = [0.0] * 1301
+    values[0], values[700], values[1000] = 99, 5, None
+    before, after = tell("curves.js", line, times, values)
+    points = [*before, *after]
+    assert max(y for _, y in points) == 5
+    assert all(-1 <= x <= 101 for x, _ in points)
+    assert before[-1][0] <= 80 <= after[0][0]
+    assert len(points) < 400
+    few = tell("curves.js", line, times[700:710], [1, 2, None, 4, 5, 6, None, None, 9, 10])
+    assert [[y for _, y in piece] for piece in few] == [[1, 2], [4, 5, 6], [9, 10]]
+    assert tell("curves.js", line, [], []) == []
+    assert tell("curves.js", f"m.rangeOf({line})", times, [None] * 1301) is None
+
+
+def test_ticks_are_round(tell: Callable[..., Any]) -> None:
+    assert tell("curves.js", "m.ticksOf(-60, 0, 6)") == [-60, -50, -40, -30, -20, -10, 0]
+    assert tell("curves.js", "m.ticksOf(0.012, 0.031, 4)") == [0.015, 0.02, 0.025, 0.03]
+    assert tell("curves.js", "m.ticksOf(1, 1, 4)") == []
+
+
+def test_a_line_keeps_a_minute_in_bounded_memory(tell: Callable[..., Any]) -> None:
+    script = """(() => {
+      const series = new m.Series();
+      for (let k = 0; k < a[0]; k++) series.push(k * a[1], k);
+      series.push(5, 5);
+      return [series.times.length, series.values[0], series.values.at(-1), series.time_ns.length];
+    })()"""
+    assert tell("series.js", script, 100, 1e9) == [61, 39, 99, 2048]  # a sample a second
+    assert tell("series.js", script, 300_000, 1e5) == [65_536, 300_000 - 65_536, 299_999, 131_072]
+
+
+def test_a_spectrum_has_the_amplitude_at_its_frequency(tell: Callable[..., Any]) -> None:
+    times = np.arange(1100) / 200 * 1e9 + 5e12
+    values = 3 * np.sin(2 * np.pi * 12.5 * times / 1e9) + 7
+    script = "m.spectrumOf(Float64Array.from(a[0]), Float64Array.from(a[1], x => x ?? NaN))"
+    for gap in (None, 20):  # the longest piece counts
+        told: list[float | None] = values.tolist()
+        if gap is not None:
+            told[gap] = None
+        found = tell(
+            "spectrum.js",
+            f"(({{amplitude, ...more}}) => ({{...more, amplitude: [...amplitude]}}))({script})",
+            times.tolist(),
+            told,
+        )
+        amplitude = np.array(found["amplitude"])
+        assert found["rate_hz"] == pytest.approx(200)
+        assert found["step_hz"] * amplitude.argmax() == pytest.approx(12.5, abs=found["step_hz"])
+        assert amplitude.max() == pytest.approx(3, rel=0.01)
+        assert amplitude[abs(np.arange(len(amplitude)) * found["step_hz"] - 12.5) > 1].max() < 0.01
+    assert tell("spectrum.js", script, times[:10].tolist(), values[:10].tolist()) is None
 
 
 def test_figures(tell: Callable[..., Any]) -> None:

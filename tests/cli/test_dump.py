@@ -15,11 +15,9 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Namespace, ServiceWriter, Status
-from skinware.cli import dump
 from skinware.cli._command import exit_status
-from skinware.cli.dump import _attach, _frames
 from skinware.errors import ServiceNotFound, ServiceTimeout
-from skinware_drivers.cli.dump import command
+from skinware_drivers.cli.dump import _attach, _frames, _reattach, command
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, PATIENCE_S
 
@@ -136,7 +134,7 @@ def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[st
         (["-n", "0"], 2, "-n"),
         (["--rate", "0", "here"], 2, "rate of 0.0 Hz"),
         (["--rate", "nan", "here"], 2, "rate of nan Hz"),
-        (["--type", "presure", "here"], 2, "it has: pressure, temperature"),
+        (["--type", "presure", "here"], 2, "There are: pressure, temperature"),
         (["contacts"], 1, "'contacts' is not a driver"),
     ],
 )
@@ -225,9 +223,9 @@ def test_a_driver_that_changed_and_went_again_is_waited_for(monkeypatch: pytest.
     skin.publish()
     with DriverReader("a") as reader:
         skin.close()
-        monkeypatch.setattr(dump, "_LOOK_EVERY_S", 0.001)
+        monkeypatch.setattr("skinware_drivers.cli.dump._LOOK_EVERY_S", 0.001)
         with pytest.raises(ServiceNotFound):
-            dump._reattach(reader, 0.01)
+            _reattach(reader, 0.01)
 
 
 @pytest.mark.usefixtures("context")

@@ -205,7 +205,7 @@ def test_no_sensors_and_no_such_type() -> None:
     nothing = arrange(structure, [], "pressure", 80, 24)
     assert (len(nothing.sensors), nothing.lines) == (0, 0)
     assert nothing.draw(np.zeros(0, np.uint8)).shape == (0, 1)
-    with pytest.raises(StructureError, match="it has: pressure, temperature"):
+    with pytest.raises(StructureError, match="There are: pressure, temperature"):
         arrange(structure, [0], "presure", 80, 24)
 
 

@@ -96,7 +96,7 @@ def test_a_sensor_is_found_by_type_and_uid() -> None:
             layout.position("pressure", 5)
         with pytest.raises(StructureError, match="of driver 'b'"):
             layout.position("temperature", 1022, "b")
-        with pytest.raises(StructureError, match="no sensor type 'heat' in this skin; it has: pressure, temperature"):
+        with pytest.raises(StructureError, match="no sensor type 'heat' in this skin; there are: pressure, temp"):
             layout.position("heat", 1)
 
 
@@ -104,7 +104,7 @@ def test_no_driver() -> None:
     with Skin() as skin:
         with pytest.raises(ServiceTimeout, match="no driver runs in namespace"):
             skin.read(timeout_s=0.0)
-        with pytest.raises(ServiceNotFound, match="no driver 'a' in this skin now; it has: none"):
+        with pytest.raises(ServiceNotFound, match="no driver 'a' in this skin now; there are: none"):
             skin.reader("a")
     with pytest.raises(Closed):
         skin.read()

@@ -58,7 +58,7 @@ def test_frames_and_snapshots_have_one_form() -> None:
             for name in ("raw", "physical", "status_of", "time_ns", "fresh"):
                 alone = getattr(snapshot.of("leg"), name)("pressure")
                 assert alone.tolist() == getattr(snapshot, name)("pressure")[20:].tolist()
-            with pytest.raises(StructureError, match="no driver 'head' in this snapshot; it has: arm, leg"):
+            with pytest.raises(StructureError, match="no driver 'head' in this snapshot; there are: arm, leg"):
                 snapshot.of("head")
 
 

@@ -90,7 +90,7 @@ def test_physical_values_use_scale_and_offset() -> None:
     raw = np.array([240, 0, 7, 9], np.uint8)
     assert structure.physical(raw, "pressure").tolist() == [15.0, 255.0]
     assert structure.physical(raw, "temperature").tolist() == [7.0, 9.0]
-    with pytest.raises(StructureError, match="it has: pressure, temperature"):
+    with pytest.raises(StructureError, match="there are: pressure, temperature"):
         structure.physical(raw, "shear_x")
 
 

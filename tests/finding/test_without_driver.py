@@ -81,7 +81,7 @@ def test_the_only_board_need_not_be_named() -> None:
         ({"address": 15, "patch": "board 7"}, "boards have 1 to 14"),
         ({"address": 0, "patch": "board 7"}, "boards have 1 to 14"),
         ({"address": 9}, "boards 7, 8: say which one"),
-        ({"address": 9, "patch": "board 6"}, "no patch 'board 6'; there are: board 7, board 8"),
+        ({"address": 9, "patch": "board 6"}, "no patch 'board 6'; did you mean 'board 8'"),
         ({"patch": "board 7"}, "it takes: bus, patch, address"),
         ({"address": "x", "patch": "board 7"}, "boards have 1 to 14"),
     ],

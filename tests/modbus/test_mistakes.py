@@ -101,7 +101,7 @@ def test_blocks_of_several_patches_may_have_the_same_channels() -> None:
         ("modbus:tcp://host?byte_order=middle", r"option byte_order=middle: give one of big, little$"),
         ("modbus:tcp://host?byte_ordr=little", r"did you mean 'byte_order'\?"),
         ("modbus:/dev/ttyUSB0?baudrate=fast", r"option baudrate=fast: give a whole number$"),
-        ("modbus:/dev/ttyUSB0?baud=9600", r"did you mean 'baudrate'\? Known: baudrate, byte_order"),
+        ("modbus:/dev/ttyUSB0?baud=9600", r"did you mean 'baudrate'\? There are: baudrate, byte_order"),
         ("modbus:tcp://host?gateway=abc", r"gateway=abc: which port\? Give PORT, HOST:PORT, or a path"),
     ],
 )

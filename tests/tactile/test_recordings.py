@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from skinware.realtime import NS_PER_S
 from skinware.tactile.baseline import Baseline
 
 TRIALS = Path(__file__).resolve().parents[3] / "shared" / "data" / "icub_grasp" / "trials"
@@ -64,3 +65,23 @@ def test_a_firm_grasp_is_seen_to_its_end(name: str) -> None:
     for trial in trials(name):
         count = touched_fingers(trial)
         assert count.max() >= len(frames_of(trial)) - 3, trial.stem
+
+
+@pytest.mark.parametrize("rate_hz", [5, 10, 20, 50])
+def test_trials_in_one_go_leave_idle_fingers_alone_though_their_taxels_jump_between_them(rate_hz: int) -> None:
+    finger = np.repeat(np.arange(FINGERS), TAXELS)
+    baseline = Baseline(finger, np.zeros_like(finger))
+    in_contact: list[bool] = []
+    grasps: list[bool] = []
+    for path in trials(""):
+        touched = np.zeros(FINGERS, bool)
+        for frame in frames_of(path):
+            calm = baseline.update((len(in_contact) + 1) * NS_PER_S // rate_hz, frame)
+            if not in_contact:
+                baseline.tare()
+            fingers = np.array([calm.touched[finger == number].any() for number in range(FINGERS)])
+            in_contact.append(bool(fingers[IDLE[0] :].any()))
+            touched |= fingers
+        grasps.append(bool(touched.any()))
+    assert np.mean(in_contact) < 0.01
+    assert all(grasps[NOTHING:-NOT_CLOSED])  # without blue_bear and none

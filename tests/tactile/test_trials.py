@@ -24,3 +24,8 @@ def test_short_trials_hold() -> None:
 def test_few_levels_are_enough(name: str) -> None:
     trial = next(trial for trial in TRIALS if trial.name == name)
     assert run([trial], seeds=4, rate_hz=20)[0].misses(trial) == {}
+
+
+def test_losses_at_a_low_rate_leave_enough_to_measure_the_rest() -> None:
+    trial = next(trial for trial in TRIALS if trial.name == "30 % lost")
+    assert run([trial], seeds=4, rate_hz=5)[0].misses(trial) == {}

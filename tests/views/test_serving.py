@@ -10,6 +10,7 @@ import pytest
 
 from skinware import Namespace, Status
 from skinware.geometry import Geometry
+from skinware.realtime import now_ns
 from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import history
@@ -139,37 +140,20 @@ def test_only_those_that_are_named(serving: Serve) -> None:
         assert drivers(page) == ["arm", "torso"]
 
 
-def test_names_series_and_values(serving: Serve) -> None:
+def test_names_and_values(serving: Serve) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))) as skin, serving() as url, page_of(url) as page:
         page.pull_picture()
         page.say("names", driver=0, type="pressure")
-        page.say("series", driver=0, position=3)
-        page.say("series", driver=0, position=4)
         page.say("exact", sensors=[[0, 3], [0, 11], [5, 3], [0, 99_999]])
         turn = page.pull()
         assert turn["names"]["of"][3] == "board 7, triangle 0, taxel 3"
         assert turn["names"]["of"][10] == "board 7, triangle 1, taxel 0"
-        assert turn["series"]["position"] == 3
-        assert page.pull()["series"]["position"] == 4
         skin.values = np.full(24, 200)
         turn = page.pull_until(lambda turn: turn["exact"][0]["raw"] == 200)
         pressure, temperature = turn["exact"]  # the others are not there
         assert (pressure["position"], pressure["value"], pressure["status"]) == (3, 55.0, 0)
         assert (temperature["position"], temperature["value"]) == (11, 100.0)
         assert pressure["age_ms"] >= 0
-
-        def is_long(turn: object) -> bool:
-            page.say("series", driver=0, position=3)
-            return len(page.pull()["series"]["value"]) > 0
-
-        assert is_long(turn)
-        page.say("series", driver=0, position=3)
-        turn = page.pull_until(lambda turn: "series" in turn)
-        times, values = (turn.array(turn["series"][name], "f") for name in ("time_s", "value"))
-        assert len(times) == len(values) > 1
-        assert times[-1] == 0
-        assert (np.diff(times) > 0).all()
-        assert values[-1] == 55
 
 
 def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,16 +177,15 @@ def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch
         page.say("tare")
         page.pull_picture(condition=lambda picture: not picture["levels"].any())
         page.say("look", mode="wipe")
-        turn = page.pull_until(lambda turn: "wipe" in turn)
-        assert turn["wipe"] == {"touched": 0, "of": 20, "running": True}
+        page.pull_until(lambda turn: turn.header.get("mode") == "wipe")
+        assert not page.pull_picture()["levels"].any()
         skin.values = touched
-        turn = page.pull_until(lambda turn: turn.header.get("wipe", {}).get("touched"))
-        assert turn["wipe"] == {"touched": 4, "of": 20, "running": True}
+        page.pull_picture(condition=lambda picture: picture["levels"].any())
         skin.values = np.full(24, 240)
         picture = page.pull_picture()
         assert np.flatnonzero(picture["levels"] == 250).tolist() == [4, 5, 6, 7]
         page.say("wipe", action="start")
-        page.pull_until(lambda turn: turn.header.get("wipe") == {"touched": 0, "of": 20, "running": True})
+        page.pull_picture(condition=lambda picture: not picture["levels"].any())
 
 
 def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace) -> None:
@@ -228,18 +211,17 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         value[[2, 3]] = 60
         contacts.publish(value, value > 0, 10**9)
         page.say("look", mode="change")
-        turn = page.pull_until(lambda turn: turn.header.get("contacts"))
-        (contact,) = turn["contacts"]
-        assert (contact["driver"], contact["taxels"], contact["kind"]) == (0, 2, "touch")
+        (contact,) = page.pull_picture(condition=lambda picture: picture["contacts"])["contacts"]
+        assert (contact["taxels"], contact["kind"]) == (2, "touch")
         assert contact["load"] == pytest.approx(120)
         middle = geometry.position_m[[2, 3]].mean(axis=0) + np.array([1, 2, 3])
         assert contact["position"] == pytest.approx(middle.tolist(), abs=1e-6)
         picture = page.pull_picture(condition=lambda picture: picture["levels"][2] > 100)
         assert np.flatnonzero(picture["levels"]).tolist() == [2, 3]
-        assert np.flatnonzero(picture["contact_of"] >= 0).tolist() == [2, 3]
         assert picture["totals"].tolist() == [120, 0]  # by module
         assert page.status[0, "pressure"][9] & Status.UNHEALTHY
         assert types(page)["pressure"]["placed"]
+        assert {name: told["touch"] for name, told in types(page).items()} == {"pressure": True, "temperature": False}
 
 
 def test_shear_is_how_far_two_axes_are_from_rest(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,6 +281,7 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         stale = next(problem for problem in page.state["problems"] if problem["text"].startswith("board 10 is stale"))
         assert (stale["bus"], stale["patch"]) == ("can1", "board 10")
         lost = next(problem for problem in page.state["problems"] if "frames dropped" in problem["text"])
-        assert set(lost) == {"severity", "driver", "text"}  # of none alone
+        assert set(lost) == {"severity", "driver", "text", "since_ns"}  # of none alone
+        assert 0 < int(lost["since_ns"]) <= now_ns()
         assert (page.state["recording"], page.state["replay"]) == (None, None)
         assert json.dumps(page.state)

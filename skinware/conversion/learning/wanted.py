@@ -16,6 +16,7 @@ import numpy.typing as npt
 from skinware.conversion.tables import TableSource, pyarrow
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
+from skinware.text import nearest_name
 
 _COLUMNS = ("start_s", "end_s", "task", "file")
 RESERVED = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task")
@@ -190,7 +191,7 @@ class Joined:
         chosen = join.columns or tuple(name for name in columns if name not in TIMES)
         for name in chosen:
             if name not in columns:
-                raise ConfigurationError(f"{self.path}: no column {name!r}; there are: {', '.join(columns)}")
+                raise ConfigurationError(f"{self.path}: no column {name!r}{nearest_name(name, columns)}")
         self.names, self.rows = self._joined({name: columns[name] for name in chosen})
         if len(self.rows) != len(self._times):
             raise ConfigurationError(f"{self.path}: {len(self.rows)} rows with {len(self._times)} times")

@@ -12,7 +12,7 @@ export class Bar {
     this.own = h("span", { class: "figure own", title: "Pictures that this page draws" });
   }
 
-  update(skin, states, stage, recording) {
+  update(skin, states, stage) {
     for (const id of this.#chips.keys()) if (!skin.drivers.has(id)) this.#chips.delete(id);
     for (const [id, driver] of skin.drivers) {
       if (!this.#chips.has(id)) this.#chips.set(id, h("span", { class: "figure" }, h("b"), h("span")));

@@ -3,22 +3,23 @@
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { age, figure, measure } from "./format.js";
 import { markOf, NO_ACK, statusText } from "./marks.js";
-import { polyline } from "./spark.js";
+import { pathOf, piecesOf, rangeOf } from "./curves.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const ROWS = ["raw", "age", "noise", "uid", "driver"];
-const [WIDTH, HEIGHT] = [220, 44];
+const [WIDTH, HEIGHT, MARGIN] = [220, 44, 3];
 const SHOWN_S = 10;
 
 class Card {
-  constructor(probe, close) {
+  constructor(probe, plotting, close) {
     this.probe = probe;
+    this.plotting = plotting;
     this.letter = h("b", { class: "letter" });
     this.name = h("strong");
     this.value = h("output", { class: "value" });
     this.status = h("span", { class: "status" });
     this.cells = Object.fromEntries(ROWS.map((row) => [row, h("dd")]));
-    this.line = document.createElementNS(SVG, "polyline");
+    this.line = document.createElementNS(SVG, "path");
     this.svg = document.createElementNS(SVG, "svg");
     this.svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
     this.svg.setAttribute("preserveAspectRatio", "none");
@@ -33,6 +34,7 @@ class Card {
         {},
         close ? this.letter : null,
         this.name,
+        close ? plotting.button(() => plotting.taxel(probe)) : null,
         close ? h("button", { type: "button", class: "plain", "aria-label": "Let go", onclick: close }, "✕") : null,
       ),
       h("p", {}, this.value, this.status),
@@ -40,6 +42,7 @@ class Card {
       this.span,
       h("dl", {}, ...ROWS.flatMap((row) => [h("dt", {}, row), this.cells[row]])),
     );
+    if (close) plotting.draggable(this.element, () => plotting.taxel(probe));
   }
 
   update(past) {
@@ -63,12 +66,17 @@ class Card {
     this.#draw();
   }
 
+  /** The line of the last seconds. */
   #draw() {
-    if (!this.probe.series || this.drawn === this.probe.series) return;
-    this.drawn = this.probe.series;
-    const { points, low, high } = polyline(this.drawn.time_s, this.drawn.value, WIDTH, HEIGHT, SHOWN_S);
-    this.line.setAttribute("points", points);
-    const text = points ? `last ${SHOWN_S} s: ${figure(low)} to ${measure(high, this.probe.sheet.unit)}` : "";
+    const series = this.plotting.seriesOf(this.probe);
+    if (!series || this.drawn === series.newest_ns) return;
+    this.drawn = series.newest_ns;
+    const window = { from: this.drawn - 1e9 * SHOWN_S, to: this.drawn, width: WIDTH };
+    const pieces = piecesOf(series.times, series.values, window);
+    const [low, high] = rangeOf(pieces) ?? [null, null];
+    const yOf = (value) => (high === low ? HEIGHT / 2 : HEIGHT - MARGIN - ((value - low) / (high - low)) * (HEIGHT - 2 * MARGIN));
+    this.line.setAttribute("d", pieces.map((piece) => pathOf(piece.map(([x, value]) => [x, yOf(value)]))).join(""));
+    const text = pieces.length ? `last ${SHOWN_S} s: ${figure(low)} to ${measure(high, this.probe.sheet.unit)}` : "";
     setText(this.span, text);
     this.svg.setAttribute("aria-label", text || "no values yet");
   }
@@ -80,9 +88,11 @@ export class Cards {
   /**
    * @param {HTMLElement} tip where the card of the hovered taxel is.
    * @param {HTMLElement} pins where those of pinned taxels are.
+   * @param {Plotting} plotting of plotting.js.
    * @param {(probe: object) => void} release called to unpin.
    */
-  constructor(tip, pins, release) {
+  constructor(tip, pins, plotting, release) {
+    this.plotting = plotting;
     this.tip = tip;
     this.pins = pins;
     this.release = release;
@@ -95,7 +105,7 @@ export class Cards {
       h("kbd", {}, "k"),
       " and ",
       h("kbd", {}, "p"),
-      ".",
+      ". Click a name to plot its load.",
     );
   }
 
@@ -107,14 +117,14 @@ export class Cards {
     const hovered = probes.hovered && !probes.pins.includes(probes.hovered) ? probes.hovered : null;
     if (hovered !== this.hovered) {
       this.hovered = hovered;
-      this.tipCard = hovered && new Card(hovered, null);
+      this.tipCard = hovered && new Card(hovered, this.plotting, null);
       this.tip.replaceChildren(...(hovered ? [this.tipCard.element] : []));
     }
     setHidden(this.tip, !hovered);
     this.tipCard?.update(past);
     for (const probe of this.#cards.keys()) if (!probes.pins.includes(probe)) this.#cards.delete(probe);
     for (const probe of probes.pins) {
-      if (!this.#cards.has(probe)) this.#cards.set(probe, new Card(probe, () => this.release(probe)));
+      if (!this.#cards.has(probe)) this.#cards.set(probe, new Card(probe, this.plotting, () => this.release(probe)));
       this.#cards.get(probe).update(past);
     }
     const cards = probes.pins.map((probe) => this.#cards.get(probe).element);

@@ -1,10 +1,13 @@
 // The last 30 seconds of what was drawn, in bounded memory; the oldest is forgotten first.
 
+import { PARTS } from "./skin.js";
+
 const LONGEST_MS = 30_000;
 const MOST_BYTES = 64e6;
+const CONTACT_BYTES = 500; // about
 
 export class Past {
-  #series = new Map(); // sheet -> [{at_ms, levels, status, shear, scale, mode, bytes}], oldest first
+  #series = new Map(); // sheet -> pictures, the oldest first: the parts of a sheet, at_ms, bytes
 
   constructor({ longest_ms = LONGEST_MS, most_bytes = MOST_BYTES } = {}) {
     this.longest_ms = longest_ms;
@@ -18,9 +21,14 @@ export class Past {
     const series = this.#series.get(sheet);
     const before = series.at(-1);
     const status = before && same(before.status, sheet.status) ? before.status : sheet.status.slice();
-    const kept = { at_ms, levels: sheet.levels.slice(), status, shear: sheet.shear?.slice() ?? null };
-    Object.assign(kept, { scale: sheet.scale, mode: sheet.mode });
-    kept.bytes = kept.levels.length + (status === before?.status ? 0 : status.length) + (kept.shear?.length ?? 0);
+    const kept = { at_ms, bytes: CONTACT_BYTES * (sheet.contacts?.length ?? 0) };
+    for (const part of PARTS) {
+      const isArray = ArrayBuffer.isView(sheet[part]) && part !== "status";
+      kept[part] = isArray ? sheet[part].slice() : sheet[part];
+      if (isArray) kept.bytes += kept[part].byteLength;
+    }
+    kept.status = status;
+    kept.bytes += status === before?.status ? 0 : status.length;
     series.push(kept);
     this.bytes += kept.bytes;
     this.#forget(at_ms);

@@ -2,10 +2,9 @@
 
 import { DIMMED, MARKS } from "./marks.js";
 import { ramp } from "./palette.js";
-import { untouched } from "./wipe.js";
 
 /** @param {object} parts of main.js. */
-export function hooks({ skin, stage, tree, probes, names, rewind, past, view, now }) {
+export function hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts, plotting }) {
   const pairOf = ({ sheet, i }) => [sheet.driver.id, sheet.index[i]];
   return {
     get connected() { return now.isAlive; },
@@ -14,9 +13,11 @@ export function hooks({ skin, stage, tree, probes, names, rewind, past, view, no
       return [...skin.drivers.values()].map(({ id, name, state, generation }) => ({ id, name, state, generation }));
     },
     get problems() { return now.problems.map(({ text }) => text); },
-    get contacts() { return now.contacts; },
-    get names() { return names.place(stage); },
-    get wipe() { return now.wipe; },
+    get contacts() { return contacts().map(({ of, ...contact }) => contact); },
+    get names() { return names.place(stage).map(({ text, x, y, alpha, width }) => ({ text, x, y, alpha, width })); },
+    get plots() { return plotting.strips.state; },
+    get marks() { return plotting.marks; },
+    get wipe() { return wipe.progress && { of: wipe.progress.of, touched: wipe.progress.touched, running: wipe.isRunning }; },
     get recording() { return now.recording; },
     get mode() { return view.mode; },
     get type() { return view.type ?? stage.sheets[0]?.type ?? null; },
@@ -25,7 +26,7 @@ export function hooks({ skin, stage, tree, probes, names, rewind, past, view, no
     get selected() { return tree.selected; },
     get hovered() { return probes.hovered && pairOf(probes.hovered); },
     get pins() { return probes.pins.map(pairOf); },
-    get untouched() { return untouched(stage.sheets).map(pairOf); },
+    get untouched() { return wipe.progress?.untouched.map(pairOf) ?? []; },
     get paused() { return rewind.isPaused; },
     get at_s() { return rewind.at_s; },
     get kept_bytes() { return past.bytes; },

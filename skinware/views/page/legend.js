@@ -89,7 +89,7 @@ export class Legend {
 }
 
 /** The different scales of sheets: `low`, `high`, `unit`, and `names` of what has it. */
-function scalesOf(sheets) {
+export function scalesOf(sheets) {
   const scales = new Map();
   for (const { shown, unit, driver, type } of sheets) {
     const [low, high] = shown.scale;

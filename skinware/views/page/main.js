@@ -13,12 +13,14 @@ import { fillHelp, onKeys } from "./keys.js";
 import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
-import { Names } from "./names.js";
+import { Names, partAt } from "./names.js";
 import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
+import { Plotting } from "./plotting.js";
 import { savePicture, showRecording } from "./keeping.js";
 import { Probes } from "./probes.js";
-import { Problems } from "./problems.js";
+import { explained, Problems } from "./problems.js";
+import { sheetsOf, taxelsOf, typesOf, whyEmpty } from "./selection.js";
 import { Skin } from "./skin.js";
 import { Stage } from "./stage.js";
 import { Touches } from "./touches.js";
@@ -26,7 +28,7 @@ import { ReplayControls, Rewind } from "./transport.js";
 import { Tree } from "./tree.js";
 import { decode } from "./turn.js";
 import { afterFrame, notify, reload, storedTheme, storeTheme } from "./window.js";
-import { Wipe } from "./wipe.js";
+import { progressOf, Wipe } from "./wipe.js";
 
 const MODES = { raw: "Values", change: "Change", peak: "Peaks", wipe: "Wipe test" };
 const [TURN, NEARER, SCROLL_S] = [0.12, 0.85, 0.2]; // of a key: rad, of the distance, s
@@ -36,6 +38,7 @@ const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
 const system = matchMedia("(prefers-color-scheme: light)");
 
+let wasPaused = false;
 const skin = new Skin();
 const past = new Past();
 const states = new Map();
@@ -51,10 +54,8 @@ const view = {
 const now = {
   isAlive: false, // turns come
   turn: 0,
-  contacts: [],
   problems: [],
   recording: null,
-  wipe: null,
   figures_ms: 0, // when figures were brought up to date
 };
 
@@ -67,7 +68,7 @@ const stage = new Stage(byId("stage"), {
       theme: view.theme,
       normals: view.normals,
       names: view.names ? names.place(its) : [],
-      contacts: now.contacts,
+      contacts: contacts().filter(({ at }) => at),
       hovered: probes.hovered,
       pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
     }),
@@ -84,17 +85,24 @@ const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${loca
   turn,
 });
 const send = (op) => link.send(op);
-const probes = new Probes(send);
-const cards = new Cards(byId("tip"), byId("pins"), (probe) => pin(probe));
-const tree = new Tree(byId("tree"), choose);
+const probes = new Probes(send, () => plotting.ask());
+const plotting = new Plotting(byId("plots"), { send, skin, probes, stage, notify, rewind: { get isPaused() { return rewind.isPaused; }, get at_s() { return rewind.at_s; } } });
+const cards = new Cards(byId("tip"), byId("pins"), plotting, (probe) => pin(probe));
+const tree = new Tree(byId("tree"), choose, (row, find) => plotting.draggable(row, () => plotting.row(find())));
 const bar = new Bar(byId("bar"));
 const list = new Problems(byId("problems"), (key) => choose(tree.find(key) ?? null));
-const touches = new Touches(byId("contacts"), byId("regions"));
+const touches = new Touches(byId("contacts"), byId("regions"), (row, contactOf) => {
+  const lineOf = () => plotting.contact(contactOf().of, contactOf());
+  plotting.draggable(row, lineOf);
+  row.addEventListener("click", () => plotting.strips.add(lineOf()));
+  row.addEventListener("keydown", (event) => event.key === "Enter" && plotting.strips.add(lineOf()));
+});
 const legend = new Legend((scale) => {
   view.scale = scale;
   look();
 });
 const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: byId("when") }, past, () => {
+  if (rewind.isPaused !== wasPaused) plotting.strips.freeze((wasPaused = rewind.isPaused));
   show();
   showFigures();
 });
@@ -103,7 +111,6 @@ const modes = new Modes(byId("modes"), MODES, setMode);
 const wipe = new Wipe(byId("wipe"), {
   start: () => send({ op: "wipe", action: "start" }),
   stop: () => send({ op: "wipe", action: "stop" }),
-  sheets: () => stage.sheets,
 });
 
 // -- what comes from the server ---------------------------------------------------------------------------------
@@ -140,10 +147,8 @@ function turn(message) {
   if (header.error) notify(header.error);
   if (skin.take(header, taken.blob)) restructured();
   if (header.state) takeState(header.state);
-  if (header.wipe) now.wipe = header.wipe;
-  now.contacts = touches.update(skin, { contacts: lastOf("contacts", header), regions: lastOf("regions", header) });
-  probes.take(taken, performance.now());
-  wipe.update(header.wipe);
+  probes.take(header);
+  plotting.take(taken);
   if (!rewind.isPaused) {
     remember(header.pictures);
     if (header.pictures || header.state || header.skin) show();
@@ -152,43 +157,39 @@ function turn(message) {
   afterFrame(() => link.next());
 }
 
-const newest = {};
-
-/** The newest value of a key of the header, from this turn or an earlier one. */
-function lastOf(name, header) {
-  if (name in header) newest[name] = header[name];
-  return newest[name];
-}
-
 function restructured() {
   past.keepOnly(skin.sheets());
   for (const id of states.keys()) if (!skin.drivers.has(id)) states.delete(id);
-  for (const name of Object.keys(newest)) delete newest[name];
   if (view.type && skin.types().length && !skin.types().includes(view.type)) {
     view.type = null; // of another skin
     sendLook();
   }
-  fillTypes();
   sheetsChanged();
   probes.find(skin, wanted.pins ?? probes.keys);
+  plotting.ask(true);
   wanted.pins = null;
   tree.update(skin, states);
   if (wanted.selected) tree.select(wanted.selected);
   wanted.selected = null;
+  fillTypes();
   dim();
   fetchMeshes(skin.links, (text) => notify(text)).then((meshes) => stage.setMeshes(meshes));
 }
 
 function takeState(state) {
   for (const driver of state.drivers ?? []) states.set(driver.id, driver);
-  now.problems = (state.problems ?? []).map(({ severity, driver, bus, patch, text }) => {
+  const seen = (state.problems ?? []).map(({ severity, driver, bus, patch, text, since_ns }) => {
     const { name = driver, key = null } = skin.drivers.get(driver) ?? {};
     const named = name === null || name === undefined ? text : `${name}: ${text}`;
-    return { severity, text: named, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    const place = { driver: name, bus, patch, key: key && [key, bus, patch].filter(Boolean).join("/") };
+    return { severity, text: named, since_ns: since_ns && Number(since_ns), ...place };
   });
+  now.problems = explained(seen, state.findings ?? []);
+  if (now.recording && !state.recording) notify(`The recording is in ${now.recording.file}`);
   now.recording = state.recording ?? null;
+  plotting.takeState(state);
   tree.update(skin, states);
-  list.update(now.problems);
+  list.update(now.problems, plotting.now_ns);
   replay.update(state.replay);
   showRecording(byId("record"), now.recording);
 }
@@ -210,20 +211,35 @@ function show() {
   stage.update();
 }
 
+/** The contacts of the moment that is looked at; those of a silent driver are over. */
+function contacts() {
+  const shown = stage.sheets.filter(({ driver }) => !driver.isOld || rewind.isPaused);
+  return shown.flatMap(({ driver, shown: { contacts = [] } }) => contacts.map((one) => ({ ...one, of: driver })));
+}
+
 /** Bring everything beside the picture up to date. */
 function showFigures() {
   now.figures_ms = performance.now();
   const isPast = rewind.isPaused;
+  plotting.strips.draw();
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
-  bar.update(skin, states, stage, now.recording);
-  const row = tree.selected && tree.find(tree.selected);
+  bar.update(skin, states, stage);
+  const row = selected();
+  touches.update(contacts(), stage.sheets.flatMap(({ shown }) => shown.regions ?? []));
+  if (view.mode === "wipe") wipe.update(progressOf(stage.sheets, taxelsOf(row) ?? (() => true)), row?.name ?? "");
   legend.update(stage.sheets, row ? stage.sheets.filter(({ driver }) => driver === row.driver) : stage.sheets, view.scale);
   setHidden(byId("legend"), !stage.sheets.length);
-  setHidden(byId("empty"), stage.sheets.length > 0 || !now.isAlive);
+  const why = now.isAlive ? whyEmpty(skin, row, view, stage.sheets) : null;
+  setHidden(byId("empty"), !why);
+  if (!why) return;
+  const [text, more] = byId("empty").children;
+  setText(text, why.text);
+  setText(more.firstElementChild, why.advice);
+  setText(more.lastElementChild, why.command);
 }
 
 function sheetsChanged() {
-  stage.setSheets(skin.shown(view.type));
+  stage.setSheets(sheetsOf(skin, view));
   names.arrange(stage.sheets);
   if (view.scale && unitsOf(stage.sheets).size > 1) {
     view.scale = null; // it was of another unit
@@ -243,15 +259,11 @@ function frameAll(isFirst = false) {
   stage.frame(isShown, isFirst || isIn ? directionOf(stage.sheets, isShown, stage.picture) : null);
 }
 
+/** The row that is selected; null without one. */
+const selected = () => (tree.selected && tree.find(tree.selected)) || null;
+
 /** Whether a taxel is selected: (sheet, i) => bool; null if nothing is. */
-function selection() {
-  const row = tree.selected && tree.find(tree.selected);
-  if (!row) return null;
-  const buses = row.driver.patches.map(({ bus }) => bus);
-  return (sheet, i) =>
-    sheet.driver === row.driver &&
-    (row.level < 2 || (row.level === 2 ? buses[sheet.patch[i]] === row.bus : sheet.patch[i] === row.patch));
-}
+const selection = () => taxelsOf(selected());
 
 /** Taxels beside those that are selected step back. */
 function dim() {
@@ -264,6 +276,7 @@ function dim() {
 
 function choose(row) {
   tree.select(row?.key ?? null);
+  fillTypes();
   dim();
   if (row) frameAll();
   keep();
@@ -280,7 +293,6 @@ function look() {
   sendLook();
   modes.show(view.mode);
   wipe.show(view.mode === "wipe");
-  if (view.mode !== "wipe") now.wipe = null;
   setHidden(byId("tare"), view.mode === "raw" || view.mode === "wipe");
   setHidden(byId("scaling"), view.mode === "wipe");
   keep();
@@ -290,11 +302,13 @@ function setMode(mode) {
   if (rewind.isPaused) rewind.toggle();
   view.mode = mode;
   look();
+  sheetsChanged();
+  dim();
   if (mode === "wipe") for (const { driver, type } of stage.sheets) send({ op: "names", driver: driver.id, type });
 }
 
 function setType(type) {
-  view.type = type;
+  view.type = type || null;
   view.scale = null;
   sheetsChanged();
   probes.hover(null);
@@ -303,18 +317,22 @@ function setType(type) {
 }
 
 function nextType() {
-  const types = skin.types();
-  const at = types.indexOf(view.type ?? stage.sheets[0]?.type);
-  if (types.length > 1) setType(types[(at + 1) % types.length]);
+  const { options, selectedIndex } = byId("types").querySelector("select");
+  if (options.length > 1 || selectedIndex < 0) setType(options[(selectedIndex + 1) % options.length].value);
   fillTypes();
 }
 
+/** The types of what is selected; of several drivers without a common first type, also each driver's own. */
 function fillTypes() {
-  const types = skin.types();
+  const row = selected();
+  const types = typesOf(skin, row);
   const select = byId("types").querySelector("select");
-  select.replaceChildren(...types.map((type) => h("option", { value: type }, type)));
-  select.value = view.type ?? skin.shown(null)[0]?.type ?? "";
-  setHidden(byId("types"), types.length < 2);
+  const firsts = skin.shown(null).filter(({ driver }) => !row || driver === row.driver).map(({ type }) => type);
+  const areDifferent = new Set(firsts).size > 1;
+  const own = areDifferent ? [h("option", { value: "" }, "each its own")] : [];
+  select.replaceChildren(...own, ...types.map((type) => h("option", { value: type }, type)));
+  select.value = view.type ?? (areDifferent ? "" : firsts[0] ?? "");
+  setHidden(byId("types"), types.length < 2 && types.includes(select.value));
 }
 
 function setTheme(theme, isChosen) {
@@ -324,6 +342,7 @@ function setTheme(theme, isChosen) {
   setText(byId("theme"), theme === "dark" ? "Light" : "Dark");
   stage.setTheme(theme);
   legend.setTheme(theme);
+  plotting.strips.theme = theme;
   if (isChosen) storeTheme(theme);
   showFigures();
 }
@@ -364,6 +383,19 @@ function release() {
   showFigures();
 }
 
+/** Plot what is pointed at, or what is selected. */
+function plot() {
+  const row = selected();
+  const line = probes.hovered ? plotting.taxel(probes.hovered) : row && plotting.row(row);
+  if (line) plotting.strips.add(line);
+  else notify("Point at a taxel, or select a driver or board, to plot it.");
+}
+
+function picture(kind) {
+  const drivers = stage.sheets.map(({ driver }) => driver.key);
+  savePicture(kind, stage, overlay, view.theme, `${MODES[view.mode]}. ${plotting.footer(drivers)}`);
+}
+
 let keepTimer = 0;
 
 /** Keep the view in the address, once it stays as it is. */
@@ -392,6 +424,8 @@ onPointer(byId("stage"), {
     cards.place(x, y, stage.width, stage.height);
   },
   click: (x, y) => {
+    const part = view.names && partAt(names.place(stage), x, y);
+    if (part) return plotting.strips.add(plotting.part(part));
     const found = pick(stage, stage.sheets, x, y);
     if (found) pin(found);
   },
@@ -399,7 +433,7 @@ onPointer(byId("stage"), {
 const clicks = {
   tare: () => send({ op: "tare" }),
   record: () => send({ op: "record", action: now.recording ? "stop" : "start" }),
-  picture: () => savePicture(stage, overlay),
+  picture: () => picture("png"),
   theme: () => setTheme(view.theme === "dark" ? "light" : "dark", true),
   help: () => {
     fillHelp(byId("keys"), view.theme);
@@ -423,6 +457,9 @@ onKeys({
   "]": () => rewind.isPaused && rewind.scroll(rewind.at_s + SCROLL_S),
   r: clicks.record,
   s: clicks.picture,
+  S: () => picture("svg"),
+  g: plot,
+  m: () => plotting.mark(),
   f: () => frameAll(),
   ArrowLeft: () => stage.orbit(-TURN, 0),
   ArrowRight: () => stage.orbit(TURN, 0),
@@ -452,7 +489,7 @@ onKeys({
   "?": clicks.help,
 });
 
-window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now });
+window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts, plotting });
 setTheme(view.theme, false);
 look();
 addEventListener("hashchange", () => location.reload()); // another address was typed

@@ -47,6 +47,9 @@ const MARK_OF = Uint8Array.from({ length: 256 }, (_, status) => {
 /** The mark of a status: of several bits the one that says most. */
 export const markOf = (status) => MARK_OF[status];
 
+/** Whether a mark is that of a value of now. */
+export const isCurrent = (mark) => (mark & ~DIMMED) !== STALE && (mark & ~DIMMED) < NO_ACK;
+
 /** The names of a status' bits; "fresh" if there are none. */
 export function statusText(status) {
   const names = BITS.filter(([, bit]) => status & bit).map(([mark]) => MARKS[mark].name);

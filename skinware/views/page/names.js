@@ -59,7 +59,7 @@ export class Names {
       const times = isNumbered(part.name) && !part.size ? NUMBERED : 1;
       if (pixels <= FADED * times * widthOf(part.name) || part.isAway(eye)) continue; // most, where there are many
       const text = part.total ? `${part.name}  ${measure(part.total, part.sheet.unit)}` : part.name;
-      const label = { text, width: widthOf(text), alpha: 0 };
+      const label = { part, text, width: widthOf(text), alpha: 0 };
       const share = pixels / (times * label.width);
       if (share <= FADED) continue;
       const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
@@ -74,6 +74,11 @@ export class Names {
     }
     return placed;
   }
+}
+
+/** The part whose name is at a place of the picture; undefined if there is none. */
+export function partAt(labels, x, y) {
+  return labels.find((label) => Math.abs(y - label.y) <= LINE / 2 && Math.abs(x - label.x) <= label.width / 2)?.part;
 }
 
 function partsOf(sheet, areSeveral) {

@@ -1,5 +1,6 @@
 // Draw over the taxels: normals, shear, contacts, names of parts, and rings around chosen taxels.
 
+import { isCurrent } from "./marks.js";
 import { FONT } from "./names.js";
 import { GROUND, INK } from "./palette.js";
 
@@ -10,8 +11,6 @@ const LEAST_SHEAR = 3; // of 127
 const HIDDEN = 0.35; // how much of a contact on the far side is seen
 
 export class Overlay {
-  #isEmpty = true;
-
   constructor(host) {
     this.canvas = document.createElement("canvas");
     this.canvas.className = "over";
@@ -20,19 +19,19 @@ export class Overlay {
   }
 
   /**
-   * @param {object} stage where things are.
+   * Draw one moment whole; nothing of an earlier one stays.
+   * @param {object} stage where things are, with the sheets that are shown.
    * @param {object} what `theme`, `normals` (shown or not), `names` (as Names.place makes them), `contacts`,
    *     `hovered` ({sheet, i} or null), `pins` ([{sheet, i, letter}]).
    */
   draw(stage, what) {
     const ratio = Math.min(devicePixelRatio, 2);
     const [width, height] = [Math.round(stage.width * ratio), Math.round(stage.height * ratio)];
-    if (this.canvas.width !== width || this.canvas.height !== height) {
-      this.canvas.width = width;
-      this.canvas.height = height;
-    } else if (!this.#isEmpty) this.context.clearRect(0, 0, width, height);
-    this.#isEmpty = true;
-    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    this.context.resetTransform();
+    this.context.clearRect(0, 0, width, height);
+    this.context.scale(ratio, ratio);
     this.ink = `rgb(${INK[what.theme]})`;
     this.ground = `rgb(${GROUND[what.theme]})`;
     for (const sheet of stage.sheets) {
@@ -46,7 +45,6 @@ export class Overlay {
   }
 
   #normals(stage, sheet) {
-    this.#isEmpty = false;
     const { context } = this;
     context.beginPath();
     for (let i = 0; i < Math.min(sheet.n, MOST_ARROWS); i++) {
@@ -63,12 +61,12 @@ export class Overlay {
 
   /** Arrows in the plane of the skin; those too short to mean anything are left out. */
   #shear(stage, sheet) {
-    const { shear } = sheet.shown;
+    const { shear, marks } = sheet.shown;
     const { context } = this;
     context.beginPath();
     for (let i = 0; i < Math.min(sheet.n, MOST_ARROWS); i++) {
       const [along, across] = [shear[2 * i], shear[2 * i + 1]];
-      if (Math.hypot(along, across) < LEAST_SHEAR) continue;
+      if (Math.hypot(along, across) < LEAST_SHEAR || !isCurrent(marks[i])) continue;
       const { at, normal, isAway } = facing(stage, sheet, i);
       if (isAway) continue;
       const [e1, e2] = planeOf(normal);
@@ -77,7 +75,6 @@ export class Overlay {
       const [x1, y1, depth] = stage.project(...at);
       if (depth <= 0) continue;
       const [x2, y2] = stage.project(...tip);
-      this.#isEmpty = false;
       arrow(context, x1, y1, x2, y2);
     }
     this.#stroke(1.6);
@@ -87,7 +84,6 @@ export class Overlay {
     const at = contact.at;
     const [x, y, depth] = stage.project(...at);
     if (depth <= 0) return;
-    this.#isEmpty = false;
     const { context } = this;
     const eye = stage.camera.position.toArray();
     const normal = contact.normal ?? [0, 0, 0];
@@ -108,7 +104,6 @@ export class Overlay {
   }
 
   #name({ text, x, y, alpha }) {
-    this.#isEmpty = false;
     const { context } = this;
     context.globalAlpha = alpha;
     context.font = FONT;
@@ -126,7 +121,6 @@ export class Overlay {
   #ring(stage, sheet, i, letter) {
     const [x, y, depth] = stage.project(...sheet.place(i));
     if (depth <= 0) return;
-    this.#isEmpty = false;
     const size = Math.max((sheet.radius[i] * stage.pixels) / depth, 3) + 3;
     this.context.beginPath();
     this.context.arc(x, y, size, 0, 2 * Math.PI);

@@ -2,14 +2,12 @@
 
 const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
 const MOST_PINS = 12;
-const SERIES_EVERY_MS = 300;
 
 /** One taxel, known again after a restart by its driver, type and uid. */
 class Probe {
   constructor(sheet, i) {
     this.letter = "";
     this.exact = null; // {value, raw, age_ms, noise, status} of the server
-    this.series = null; // {time_s, value}
     this.key = keyOf(sheet, i);
     this.sheet = sheet;
     this.i = i;
@@ -29,7 +27,7 @@ function keyOf(sheet, i) {
 }
 
 /** The taxel of a key: {sheet, i}; null if there is no such one now. */
-function resolve(skin, key) {
+export function resolve(skin, key) {
   const [driver, type, id] = key.split(":");
   const sheet = skin.sheets(type).find((one) => one.driver.key === driver);
   if (!sheet || !/^[0-9a-f]+$/.test(id ?? "")) return null;
@@ -43,12 +41,11 @@ export class Probes {
   #lost = []; // keys of pins whose driver is not there
   #named = new Set();
   #asked = "[]";
-  #turn = 0;
-  #at_ms = 0;
 
-  /** @param {(op: object) => void} send */
-  constructor(send) {
+  /** @param {(op: object) => void} send @param {() => void} changed called when others are looked at. */
+  constructor(send, changed) {
     this.send = send;
+    this.changed = changed;
   }
 
   get all() {
@@ -111,8 +108,11 @@ export class Probes {
   ask() {
     const sensors = this.all.map((probe) => [probe.sheet.driver.id, probe.position]);
     const text = JSON.stringify(sensors);
-    if (text !== this.#asked) this.send({ op: "exact", sensors });
-    this.#asked = text;
+    if (text !== this.#asked) {
+      this.#asked = text;
+      this.send({ op: "exact", sensors });
+      this.changed();
+    }
     for (const { sheet } of this.all) {
       if (sheet.names || this.#named.has(sheet)) continue;
       this.#named.add(sheet);
@@ -120,21 +120,11 @@ export class Probes {
     }
   }
 
-  /** Take a turn, and ask for the next line of 10 s. */
-  take({ header, blob }, now_ms) {
-    const of = ({ driver, position }) =>
-      this.all.find((probe) => probe.sheet.driver.id === driver && probe.position === position);
+  take(header) {
     for (const exact of header.exact ?? []) {
-      const probe = of(exact);
+      const { driver, position } = exact;
+      const probe = this.all.find((one) => one.sheet.driver.id === driver && one.position === position);
       if (probe) probe.exact = exact;
     }
-    const series = header.series;
-    const probe = series && of(series);
-    if (probe) probe.series = { time_s: blob(series.time_s, Float32Array), value: blob(series.value, Float32Array) };
-    const every = this.all;
-    if (!every.length || now_ms - this.#at_ms < SERIES_EVERY_MS) return;
-    this.#at_ms = now_ms;
-    const next = every.find((one) => !one.series) ?? every[this.#turn++ % every.length];
-    this.send({ op: "series", driver: next.sheet.driver.id, position: next.position });
   }
 }

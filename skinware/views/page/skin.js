@@ -6,6 +6,9 @@ import { TOP } from "./palette.js";
 const NOTHING = 255;
 const DRAWN_PART = 0.44; // radius of a disc, of the distance to its neighbour
 
+/** What a picture of a sheet consists of. */
+export const PARTS = ["levels", "status", "shear", "totals", "contacts", "regions", "scale", "mode"];
+
 /** n taxels of one type of a driver. */
 class Sheet {
   constructor(driver, table, blob) {
@@ -14,6 +17,7 @@ class Sheet {
     this.unit = table.unit ?? "";
     this.n = table.n;
     this.hasShear = Boolean(table.axes);
+    this.isTouch = table.touch ?? true;
     this.index = blob(table.index, Uint32Array); // positions in a frame
     this.uid = table.uid ? blob(table.uid, BigUint64Array) : null;
     this.patch = blob(table.patch, Uint16Array);
@@ -24,6 +28,8 @@ class Sheet {
     this.levels = new Uint8Array(this.n).fill(NOTHING);
     this.shear = null;
     this.totals = null; // by module
+    this.contacts = [];
+    this.regions = [];
     this.scale = [0, 1];
     this.mode = "raw";
     this.dimmed = null;
@@ -48,16 +54,24 @@ class Sheet {
     if (picture.status) this.status = blob(picture.status, Uint8Array);
     this.shear = picture.shear ? blob(picture.shear, Int8Array) : null;
     this.totals = picture.totals ? blob(picture.totals, Float32Array) : null;
+    this.contacts = (picture.contacts ?? []).map((contact) => ({ ...contact, at: this.#placeOf(contact) }));
+    this.regions = picture.regions ?? [];
     this.scale = picture.scale ?? this.scale;
     this.mode = mode;
     this.sequence = picture.sequence;
   }
 
-  /** Show the newest, or a picture of the past. */
+  /** Show the newest, or a picture of the past, all of one moment. */
   show(picture = this) {
-    const { levels, status, shear, totals, scale, mode } = picture;
-    Object.assign(this.shown, { levels, status, shear, totals: totals ?? null, scale, mode });
+    for (const part of PARTS) this.shown[part] = picture[part];
     this.fill();
+  }
+
+  /** Where a contact is, or else its taxel; null if neither is known. */
+  #placeOf({ position, sensor }) {
+    if (position?.every(Number.isFinite)) return position;
+    const i = this.index.indexOf(sensor);
+    return i < 0 ? null : [...this.place(i)];
   }
 
   fill() {
@@ -84,6 +98,7 @@ class Driver {
     this.id = table.id;
     this.name = table.name;
     this.namespace = table.namespace;
+    this.type = table.type;
     this.key = keyOf(table);
     this.generation = table.generation;
     this.buses = table.buses ?? [];
@@ -103,6 +118,7 @@ export class Skin {
   drivers = new Map(); // by id
   links = [];
   namespaces = [];
+  names = []; // of the drivers that are followed; empty: all
   mode = "raw"; // of the newest pictures
 
   /**
@@ -112,6 +128,7 @@ export class Skin {
   take(header, blob) {
     if (header.skin) {
       this.namespaces = header.skin.namespaces ?? [];
+      this.names = header.skin.names ?? [];
       this.links = header.skin.links ?? [];
       this.drivers = new Map(header.skin.drivers.map((table) => [table.id, this.#driver(table, blob)]));
     }

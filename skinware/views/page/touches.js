@@ -1,4 +1,4 @@
-// Contacts and regions that services publish: their lists, and the places of contacts.
+// The lists of contacts and regions that services publish.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { short } from "./format.js";
@@ -7,7 +7,9 @@ const CONTACTS = ["", "", "load", "mm/s", "s"];
 const LOAD = CONTACTS.indexOf("load");
 
 export class Touches {
-  constructor(contacts, regions) {
+  /** @param {(row: HTMLElement, contactOf: () => object) => void} equip called with each new row of a contact. */
+  constructor(contacts, regions, equip) {
+    this.equip = equip;
     this.contacts = contacts;
     this.regions = regions;
     this.contactRows = h("tbody");
@@ -19,15 +21,16 @@ export class Touches {
     regions.append(h("h2", {}, "Regions"), h("table", {}, h("thead", {}, this.regionHead), this.regionRows));
   }
 
-  /** Take a turn; says where the contacts are: [{id, at, normal, area_m2}]. */
-  update(skin, header) {
-    const places = (header.contacts ?? []).map((contact) => ({ ...contact, at: placeOf(skin, contact) }));
-    setHidden(this.contacts, this.contacts.hidden && !places.length); // once there were some, it stays
-    const load = inUnit(places);
+  /** @param {object[]} contacts that are shown; @param {object[]} regions */
+  update(contacts, regions) {
+    setHidden(this.contacts, this.contacts.hidden && !contacts.length); // once there were some, it stays
+    const load = inUnit(contacts);
+    this.shown = contacts;
+    while (this.contactRows.rows.length < contacts.length) this.contactRows.append(this.#row());
     setText(this.contactHead.cells[LOAD], load.unit ? `load, ${load.unit}` : "load");
     fill(
       this.contactRows,
-      places.map((contact) => [
+      contacts.map((contact) => [
         `${contact.id}`,
         contact.kind ?? "",
         load.write(contact.load, contact.unit),
@@ -35,15 +38,19 @@ export class Touches {
         short(contact.age_s),
       ]),
     );
-    setHidden(this.regions, !header.regions?.length);
-    const regions = header.regions ?? [];
+    setHidden(this.regions, !regions.length);
     const region = inUnit(regions);
     setText(this.regionHead.cells[1], region.unit);
     fill(
       this.regionRows,
       regions.map(({ name, value, unit, touched }) => [name, region.write(value, unit), touched ? "◉ touched" : ""]),
     );
-    return places.filter(({ at }) => at);
+  }
+
+  #row() {
+    const row = h("tr", { tabindex: 0, title: "Plot its load (Enter)" });
+    this.equip(row, () => this.shown[row.sectionRowIndex]);
+    return row;
   }
 }
 
@@ -52,12 +59,6 @@ function inUnit(rows) {
   const units = new Set(rows.map(({ unit }) => unit ?? ""));
   if (units.size > 1) return { unit: "", write: (x, unit) => `${short(x)} ${unit ?? ""}`.trim() };
   return { unit: [...units][0] ?? "", write: short };
-}
-
-function placeOf(skin, { position, driver, sensor }) {
-  if (position?.every(Number.isFinite)) return position;
-  const found = sensor === undefined ? null : skin.find(driver, sensor);
-  return found && [...found.sheet.place(found.i)];
 }
 
 function fill(body, rows) {

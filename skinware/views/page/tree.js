@@ -5,11 +5,12 @@ import { age, isKnown, percent, rate } from "./format.js";
 
 const COLLAPSED_FROM = 40; // patches of a driver: more are folded, but for those with problems
 const GOOD = new Set(["live", ""]);
+const WORST = 3;
 
 /** How bad a state is; the worst first in the tree. */
 export function badness(state) {
   if (state === undefined || GOOD.has(state)) return 0;
-  if (/dead|gone|down|failed/.test(state)) return 3;
+  if (/dead|gone|down|failed/.test(state)) return WORST;
   if (/stale|silent|was /.test(state)) return 2;
   return 1;
 }
@@ -49,8 +50,12 @@ export class Tree {
   #folded = new Map(); // key -> bool, where a person said so
   #shown = [];
 
-  /** @param {(row: ?object) => void} choose called with the row that is clicked; null if it was selected already. */
-  constructor(host, choose) {
+  /**
+   * @param {(row: ?object) => void} choose called with the row that is clicked; null if it was selected already.
+   * @param {(element: HTMLElement, find: () => object) => void} equip called with each new element.
+   */
+  constructor(host, choose, equip = () => {}) {
+    this.equip = equip;
     this.host = host;
     this.choose = choose;
     this.selected = null;
@@ -97,6 +102,7 @@ export class Tree {
 
   #isFolded(row) {
     if (this.#folded.has(row.key)) return this.#folded.get(row.key);
+    if (row.level === 1) return badness(row.report.state) === WORST;
     return row.level === 2 && row.children.length > COLLAPSED_FROM;
   }
 
@@ -111,6 +117,7 @@ export class Tree {
       if (row.level > 2) element.dataset.patch = row.name;
       element.addEventListener("click", (event) => this.#click(element.dataset.key, event.target));
       this.#rows.set(row.key, element);
+      this.equip(element, () => this.find(element.dataset.key));
     }
     const [fold, sign, name, state, figures] = element.children;
     const own = badness(row.report.state);
@@ -118,6 +125,7 @@ export class Tree {
     if (row.children?.length) element.setAttribute("aria-expanded", String(!this.#isFolded(row)));
     setText(sign, SIGNS[own]);
     element.dataset.bad = own;
+    element.dataset.fresh = String(isFresh(row));
     setText(name, row.level === 1 && this.severalNamespaces ? `${row.name} · ${row.driver.namespace}` : row.name);
     setText(state, own ? [row.report.state, row.report.reason].filter(Boolean).join(": ") : "");
     const texts = figuresOf(row);
@@ -162,6 +170,12 @@ export class Tree {
     event.stopPropagation();
     actions[event.key]();
   }
+}
+
+/** Whether all sensors of a row are fresh: nothing else is green. */
+function isFresh({ level, bad, report, children }) {
+  if (level === 2) return children.length > 0 && children.every(isFresh);
+  return !bad && report.sensors > 0 && report.fresh === report.sensors;
 }
 
 /** Texts of a row's figures; always as many for a row of a level. */

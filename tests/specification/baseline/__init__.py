@@ -28,6 +28,7 @@ from skinware.realtime import NS_PER_S
 from skinware.tactile.baseline import Calm
 from skinware.tactile.rule import BaselineSettings, Why
 from tests.specification.baseline.numbers import (
+    ALIKE,
     EPSILON,
     FEW_LEVELS,
     FORGET_AFTER_S,
@@ -179,6 +180,7 @@ class SpecifiedBaseline:
         rows = np.flatnonzero(taxels)
         fresh = rows[~self._ready[rows]]
         self._offsets.noise2[fresh] = self._least_noise2(self._intake.last[fresh])
+        self._offsets.noise_s[fresh] = 0
         self._ready |= taxels
         now = self._intake.last[rows]
         known = np.isfinite(self._offsets.level[rows]) & ~np.isin(rows, fresh)
@@ -302,7 +304,8 @@ class SpecifiedBaseline:
         """End touches: what is left of them is what the prediction was wrong by."""
         offsets, touches = self._offsets, self._touches
         if len(over):
-            left = touches.smooth[over]
+            left, now = touches.smooth[over], deviation[over]
+            left = np.where(np.abs(now) < np.abs(left), now, left)  # the smoothed one may still fall
             firm = touches.peak[over] > 2 * on[over]  # a light one that flickers says nothing of its offset
             offsets.variance[over] += left * left * firm
             too_long = touches.contact_s[over] > (self._settings.maximum_hold_s or math.inf)
@@ -313,10 +316,12 @@ class SpecifiedBaseline:
         if len(back):
             self._put(back, touches.smooth[back], deviation)
             touches.end(back)
-        stepped, by = touches.module_steps(live, on, offsets, passed_s)
+        stepped, by = touches.module_steps(deviation, live, on, off, offsets, passed_s)
         if len(stepped):
             self._put(stepped, by, deviation)
-            touches.end(stepped[touches.smooth[stepped] < off[stepped]])
+            offsets.variance[stepped] += (np.float32(ALIKE) * by) ** 2
+            touches.smooth[stepped] = deviation[stepped]
+            touches.end(stepped[touches.smooth[stepped] < on[stepped]])
 
     def _recover(self, deviation: Floats, live: Flags, on: Floats, passed_s: float) -> Flags:
         """Give new offsets to taxels whose old ones were learned under a load that is gone now."""
@@ -335,6 +340,7 @@ class SpecifiedBaseline:
         offsets.put(taxels, offsets.level[taxels] + by)
         deviation[taxels] -= by
         touches.smooth[taxels] -= by
+        touches.onset[taxels] -= by
         self._forced[taxels] = True
 
     def _calm(self, deviation: Floats, live: Flags, low: Flags, off: Floats) -> Calm:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from tests.specification.baseline.numbers import (
     DRIFT_SIGMA,
     FEW_TAXELS,
+    FEWEST,
     GAIN_LASTS_S,
     GAIN_SPREAD2,
     LEAST_GAIN,
@@ -139,6 +140,7 @@ class Offsets:
         cross: (n,) float32, covariance of offset and gain.
         gain_variance: (n,) float32.
         noise2: (n,) float32, variance from frame to frame.
+        noise_s: (n,) float32, for how long that has been measured.
         slow: (n,) float32, the deviation of each at rest, over some seconds.
         common: the common modes.
         agility: (n_patches,) variance that the offset of a taxel gains in a second by a drift of its own.
@@ -151,6 +153,7 @@ class Offsets:
         self.variance, self.cross, self.slow = (np.zeros(n, np.float32) for _ in range(3))
         self.gain_variance: Floats = np.full(n, GAIN_SPREAD2, np.float32)
         self.noise2: Floats = np.full(n, np.nan, np.float32)
+        self.noise_s: Floats = np.full(n, NOISE_S, np.float32)
         self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
         self.agility = np.zeros(self.patches.n)
@@ -234,7 +237,10 @@ class Offsets:
         quick = innovation - self.slow
         self.slow += quick * (np.float32(slowly) * taxels)
         quick2 = quick * (innovation - self.slow)
-        self.noise2 += (quick2 - self.noise2) * (calm * np.float32(min(passed_s / NOISE_S, 0.1)))
+        self.noise_s = np.minimum(self.noise_s + calm * np.float32(passed_s), np.float32(NOISE_S))
+        with np.errstate(divide="ignore"):
+            of_square = np.minimum(np.float32(passed_s) / self.noise_s, np.float32(FEWEST))
+        self.noise2 += (quick2 - self.noise2) * (calm * of_square)
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, passed_s)

@@ -114,7 +114,8 @@ class Rest:
         for total, of_frame in zip(self._sums, pairs, strict=True):
             total += of_frame
         self._frames += 1
-        if time_ns - self._begun_ns < block_ns or self._frames < BLOCK_FRAMES:
+        values_of = self._sums[0]
+        if time_ns - self._begun_ns < block_ns or values_of.sum() < BLOCK_FRAMES * (values_of > 0).sum():
             return False
         self._blocks.append(self._sums)
         self._sums = np.zeros_like(self._sums)

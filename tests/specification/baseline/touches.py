@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from tests.specification.baseline.numbers import (
     ALIKE,
+    AT_ONCE,
     DRIFT_SIGMA,
     FALLEN,
     LOOK_AT_S,
@@ -39,6 +40,7 @@ class Touches:
         smooth: (n,) float32, deviation from the offset, smoothed.
         peak: (n,) float32, the highest load of the touch, slowly followed.
         contact_s: (n,) float32, how long each has been touched.
+        onset: (n,) float32, deviation in the first frame above the threshold at which a touch ends.
         noise_share: share of the noise that smoothing leaves; at least a half.
         remainders: what covers keep of loads.
     """
@@ -48,7 +50,7 @@ class Touches:
         self.signed = signed
         self.touched: Flags = np.zeros(n, bool)
         self._high: Flags = np.zeros(n, bool)
-        self.smooth, self.peak, self.contact_s = (np.zeros(n, np.float32) for _ in range(3))
+        self.smooth, self.peak, self.contact_s, self.onset = (np.zeros(n, np.float32) for _ in range(4))
         self._modules, self._patch = Grouping(module), patch
         self.noise_share = 0.5
         self.remainders = Remainders(self._modules, patch)
@@ -88,6 +90,7 @@ class Touches:
         begins = high & (smooth > on) & ~self.touched
         if passed_s < QUICK_S:
             begins &= self._high
+        np.copyto(self.onset, deviation, where=high & ~self._high)
         np.copyto(self._high, high, where=live)
         begun = np.flatnonzero(begins)
         if len(begun):
@@ -121,25 +124,31 @@ class Touches:
         old = self.touched & (self.contact_s - np.float32(passed_s) >= LOOK_AT_S)
         return self.touched & (self.contact_s >= LOOK_AT_S) & ~old, old
 
-    def module_steps(self, live: Flags, on: Floats, offsets: Offsets, passed_s: float) -> tuple[Rows, Floats]:
-        """Return the k taxels of modules that rose alike, suddenly and by little, and (k,) by how much."""
-        new, _ = self.looked(passed_s)
+    def module_steps(
+        self, deviation: Floats, live: Flags, on: Floats, off: Floats, offsets: Offsets, passed_s: float
+    ) -> tuple[Rows, Floats]:
+        """Return the k taxels of modules that rose alike, at once and by little, and (k,) by how much."""
+        later, _ = self.looked(passed_s)
+        new = later | (self.touched & (self.contact_s <= np.float32(passed_s)))
         if self.signed or not new.any():
             return np.zeros(0, np.intp), self.smooth[:0]
         modules = self._modules
-        looked = np.zeros(modules.n, bool)
+        looked, is_later = np.zeros(modules.n, bool), np.zeros(modules.n, bool)
         looked[modules.group[new]] = True
+        is_later[modules.group[later]] = True
         here = live & looked[modules.group]
-        median = modules.median(self.smooth, here)
+        median = modules.median(deviation, here)
+        at_once = np.abs(modules.median(self.onset, here & self._high) - median) < AT_ONCE * median
         sudden = modules.median(offsets.slow, here) < 0.3 * median
-        threshold = modules.median(on, here)
         around = np.maximum(ALIKE * modules.spread(median), 0.5 * on)
-        near = here & (np.abs(self.smooth - modules.spread(median)) < around)
+        near = here & (np.abs(deviation - modules.spread(median)) < around)
         number = modules.sum(here)
-        alike = (number >= 4) & (modules.sum(near) >= MOST_ALIKE * number) & sudden & looked
-        alike &= (median > OFF_TO_ON * threshold) & (median < STEP_OVER_ON * threshold)
-        stepped = np.flatnonzero(here & alike[modules.group])
-        return stepped, median[modules.group[stepped]]
+        alike = (number >= 4) & (modules.sum(near) >= MOST_ALIKE * number) & sudden & looked & (at_once | is_later)
+        alike &= median > OFF_TO_ON * modules.median(on, here)
+        alike &= median < np.float32(STEP_OVER_ON / OFF_TO_ON) * modules.median(off, here)
+        typical = modules.spread(median)
+        stepped = np.flatnonzero(live & alike[modules.group] & (deviation >= np.float32(0.5) * typical))
+        return stepped, typical[stepped]
 
     def forget(self, taxels: Rows) -> None:
         """Drop what is known of some taxels."""

@@ -1,0 +1,117 @@
+// What is plotted: which lines, asked of the server, drawn in strips, and events that a person marks.
+
+import { h } from "./dom.js";
+import { contactLine, Lines, partLine, taxelLine } from "./series.js";
+import { Strips } from "./strips.js";
+
+export class Plotting {
+  #dragged = null;
+  #isMarking = false;
+
+  /**
+   * @param {HTMLElement} host
+   * @param {object} parts `send(op)`, `skin`, `probes`, `stage`, `rewind`, `notify(text)`.
+   */
+  constructor(host, parts) {
+    Object.assign(this, parts);
+    this.marks = [];
+    this.now_ns = 0;
+    this.offset_ms = 0; // from the server's clock to the time of day
+    this.lines = new Lines(this.send);
+    this.strips = new Strips(host, this.lines, {
+      now_ns: () => this.now_ns,
+      marks: () => this.marks,
+      moment_s: () => (this.rewind.isPaused ? this.rewind.at_s : null),
+      footer: (lines, time_ns) => this.footer(lines.map(driverOf), time_ns),
+      changed: () => this.ask(),
+      refuse: this.notify,
+      find: () => this.#dragged,
+    });
+    document.addEventListener("dragend", () => this.#drag(null));
+  }
+
+  /** Ask for all lines that are looked at: those of strips, and those of cards. */
+  ask(again = false) {
+    this.lines.choose(this.skin, [...this.strips.all, ...this.probes.all.map(taxelLine)], again);
+  }
+
+  take(taken) {
+    this.now_ns = Number(taken.header.now_ns);
+    this.offset_ms = Date.now() - this.now_ns / 1e6;
+    this.lines.take(taken);
+  }
+
+  takeState({ marks = [], recording = null }) {
+    this.marks = marks.map(({ time_ns, text }) => ({ time_ns: Number(time_ns), text }));
+    const last = marks.at(-1);
+    if (!this.#isMarking || !last) return;
+    this.#isMarking = false;
+    this.notify(last.is_recorded ? `${last.text} is in ${recording?.file ?? "the recording"}` : `${last.text}; nothing is recorded (r records)`);
+  }
+
+  mark() {
+    this.#isMarking = true;
+    this.send({ op: "mark", text: `mark ${this.marks.length + 1}` });
+  }
+
+  seriesOf(probe) {
+    return this.lines.get(taxelLine(probe).key);
+  }
+
+  /** Of a taxel. @param {object} probe */
+  taxel(probe) {
+    const line = taxelLine(probe);
+    return { ...line, get label() { return probe.name; } };
+  }
+
+  /** Of a hand, finger, pad or board. */
+  part({ sheet, name, modules }) {
+    const isOne = this.skin.drivers.size < 2 || name === sheet.driver.name;
+    return partLine({ sheet, name: isOne ? name : `${sheet.driver.name}, ${name}`, modules });
+  }
+
+  contact(driver, contact) {
+    return contactLine(driver, contact);
+  }
+
+  /** Of a driver or a patch of the tree; null of another row, or if it has no taxels in the picture. */
+  row({ driver, level, name, patch }) {
+    const sheet = this.stage.sheets.find((one) => one.driver === driver);
+    const modules = driver.modules.map((_, m) => m).filter((m) => level === 1 || driver.modules[m].patch === patch);
+    return sheet && level !== 2 && modules.length ? this.part({ sheet, name, modules }) : null;
+  }
+
+  /** Let an element be dragged into a strip. @param {() => ?object} lineOf it stands for. */
+  draggable(element, lineOf) {
+    element.draggable = true;
+    element.addEventListener("dragstart", (event) => {
+      const line = lineOf();
+      if (!line) return event.preventDefault();
+      event.dataTransfer.setData("text/plain", line.label);
+      event.dataTransfer.effectAllowed = "copyMove";
+      setTimeout(() => this.#drag(line)); // a change of the page at once would end it
+    });
+    return element;
+  }
+
+  /** A button that plots. */
+  button(lineOf) {
+    const add = () => this.strips.add(lineOf());
+    return h("button", { type: "button", class: "plain", title: "Plot it (g)", "aria-label": "Plot it", onclick: add }, "∿");
+  }
+
+  #drag(line) {
+    this.#dragged = line;
+    document.body.toggleAttribute("data-dragging", Boolean(line));
+  }
+
+  /** Whose values, and of when. @param {string[]} keys of drivers. */
+  footer(keys, time_ns = this.now_ns) {
+    const drivers = [...this.skin.drivers.values()].filter(({ key }) => keys.includes(key));
+    const names = drivers.map(({ name, type }) => (name === type ? name : `${name} (${type})`));
+    const time = new Date(time_ns / 1e6 + this.offset_ms).toISOString().replace("T", " ").replace(/\.\d+Z/, " UTC");
+    return [...names, time].join(", ");
+  }
+}
+
+const driverOf = ({ driver, taxel }) => driver ?? taxel.split(":")[0];

@@ -1,0 +1,234 @@
+"""Take every sample of the taxels, parts and contacts that a viewer plots, in bounded memory."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_service import DriverReader
+from skinware.driver_snapshot import DriverSnapshot
+from skinware.errors import Overrun, ServiceError, ServiceTimeout
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.service import ServiceReader
+from skinware.status import Status
+from skinware.structure import Structure
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.views.following import Follower, ShownDriver
+from skinware.views.looks import Line
+from skinware.views.quantities import WITHOUT_VALUE
+
+Values = npt.NDArray[np.float64]
+Sensors = npt.NDArray[np.int64]
+
+_MOST_SAMPLES = 4096
+"""Samples of a service that wait for a turn."""
+_MOST_BLOCKS = 64
+"""Values of earlier choices that wait, at most."""
+_LOOK_EVERY_NS = NS_PER_S // 2
+_NO_VALUE = np.uint8(WITHOUT_VALUE | Status.STALE)
+
+
+class _Origin(NamedTuple):
+    """The service that has the values of a line; ``of`` is ``driver``, ``calm`` or ``contacts``."""
+
+    of: str
+    namespace: Namespace
+    name: str
+
+
+class PlotBlock(NamedTuple):
+    """(k,) int64 ns, CLOCK_MONOTONIC of publication, and (k, m) values of m lines, NaN without one.
+
+    ``number`` is that of the viewer's choice, of which ``lines`` are places.
+    """
+
+    number: int
+    of: str
+    lines: list[int]
+    time_ns: npt.NDArray[np.int64]
+    values: Values
+
+
+class _Feed:
+    """The samples of one service that wait for the next turn."""
+
+    def __init__(self, source: _Origin) -> None:
+        reader = ContactsReader if source.of == "contacts" else DriverReader
+        self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
+        self.of, self.number, self.missed = source.of, 0, 0
+        self.lines: dict[int, Line] = {}
+        self._values: Callable[[Any], Values] = lambda _: np.zeros(0)
+        self._rows: deque[tuple[int, Values]] = deque(maxlen=_MOST_SAMPLES)
+        self._last: tuple[int, int] | None = None
+
+    def choose(self, number: int, lines: dict[int, Line], driver: ShownDriver) -> None:
+        """Take the values of these lines, by their places in a choice, from now on."""
+        self.number, self.lines = number, lines
+        if self.of == "contacts":
+            ids = [line.contact for line in lines.values()]
+            self._values = lambda sample: _loads(sample, ids)
+        else:
+            self._values = _sums(driver.structure, [_sensors_of(driver, line) for line in lines.values()])
+
+    def take(self) -> bool:
+        """Take the newer samples, and return whether some wait; raise what the reader raises."""
+        latest = self.reader.refresh()
+        if latest is not None and latest != self._last:
+            with contextlib.suppress(ServiceTimeout, Overrun):
+                for sample in self.reader.in_order(timeout_s=0.0):
+                    self._add(sample)
+                    if sample.position >= latest:
+                        break
+        return bool(self._rows)
+
+    def _add(self, sample: Any) -> None:
+        last, self._last = self._last, sample.position
+        if last is not None and sample.position != (last[0], last[1] + 1):  # a gap is seen as one
+            self.missed += max(1, sample.position[1] - last[1] - 1)
+            self._rows.append((sample.published_ns - 1, np.full(len(self.lines), np.nan)))
+        self.missed += len(self._rows) == _MOST_SAMPLES
+        self._rows.append((sample.published_ns, self._values(sample)))
+
+    def block(self) -> PlotBlock:
+        """Return the samples that wait; they are forgotten."""
+        rows = list(self._rows)
+        self._rows.clear()
+        values = np.array([values for _, values in rows], np.float64).reshape(len(rows), len(self.lines))
+        times = np.array([time_ns for time_ns, _ in rows], np.int64)
+        return PlotBlock(self.number, self.of, list(self.lines), times, values)
+
+
+class Plots:
+    """The lines of one viewer.
+
+    Attributes:
+        has_news: values wait for a turn.
+    """
+
+    def __init__(self, follower: Follower) -> None:
+        self.has_news = False
+        self._number = 0
+        self._follower = follower
+        self._lines: list[Line] = []
+        self._edition = self._look_ns = 0
+        self._feeds: dict[_Origin, _Feed] = {}
+        self._waiting: deque[PlotBlock] = deque(maxlen=_MOST_BLOCKS)
+
+    @property
+    def missed(self) -> int:
+        """Samples that came since a service is plotted, and were not taken or not sent."""
+        return sum(feed.missed for feed in self._feeds.values())
+
+    def choose(self, number: int, lines: list[Line], edition: int) -> None:
+        """Send the values of these lines from now on; of new taxels also those of the last seconds.
+
+        Args:
+            edition: of the structures that the lines are from.
+        """
+        before, self._lines, self._number, self._edition = self._lines, lines, number, edition
+        self._find()
+        new = [(at, line) for at, line in enumerate(lines) if line not in before]
+        self._waiting += [block for at, line in new if (block := self._past_of(at, line)) is not None]
+        self.has_news = bool(self._waiting)
+
+    def take(self) -> None:
+        """Take the samples that came."""
+        if self._lines and now_ns() >= self._look_ns:
+            self._find()
+        for source, feed in list(self._feeds.items()):
+            try:
+                self.has_news |= feed.take()
+            except ServiceError:  # it went, or has other sensors: the viewer chooses again when it knows them
+                self._feeds.pop(source).reader.close()
+
+    def blocks(self) -> list[PlotBlock]:
+        """Return the values that came since the last call."""
+        waiting, self.has_news = list(self._waiting), False
+        self._waiting.clear()
+        return waiting + [block for feed in self._feeds.values() if len((block := feed.block()).time_ns)]
+
+    def close(self) -> None:
+        for feed in self._feeds.values():
+            feed.reader.close()
+        self._feeds, self._lines = {}, []
+
+    def _find(self) -> None:
+        """Open the services that have the lines, and close the others."""
+        self._look_ns = now_ns() + _LOOK_EVERY_NS
+        if self._follower.edition != self._edition:
+            return
+        wanted: dict[_Origin, tuple[ShownDriver, dict[int, Line]]] = {}
+        for at, line in enumerate(self._lines):
+            driver = self._follower.get(line.driver)
+            source = None if driver is None else self._source_of(driver, line)
+            if driver is not None and source is not None:
+                wanted.setdefault(source, (driver, {}))[1][at] = line
+        for source in self._feeds.keys() - wanted.keys():
+            self._feeds.pop(source).reader.close()
+        for source, (driver, lines) in wanted.items():
+            with contextlib.suppress(ServiceError):  # it is looked for again
+                feed = self._feeds.get(source) or self._feeds.setdefault(source, _Feed(source))
+                if (self._number, lines) != (feed.number, feed.lines):
+                    self._waiting += [block] if len((block := feed.block()).time_ns) else []
+                    feed.choose(self._number, lines, driver)
+
+    def _source_of(self, driver: ShownDriver, line: Line) -> _Origin | None:
+        follower = self._follower
+        if line.contact is not None:
+            reader = follower.contacts_reader(driver.name)
+            return None if reader is None else _Origin("contacts", reader.namespace, reader.name)
+        is_calm = driver.newest is not None and driver.newest.calm is not None
+        if line.modules and is_calm and follower.calm_namespace is not None:
+            return _Origin("calm", follower.calm_namespace, driver.name)
+        return _Origin("driver", follower.namespace, driver.name)
+
+    def _past_of(self, at: int, line: Line) -> PlotBlock | None:
+        driver = self._follower.get(line.driver)
+        if driver is None or line.position is None or line.position >= driver.structure.n_sensors:
+            return None
+        time_ns, raw = driver.past.series(line.position)
+        scale, offset = _units_of(driver.structure, np.array([line.position]))
+        return PlotBlock(self._number, "driver", [at], time_ns, raw[:, None] * scale + offset)
+
+
+def _sensors_of(driver: ShownDriver, line: Line) -> Sensors:
+    """Return (k,) positions of the sensors whose sum is a line."""
+    structure, quantity = driver.structure, driver.quantity(line.type)
+    if line.position is not None:
+        return np.array([line.position] if line.position < structure.n_sensors else [], np.int64)
+    if quantity is None:
+        return np.zeros(0, np.int64)
+    return quantity.index[np.isin(structure.sensor_module[quantity.index], line.modules)]
+
+
+def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
+    """Return (k,) scale and (k,) offset of sensors."""
+    by_id = {t.id: (t.scale, t.offset) for t in structure.types}
+    units = np.array([by_id[of_type] for of_type in structure.sensor_type[sensors].tolist()]).reshape(-1, 2)
+    return units[:, 0], units[:, 1]
+
+
+def _sums(structure: Structure, lines: list[Sensors]) -> Callable[[DriverSnapshot], Values]:
+    """Return a function of a snapshot: the (m,) sums of the values of each line's sensors."""
+    at = np.concatenate(lines)
+    scale, offset = _units_of(structure, at)
+    ends = np.cumsum([len(sensors) for sensors in lines])[:-1]
+
+    def sums(frame: DriverSnapshot) -> Values:
+        values = frame.values[at] * scale + offset
+        values[(frame.status[at] & _NO_VALUE) != 0] = np.nan
+        parts = np.split(values, ends)
+        return np.array([np.nan if np.isnan(part).all() else np.nansum(part) for part in parts])
+
+    return sums
+
+
+def _loads(sample: ContactsSample, ids: list[int | None]) -> Values:
+    loads = dict(zip(sample.contacts.id.tolist(), sample.contacts.load.tolist(), strict=True))
+    return np.array([loads.get(contact, np.nan) for contact in ids])

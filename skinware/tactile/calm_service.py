@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
@@ -18,13 +19,18 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
 from skinware.service.messages import ACQUIRE
 from skinware.tactile import contacts_service, health_service
-from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.calm_driver import CalmedDriver, DriverSource
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState
 from skinware.tactile.derived_services import CalmContacts, CalmHealth, WatchedRegions
+from skinware.tactile.rule import Why
 
 log: logging.Logger = logging.getLogger("skinware.calm")
+
+
+def _reasons(calm: Calm) -> dict[str, int]:
+    return {why.name.lower(): count for why in Why if (count := int(np.count_nonzero(calm.why == why)))}
 
 
 class CalmRequests:
@@ -171,7 +177,7 @@ class CalmService:
         self._source = DriverSource(name, self.namespace)
         self._calmed = CalmedDriver(name, self.into, group, self._requests.operations)
         self._state: Literal["waiting", "running", "lost"] = "waiting"
-        self._refused: set[str] = set()
+        self._warned: set[str] = set()
         self._stopping = False
 
     def run(
@@ -233,6 +239,7 @@ class CalmService:
             "ready": {name: int(stage.baseline.ready.sum()) for name, stage in stages.items()},
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},
             "touched": {name: int(stage.touched.sum()) for name, stage in stages.items()},
+            "why": {name: _reasons(stage.calm) for name, stage in stages.items() if stage.calm is not None},
             "contacts": 0 if self.contacts is None else self.contacts.count,
             "faulty": 0 if self.health is None else self.health.faulty,
         }
@@ -266,7 +273,7 @@ class CalmService:
         chain.explain(columns["uncertainty"], columns["why"])
         if self.health is not None:
             self.health.step(columns["status"], frame.acquired_ns)
-        self._warn_of_waiting(chain)
+        self._warn(chain)
         writer.commit(frame.acquired_ns)
         if self.contacts is not None:
             self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
@@ -284,17 +291,28 @@ class CalmService:
         if self.contacts is not None:
             self.contacts.publish_none(now_ns())
 
-    def _warn_of_waiting(self, chain: Chain) -> None:
-        """Warn once of the sensors of each type that wait for their baselines."""
-        for name, baseline in chain.baselines.items():
-            if baseline.refused_share and name not in self._refused:
+    def _warn(self, chain: Chain) -> None:
+        """Warn once of the sensors of each type that wait for their baselines, and that a touch seems to lower."""
+        for name, stage in chain.baseline_stages.items():
+            share, calm = stage.baseline.refused_share, stage.calm
+            if self._is_new(f"{name} moves", share > 0):
                 log.warning(
                     "%s: no baselines yet for %.0f %% of the sensors: they move; each gets one when it has rested for"
                     " %g s, or at a tare",
                     name,
-                    100 * baseline.refused_share,
-                    baseline.settings.calibrate_s,
+                    100 * share,
+                    stage.baseline.settings.calibrate_s,
                 )
-                self._refused.add(name)
-            elif not baseline.refused_share:
-                self._refused.discard(name)
+            doubted = 0 if calm is None else int(np.count_nonzero(calm.why == Why.DOUBTED))
+            if self._is_new(f"{name} doubted", doubted > 0):
+                log.warning(
+                    "%s: sensors fall and return where nothing touches (%d so far): if a touch lowers them, put a stage"
+                    " amplifier with gain -1 before the baseline",
+                    name,
+                    doubted,
+                )
+
+    def _is_new(self, what: str, is_there: bool) -> bool:
+        is_new = is_there and what not in self._warned
+        (self._warned.add if is_there else self._warned.discard)(what)
+        return is_new

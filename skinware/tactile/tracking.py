@@ -380,7 +380,8 @@ class Tracker:
         velocity = tracks["velocity"][first]
         for blob in set(home[1:][np.diff(home) == 0].tolist()):
             rows = here[home == blob]
-            velocity[blob] = np.average(tracks["velocity"][rows], axis=0, weights=np.maximum(tracks["now"][rows], 1e-9))
+            weight = np.maximum(tracks["now"][rows], 1e-9)
+            velocity[blob] = weight @ tracks["velocity"][rows] / weight.sum()
         age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
         return Tracked(tracks["id"][first], age_s, velocity, tracks["kind"][first], ~tracks["sure"][first])
 

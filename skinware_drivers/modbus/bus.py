@@ -29,7 +29,7 @@ from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.bus import Address, parse_address
 from skinware_drivers.streams.tcp import TcpOptions, TcpPort, TcpServerBus, connect
-from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
+from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock, Timer
 
 DEFAULT_PORT = 502
 _TCP = "tcp://"
@@ -101,7 +101,7 @@ class ModbusBus(KernelBus):
         *,
         payload_size: int = 8,
         listen_only: bool = False,
-        make_timer: Callable[[], Timer] = MonotonicTimer,
+        clock: Clock = REAL_CLOCK,
     ) -> None:
         given = dict(options or {})
         own = {key: given.pop(key) for key in list(given) if key in ModbusOptions.__struct_fields__}
@@ -122,7 +122,7 @@ class ModbusBus(KernelBus):
                 raise ConfigurationError(f"{self.name}: a bus that only listens cannot ask for others: no gateway")
             guests = Guests(may_write=self._modbus.gateway_writes, over_tcp=self._address is not None)
             self._gateway = Gateway(self._modbus.gateway, guests, is_public=self._modbus.gateway_public)
-        self._make_timer = make_timer
+        self._clock: Clock = clock
         self._wanted = Wanted(())
         self._timing = Timing(NS_PER_S, NS_PER_S, 0)
         self._baudrate = DEFAULT_BAUDRATE
@@ -203,7 +203,7 @@ class ModbusBus(KernelBus):
                 self._port = None
                 port.close()
                 raise
-        self._timer = self._make_timer()
+        self._timer = self._clock.timer()
         epoll = select.epoll()
         for each in (port, self._timer, self._gateway):
             if each is not None:

@@ -31,7 +31,7 @@ from skinware_drivers.proving.updates import Collected, Comparison, Decoding, co
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
-from skinware_drivers.virtual.recorded import Clock, medium_of, replayed_bus, wire_of
+from skinware_drivers.virtual.recorded import medium_of, replayed_bus, wire_of
 
 _NAME = "captured"
 _SLOTS = 64
@@ -166,7 +166,7 @@ class _ReplayedWire:
             {"bus": self.wire.bus, "driver": self.wire.driver},
             payload_size=adapter.payload_size,
             listen_only=self._listens,
-            clock=Clock(self._clock, self._clock.timer),
+            clock=self._clock,
             note=self._note,
         )
         self.line = self.wire.bus, adapter, bus

@@ -263,7 +263,6 @@ def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, 
         listen_only=listen_only,
         hardware=hardware,
         clock=clock,
-        make_timer=clock.timer,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import ClassVar
@@ -18,7 +17,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
+from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock, Timer
 from skinware_drivers.virtual.hardware import (
     EmulatedHardware,
     PlacedHardware,
@@ -51,8 +50,7 @@ class VirtualCanBus(Bus):
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
-        clock: returns CLOCK_MONOTONIC ns.
-        make_timer: makes the timer behind ``fileno``; another clock needs another timer.
+        clock: stamps the frames, and makes the timer behind ``fileno``.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
@@ -68,8 +66,7 @@ class VirtualCanBus(Bus):
         payload_size: int = 8,
         listen_only: bool = False,
         hardware: EmulatedHardware | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
-        make_timer: Callable[[], Timer] = MonotonicTimer,
+        clock: Clock = REAL_CLOCK,
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self._emulated = type(hardware).__name__
@@ -81,7 +78,6 @@ class VirtualCanBus(Bus):
         self._wire = hardware.wire if isinstance(hardware, Stage) else None
         self.bit_rate: int = self._wire.bit_rate if self._wire else 0
         self._clock = clock
-        self._make_timer = make_timer
         self._timer: Timer | None = None
         self._pending: list[WireFrame] = []
         self._due_ns: int | None = None
@@ -112,7 +108,7 @@ class VirtualCanBus(Bus):
         if not self._present:
             raise BusNotAvailable(f"{self.name}: the emulated interface is away")
         if self._timer is None:
-            self._timer = self._make_timer()
+            self._timer = self._clock.timer()
             self.hardware.skip(self._clock())
             self._wake_when_due()
 

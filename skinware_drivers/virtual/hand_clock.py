@@ -81,6 +81,27 @@ class MonotonicTimer:
             self._fd = -1
 
 
+class Clock(Protocol):
+    """CLOCK_MONOTONIC, or the time of a test. A call returns ns."""
+
+    def __call__(self) -> int: ...
+
+    def timer(self) -> Timer: ...
+
+
+class MonotonicClock:
+    """CLOCK_MONOTONIC, ns."""
+
+    def __call__(self) -> int:
+        return time.monotonic_ns()
+
+    def timer(self) -> Timer:
+        """Make an open timer that does not run."""
+        return MonotonicTimer()
+
+
+REAL_CLOCK = MonotonicClock()
+
 _BEGINNING_NS = 5_000_000_000_000
 _TURNS_AT_ONE_MOMENT = 20_000
 _NAPS_WITHOUT_TIMER = 40

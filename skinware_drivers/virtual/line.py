@@ -5,8 +5,7 @@ On a line, the payloads of the emulator's frames are the bytes, framing and all;
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections import deque
 from typing import ClassVar
 
 from skinware.errors import BusNotAvailable
@@ -17,10 +16,11 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, PlacedCanBus, VirtualCanBus
-from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
+from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock
 from skinware_drivers.virtual.hardware import (
     EmulatedHardware,
     PlacedHardware,
+    WireFrame,
     emulators_instead,
     load_emulator,
     medium_of,
@@ -30,15 +30,14 @@ _LONGEST_BACKLOG_NS = 1_000_000_000
 """Bytes that wait longer are dropped, as from a full buffer of the kernel."""
 
 
-class _EmulatedLine(Bus):
+class EmulatedLine(Bus):
     """A bus of lines with emulated devices at the other end.
 
     Args:
         payload_size: longest body that fits into a batch.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
-        clock: returns CLOCK_MONOTONIC ns.
-        make_timer: makes the timer that wakes the reader; another clock needs another timer.
+        clock: stamps what is read, and makes the timer that wakes the reader.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
@@ -54,16 +53,15 @@ class _EmulatedLine(Bus):
         payload_size: int = 8,
         listen_only: bool = False,
         hardware: EmulatedHardware | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
-        make_timer: Callable[[], Timer] = MonotonicTimer,
+        clock: Clock = REAL_CLOCK,
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
         if hardware is None:
             emulator = load_emulator(channel)
             hardware = emulator(options_from_strings(emulator.Options, options or {}))
         self.hardware: EmulatedHardware = hardware
-        self._clock, self._make_timer = clock, make_timer
-        self._end: _EmulatedPort | None = None
+        self._clock = clock
+        self._end: EmulatedPort | None = None
         self._is_away = False
 
     @property
@@ -86,15 +84,15 @@ class _EmulatedLine(Bus):
     def _open_port(self) -> Port:
         if self._is_away:
             raise BusNotAvailable(f"{self.name}: the emulated line is away")
-        self._end = _EmulatedPort(self.hardware, self._clock, self._make_timer())
+        self._end = EmulatedPort(self.hardware, self._clock)
         return self._end
 
 
-class VirtualSerialBus(_EmulatedLine, SerialBus):
+class VirtualSerialBus(EmulatedLine, SerialBus):
     """Emulated serial devices as a bus, with a name as that of ``VirtualCanBus``."""
 
 
-class VirtualModbusBus(_EmulatedLine, ModbusBus):
+class VirtualModbusBus(EmulatedLine, ModbusBus):
     """Emulated Modbus devices as a bus, with a name as that of ``VirtualCanBus``."""
 
     def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
@@ -102,12 +100,12 @@ class VirtualModbusBus(_EmulatedLine, ModbusBus):
         return 0.0
 
 
-class _EmulatedPort(Port):
+class EmulatedPort(Port):
     """The host's end of a line with emulated devices at the other."""
 
-    def __init__(self, hardware: EmulatedHardware, clock: Callable[[], int], timer: Timer) -> None:
-        self._hardware, self._clock, self._timer = hardware, clock, timer
-        self._unread: list[bytes] = []
+    def __init__(self, hardware: EmulatedHardware, clock: Clock) -> None:
+        self._hardware, self._clock, self._timer = hardware, clock, clock.timer()
+        self._unread: deque[WireFrame] = deque()
         self._is_away = False
         hardware.skip(clock())
         self._wake_when_due()
@@ -122,7 +120,7 @@ class _EmulatedPort(Port):
         due_ns = self._hardware.next_due_ns()
         if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-        self._unread += [frame.payload for frame in self._hardware.emit(now_ns)]
+        self._unread += self._hardware.emit(now_ns)
         data = self._next_read(size)
         self._wake_when_due()
         return data
@@ -144,9 +142,9 @@ class _EmulatedPort(Port):
     def _next_read(self, size: int) -> bytes:
         """Return the bytes of one read: all that wait, or one datagram."""
         if getattr(self._hardware, "datagrams", False):
-            return self._unread.pop(0)[:size] if self._unread else b""
-        data = b"".join(self._unread)
-        self._unread = [data[size:]] if len(data) > size else []
+            return self._unread.popleft().payload[:size] if self._unread else b""
+        data = b"".join(frame.payload for frame in self._unread)
+        self._unread = deque([WireFrame(0, 0, data[size:])] if len(data) > size else ())
         return data[:size]
 
     def _wake_when_due(self) -> None:

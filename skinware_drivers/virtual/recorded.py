@@ -7,8 +7,7 @@ come from the recording, and the driver need not ask.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -28,8 +27,10 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
-from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedPort, RecordedWire
+from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock
+from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.line import EmulatedLine, EmulatedPort
+from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedWire
 
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireItem, WireTrack
@@ -60,58 +61,53 @@ class Recorded(NamedTuple):
     options: Mapping[str, Any] = MappingProxyType({})
 
 
-class Clock(NamedTuple):
-    """The time of a replay.
-
-    Attributes:
-        now_ns: returns CLOCK_MONOTONIC ns.
-    """
-
-    now_ns: Callable[[], int] = time.monotonic_ns
-    timer: Callable[[], Timer] = MonotonicTimer
-
-
 class ReplayedCanBus(VirtualCanBus):
     """A recorded CAN bus."""
 
-    def __init__(self, wire: RecordedWire, name: str, clock: Clock, *, payload_size: int, listen_only: bool) -> None:
-        super().__init__(
-            "",
-            payload_size=payload_size,
-            listen_only=listen_only,
-            hardware=wire,
-            clock=clock.now_ns,
-            make_timer=clock.timer,
-        )
-        self._name = name
-
     @property
     def name(self) -> str:
-        return f"bus {self._name}"
+        return f"bus {self.channel}"
 
 
-class ReplayedSerialBus(SerialBus):
+class RecordedPort(EmulatedPort):
+    """A port that returns the bytes of the recording, read by read.
+
+    Attributes:
+        read_ns: when the newest returned bytes were read.
+    """
+
+    read_ns = 0
+
+    def read(self, size: int) -> bytes:  # noqa: ARG002
+        frame = self.next_frame()
+        return b"" if frame is None else frame.payload
+
+    def next_frame(self) -> WireFrame | None:
+        self._unread += self._hardware.emit(self._clock())
+        frame = self._unread.popleft() if self._unread else None
+        self._wake_when_due()
+        if frame is not None:
+            self.read_ns = frame.time_ns
+        return frame
+
+    def wake(self) -> None:
+        self._timer.wake_at(0)
+
+
+class ReplayedSerialBus(EmulatedLine, SerialBus):
     """A recorded serial line."""
 
-    opens_slowly = False
-
-    def __init__(self, wire: RecordedWire, name: str, clock: Clock, *, payload_size: int, listen_only: bool) -> None:
-        super().__init__("", payload_size=payload_size, listen_only=listen_only)
-        self._wire, self._name, self._clock = wire, name, clock
-        self._recorded: RecordedPort | None = None
-
     @property
     def name(self) -> str:
-        return f"bus {self._name}"
+        return f"bus {self.channel}"
 
-    def _open_port(self) -> Port:
-        self._recorded = RecordedPort(self._wire, self._clock.now_ns, self._clock.timer)
-        return self._recorded
+    def _open_port(self) -> RecordedPort:
+        return RecordedPort(self.hardware, self._clock)
 
     def _read(self, port: Port) -> None:
         chunk = port.read(0)
-        if chunk and self._recorded is not None:
-            self._hear(chunk, self._recorded.read_ns)
+        if chunk and isinstance(port, RecordedPort):
+            self._hear(chunk, port.read_ns)
 
 
 class Conversation(Listener):
@@ -166,8 +162,8 @@ class ReplayedModbusBus(ModbusBus):
     """A recorded Modbus line or connection. It asks nothing, because the recording has the questions.
 
     Args:
-        open_port: begins the recording, in both directions.
-        name: as a user writes it.
+        channel: its name, as a user writes it.
+        hardware: the recording, in both directions.
         over_tcp: it was a connection.
         payload_size: longest frame.
         listen_only: refuse every ``send``.
@@ -178,21 +174,22 @@ class ReplayedModbusBus(ModbusBus):
 
     def __init__(
         self,
-        open_port: Callable[[], RecordedPort],
-        name: str,
+        channel: str,
         *,
+        hardware: RecordedWire,
+        clock: Clock,
         over_tcp: bool,
         payload_size: int,
         listen_only: bool,
     ) -> None:
-        super().__init__("recorded", payload_size=payload_size, listen_only=listen_only)
-        self._begin_port, self._name, self._over_tcp = open_port, name, over_tcp
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only, clock=clock)
+        self._hardware, self._over_tcp = hardware, over_tcp
         self._recorded: RecordedPort | None = None
         self._conversation = Conversation(self._wanted, self.counters, over_tcp=over_tcp)
 
     @property
     def name(self) -> str:
-        return f"bus {self._name}"
+        return f"bus {self.channel}"
 
     @property
     def asks(self) -> bool:
@@ -209,7 +206,7 @@ class ReplayedModbusBus(ModbusBus):
 
     def open(self) -> None:
         if self._recorded is None:
-            self._recorded = self._begin_port()
+            self._recorded = RecordedPort(self._hardware, self._clock)
 
     def fileno(self) -> int:
         """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
@@ -263,7 +260,7 @@ def replayed_bus(
     *,
     payload_size: int = 8,
     listen_only: bool = False,
-    clock: Clock | None = None,
+    clock: Clock = REAL_CLOCK,
     note: Note | None = None,
 ) -> Bus:
     """Make the bus ``replay`` of a recorded bus in the file ``channel``.
@@ -272,7 +269,7 @@ def replayed_bus(
         options: see :class:`ReplayOptions`.
         payload_size: longest payload of the layout.
         listen_only: refuse to send, and wait for no question.
-        clock: of the replay; default: real time.
+        clock: of the replay.
         note: is called for each frame; see :class:`.recorded_wire.RecordedWire`.
 
     Raises:
@@ -284,19 +281,17 @@ def replayed_bus(
     wanted = options_from_strings(ReplayOptions, options or {})
     recording = _open(channel)
     wire = wire_of(recording, wanted.bus, wanted.driver)
-    name, clock = f"replay:{channel} ({wire.bus})", clock or Clock()
+    name = f"replay:{channel} ({wire.bus})"
     items = _items(recording, wire, wanted)
     of_driver = [one for one in recording.wires if one.driver == wire.driver]
     first_ns = first_of(of_driver, wanted.start)
-    more: dict[str, Any] = {"payload_size": payload_size, "listen_only": listen_only}
+    more: dict[str, Any] = {"payload_size": payload_size, "listen_only": listen_only, "clock": clock}
     play = partial(RecordedWire, items, first_ns, speed=wanted.speed, name=name, note=note)
     if medium_of(recording, wire) == "modbus":
-        recorded = play(waits=False, with_sent=True)
-        begin = partial(RecordedPort, recorded, clock.now_ns, clock.timer)
-        return ReplayedModbusBus(begin, name, over_tcp=_was_over_tcp(wire.items()), **more)
-    recorded = play(waits=not listen_only)
+        hardware = play(waits=False, with_sent=True)
+        return ReplayedModbusBus(name, hardware=hardware, over_tcp=_was_over_tcp(wire.items()), **more)
     kind = ReplayedSerialBus if medium_of(recording, wire) == "serial" else ReplayedCanBus
-    return kind(recorded, name, clock, **more)
+    return kind(name, hardware=play(waits=not listen_only), **more)
 
 
 def recorded_driver(bus_name: str) -> Recorded:

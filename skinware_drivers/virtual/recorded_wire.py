@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG
-from skinware_drivers.serial.ports import Port
-from skinware_drivers.virtual.hand_clock import MonotonicTimer, Timer
 from skinware_drivers.virtual.hardware import WireFrame
 
 if TYPE_CHECKING:
@@ -216,57 +213,3 @@ class RecordedWire:
             self.is_over = True
             if self._name:
                 log.warning("%s: the recording is over", self._name)
-
-
-class RecordedPort(Port):
-    """A port that returns the bytes of the recording, read by read.
-
-    Args:
-        clock: returns CLOCK_MONOTONIC ns.
-        make_timer: makes the timer that wakes the reader; another clock needs another timer.
-
-    Attributes:
-        read_ns: when the newest returned bytes were read.
-    """
-
-    def __init__(
-        self,
-        wire: RecordedWire,
-        clock: Callable[[], int] = time.monotonic_ns,
-        make_timer: Callable[[], Timer] = MonotonicTimer,
-    ) -> None:
-        self._wire, self._clock = wire, clock
-        self._timer = make_timer()
-        self._reads: deque[WireFrame] = deque()
-        self.read_ns: int = 0
-        wire.skip(self._clock())
-        self._wake_when_due()
-
-    def fileno(self) -> int:
-        return self._timer.fileno()
-
-    def read(self, size: int) -> bytes:  # noqa: ARG002
-        frame = self.next_frame()
-        return b"" if frame is None else frame.payload
-
-    def next_frame(self) -> WireFrame | None:
-        self._reads += self._wire.emit(self._clock())
-        frame = self._reads.popleft() if self._reads else None
-        self._wake_when_due()
-        if frame is not None:
-            self.read_ns = frame.time_ns
-        return frame
-
-    def write(self, data: bytes) -> int:
-        self._wire.receive(0, data, self._clock())
-        self._wake_when_due()
-        return len(data)
-
-    def wake(self) -> None:
-        self._timer.wake_at(0)
-
-    def close(self) -> None:
-        self._timer.close()
-
-    def _wake_when_due(self) -> None:
-        self._timer.wake_at(0 if self._reads else self._wire.next_due_ns())

@@ -140,8 +140,3 @@ def test_a_recording_without_wires_and_a_bus_that_is_not_there(file: Path) -> No
     assert nothing.stderr == "skin-replay: without.mcap: no wire was recorded: skin-record --wire records them\n"
     away = run("skin-replay", str(file), "--wire", "--bus", "can0=nocan7")
     assert (away.returncode, away.stdout, away.stderr.count("\n")) == (1, "", 1)
-
-
-def test_services_are_replayed_as_before(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(command, [str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[0])["names"] == []

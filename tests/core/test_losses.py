@@ -117,6 +117,18 @@ def test_samples_in_order_begin_with_the_first_or_the_newest(with_first: bool, f
         assert (taken.sequence, reader.missed) == (first, 0)
 
 
+def test_the_sample_nearest_to_a_time_is_read_first_and_the_newest_is_still_to_come() -> None:
+    with ServiceWriter("x", COLUMNS) as writer, Tap[Sample]("x") as reader:
+        for number in range(3):
+            writer.begin()
+            writer.commit(1000 + 100 * number)
+        assert reader.nearest(1140).acquired_ns == 1100
+        assert reader.nearest(0).acquired_ns == 1000
+        assert reader.read().acquired_ns == 1200
+        assert reader.nearest(1000).acquired_ns == 1000
+        assert (reader.last_taken, reader.missed) == ((writer.generation, 3), 0)
+
+
 def test_a_view_counts_also_where_its_sample_was_read_before() -> None:
     with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)

@@ -83,6 +83,14 @@ def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- losses -------------------------------------------------------------------------------------------------------
 
 
+def test_the_age_of_a_sample_is_that_of_its_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
+        writer.begin()
+        writer.commit(1_000)
+        monkeypatch.setattr(ring_module, "now_ns", lambda: 1_700)
+        assert reader.read().age_ns == 700
+
+
 def test_losses_are_counted_exactly() -> None:
     with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)

@@ -82,7 +82,7 @@ class _End(ModbusBus):
     """A bus at the end of a pair of sockets, whatever its name says."""
 
     def __init__(self, channel: str, clock: HandClock) -> None:
-        super().__init__(channel, payload_size=Fingers(NoOptions()).payload_size, make_timer=clock.timer)
+        super().__init__(channel, payload_size=Fingers(NoOptions()).payload_size, clock=clock)
         self.far, self.near = socket.socketpair()
         self.far.setblocking(False)
 

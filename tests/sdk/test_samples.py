@@ -127,8 +127,8 @@ def test_bytes_of_a_serial_line_without_a_frame() -> None:
     clock = HandClock()
 
     async def scenario() -> list[str]:
-        given: Any = {"hardware": Babbler((0, b"\xaa\x55garbage")), "clock": clock, "make_timer": clock.timer}
-        bus = VirtualSerialBus("babbler", payload_size=64, listen_only=True, **given)
+        babbler = Babbler((0, b"\xaa\x55garbage"))
+        bus = VirtualSerialBus("babbler", payload_size=64, listen_only=True, hardware=babbler, clock=clock)
         bus.use(Packet(sync=(0xAA, 0x55), length=9, checksum=XOR))
         bus.open()
         for _ in range(4):

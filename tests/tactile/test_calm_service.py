@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverReader, Namespace, PatchState, Status
+from skinware import DriverReader, DriverWriter, Namespace, PatchState, Status
 from skinware.errors import ConfigurationError, NameInUse, RequestFailed, RequestRefused, ServiceError, SkinwareError
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_service import CalmService
@@ -70,7 +70,7 @@ def idle(skin: FakeSkin) -> FakeSkin:
 
 
 def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None:
-    with publishing(idle(FakeSkin())) as skin, calming():
+    with publishing(idle(FakeSkin())) as skin, calming() as service:
         skin.status[30] = Status.STALE
         with DriverReader("fake", namespace=into()) as reader:
             assert np.array_equal(reader.structure.sensor_uid, skin.structure.sensor_uid)
@@ -88,6 +88,7 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
             frame = read_until(reader, lambda frame: frame.values[12] > 0)
             assert np.flatnonzero(frame.physical("pressure")).tolist() == [10]
             assert frame.values[12] == 50
+            assert service.status()["why"]["pressure"]["held"] == 1
             assert frame.fresh("pressure")[10]
             assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "dropped", "errors", "unknown"]]
             with DriverReader("fake") as source:
@@ -95,6 +96,23 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
             assert abs(frame.acquired_ns - newest.acquired_ns) < 10e9
             skin.values[12] = 200
             read_until(reader, lambda frame: not frame.values[12])
+
+
+def test_sensors_that_a_touch_lowers_are_doubted_aloud_once(caplog: pytest.LogCaptureFixture) -> None:
+    structure = fake_structure(1, 2)
+    pressed = np.arange(structure.n_sensors)[structure.index("pressure")][3]
+    with DriverWriter("fake", structure, rate_hz=20) as writer, calming(frames=0) as service:
+        for number in range(300):  # 15 s at 20 Hz by its stamps; the second half of each 4 s is a touch
+            is_touched = number >= 140 and number % 80 >= 40
+            columns = writer.begin()
+            columns["values"][:] = 200
+            columns["values"][pressed] = 240 if is_touched else 200
+            columns["module_time_ns"][:] = 1_000_000_000 + 50_000_000 * number
+            columns["status"][:] = 0
+            writer.commit(1_000_000_000 + 50_000_000 * number)
+            wait_until(lambda: service.frames == writer.sequence)
+        assert service.status()["why"]["pressure"]["doubted"] == 1
+    assert caplog.text.count("if a touch lowers them") == 1
 
 
 def test_operations_and_what_they_refuse() -> None:

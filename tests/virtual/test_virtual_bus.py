@@ -13,6 +13,7 @@ import pytest
 from skinware.errors import BusError, BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.hand_clock import MonotonicClock
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -20,7 +21,7 @@ from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from .rig import MS
 
 
-class Clock:
+class Clock(MonotonicClock):
     """A clock that only the test moves. It begins at the real time, which is all that descriptors know."""
 
     def __init__(self) -> None:

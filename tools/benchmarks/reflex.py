@@ -1,8 +1,8 @@
 """Reflexes: the age of a frame when a reader learns of a touch in it, through skin-calm, beside busy processes.
 
 A driver of some taxels is pressed twice a second. The age is measured from the commit of the frame in which the touch
-is found (its second one) to the event in the reader. Driver, service and reader are a process each; with the real-time
-profile they are ahead of everything else.
+is found (its second one) to the event in the reader: that of skinware.tactile, or examples/reflex.c. Driver, service
+and reader are a process each; with the real-time profile they are ahead of everything else.
 """
 
 from __future__ import annotations
@@ -10,8 +10,11 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import subprocess
+import tempfile
 import time
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 from processes import Processes, answer
@@ -24,6 +27,7 @@ from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.onsets import EventKind
 from tests.tactile.skins import placed, triangles
 
+ROOT = Path(__file__).resolve().parents[2]
 SIDE, SETTLED_S, EVERY_S, PRESS_S = 32, 8.0, 0.5, 0.2
 LOAD = 8.0
 
@@ -90,6 +94,23 @@ def react(pipe: Connection, into: Namespace, seconds: float, profile: Profile | 
     pipe.send(ages_us)
 
 
+def react_in_c(pipe: Connection, into: Namespace, seconds: float, profile: Profile | None) -> None:
+    """The reader in C, and the ages that it prints, us."""
+    apply(profile)
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder, "reflex")
+        include = ROOT / "skinware" / "include"
+        source = ROOT / "examples" / "reflex.c"
+        subprocess.run(["cc", "-O2", "-std=c11", f"-I{include}", "-o", str(program), str(source)], check=True)
+        with subprocess.Popen([program, into.name], stdout=subprocess.PIPE, text=True) as reader:
+            try:
+                time.sleep(SETTLED_S + seconds)
+            finally:
+                reader.terminate()
+            lines = reader.communicate()[0].splitlines()
+    pipe.send([float(line.split()[2]) for line in lines if line.startswith("onset")])
+
+
 def compute(pipe: Connection) -> None:
     """Keep a processor busy."""
     while not pipe.poll():
@@ -102,7 +123,7 @@ def apply(profile: Profile | None) -> None:
             print(f"  {refusal}")
 
 
-def run(rate_hz: float, seconds: float, busy: int, priority: int) -> None:
+def run(rate_hz: float, seconds: float, busy: int, priority: int, *, in_c: bool) -> None:
     """One line."""
     source, into = (Namespace(f"bench-{os.getpid()}-{what}") for what in ("source", "calm"))
     profiles = [Profile.fifo(priority + step) if priority else None for step in (0, 1, 2)]
@@ -113,14 +134,15 @@ def run(rate_hz: float, seconds: float, busy: int, priority: int) -> None:
             answer(driver, 30)
             service = processes.start(calm_down, source, into, profiles[1])
             answer(service, 30)
-            reader = processes.start(react, into, seconds, profiles[2])
+            reader = processes.start(react_in_c if in_c else react, into, seconds, profiles[2])
             ages_us = answer(reader, seconds + 60)
             for pipe in (driver, service, *computing):
                 pipe.send("stop")
         p50, p99 = np.percentile(ages_us, [50, 99]) / 1000
         how = f"fifo:{priority}" if priority else "no profile"
         text = f"p50 {p50:.2f}  p99 {p99:.2f}  most {max(ages_us) / 1000:.2f}"
-        print(f"  {rate_hz:g} Hz, {busy} busy, {how:<10}: {text} ms; {len(ages_us)} onsets", flush=True)
+        reader_in = "C" if in_c else "Python"
+        print(f"  {rate_hz:g} Hz, {busy} busy, {how:<10}, {reader_in:<6}: {text} ms; {len(ages_us)} onsets", flush=True)
     finally:
         for namespace in (source, into):
             shutil.rmtree(namespace.path, ignore_errors=True)
@@ -136,7 +158,8 @@ def main() -> None:
     print(f"age of the frame at the onset of a touch, {SIDE * SIDE} taxels")
     for busy in (0, os.cpu_count() or 1):
         for priority in (0, arguments.priority):
-            run(arguments.rate, arguments.seconds, busy, priority)
+            for in_c in (False, True):
+                run(arguments.rate, arguments.seconds, busy, priority, in_c=in_c)
 
 
 if __name__ == "__main__":

@@ -152,8 +152,8 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
     part, _ = Components(n, neighbours_of_pairs(measured, n)).of(rows)
     _, part, size = np.unique(part, return_inverse=True, return_counts=True)
     linked = np.zeros(n, bool)
-    for number in range(int(piece.max(initial=-1)) + 1):
-        own = np.flatnonzero(piece[rows] == number)
+    for which in range(int(piece.max(initial=-1)) + 1):
+        own = np.flatnonzero(piece[rows] == which)
         linked[rows[own]] = part[own] == part[own][np.argmax(size[part[own]])]
     return Topology(np.column_stack([one, other]), distance, piece, linked)
 

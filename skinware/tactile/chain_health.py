@@ -11,7 +11,6 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
 from skinware.tactile.health import Health, HealthReport
-from skinware.tactile.rule import SIGNED_TYPES
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -29,9 +28,9 @@ class ChainHealth:
         self._watched: dict[str, tuple[BaselineStage, Health]] = {}
         structure = chain.structure
         for name, stage in chain.baseline_stages.items():
-            if name.startswith(SIGNED_TYPES):
-                continue
             taxels = stage.before
+            if taxels.signed:
+                continue
             geometry = None if structure.geometry is None else structure.geometry[structure.index(name)]
             limits = taxels.type.minimum, taxels.type.maximum
             try:

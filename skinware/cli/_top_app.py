@@ -17,6 +17,7 @@ from textual.widgets import DataTable, Footer, Static
 from skinware.bridge_state import as_data, summary
 from skinware.cli._painting import HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
+from skinware.cli._top_help import Help
 from skinware.cli._top_rows import COLUMNS, ListRow, RowKey, labels_of, lines_of, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
@@ -103,6 +104,7 @@ class SkinTop(App[None]):
         Binding("b", "take_baselines", "Baseline"),
         Binding("pagedown", "scroll(1)", "Scroll", key_display="PgUp/PgDn"),
         Binding("pageup", "scroll(-1)", show=False),
+        Binding("question_mark", "explain", "Help", key_display="?"),
     ]
 
     def __init__(
@@ -168,6 +170,9 @@ class SkinTop(App[None]):
     def action_choose(self, step: int) -> None:
         self._missed = None
         self._table.move_cursor(row=self._table.cursor_row + step)
+
+    def action_explain(self) -> None:
+        self.push_screen(Help())
 
     def action_scroll(self, pages: int) -> None:
         self._heat_map.scroll_relative(y=pages * max(1, self._heat_map.size.height - 1), animate=False)

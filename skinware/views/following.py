@@ -18,7 +18,6 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
 from skinware.tactile.motion_service import MotionSample
-from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
 from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
@@ -194,6 +193,7 @@ class Follower:
 
     Attributes:
         edition: changes whenever drivers or structures change.
+        services: about the drivers.
     """
 
     def __init__(
@@ -211,14 +211,10 @@ class Follower:
         self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[str, int] = {}
         self._live = LiveDrivers(namespace, names)
-        self._services = TactileServices(self._live, names, calm)
+        self.services = TactileServices(self._live, names, calm)
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
-
-    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
-        """Return the reader of the service of contacts on a driver."""
-        return self._services.contacts_reader(driver)
 
     def take(self, period_ns: int) -> list[ShownDriver]:
         """Take newer snapshots without waiting.
@@ -232,7 +228,7 @@ class Follower:
         self.problem = None
         try:
             found = self._live.look()
-            self._services.look()
+            self.services.look()
         except NamespaceError as error:
             self.problem = str(error)
             return []
@@ -247,7 +243,7 @@ class Follower:
         return newer
 
     def close(self) -> None:
-        self._services.close()
+        self.services.close()
         self._live.close()
         self.drivers = []
 
@@ -258,9 +254,9 @@ class Follower:
         if live.frame is driver.frame:
             self._live.poll(live)
         if live.frame is None or live.frame is driver.frame:
-            driver.judge(self._services)
-        elif self._services.is_due(live):
-            driver.take(live.frame, self._services)
+            driver.judge(self.services)
+        elif self.services.is_due(live):
+            driver.take(live.frame, self.services)
             return True
         return False
 

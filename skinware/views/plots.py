@@ -181,7 +181,7 @@ class Plots:
     def _source_of(self, driver: ShownDriver, line: Line) -> _Origin | None:
         follower = self._follower
         if line.contact is not None:
-            reader = follower.contacts_reader(driver.name)
+            reader = follower.services.contacts_reader(driver.name)
             return None if reader is None else _Origin("contacts", reader.namespace, reader.name)
         is_calm = driver.newest is not None and driver.newest.calm is not None
         if line.modules and is_calm and follower.calm_namespace is not None:
@@ -216,15 +216,23 @@ def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
 
 def _sums(structure: Structure, lines: list[Sensors]) -> Callable[[DriverSnapshot], Values]:
     """Return a function of a snapshot: the (m,) sums of the values of each line's sensors."""
-    at = np.concatenate(lines)
+    some = [sensors for sensors in lines if len(sensors)]
+    at = np.concatenate([np.zeros(0, np.int64), *some])
     scale, offset = _units_of(structure, at)
-    ends = np.cumsum([len(sensors) for sensors in lines])[:-1]
+    starts = np.cumsum([0, *map(len, some)])[:-1]
+    has_sensors = np.array([len(sensors) > 0 for sensors in lines], bool)
 
     def sums(frame: DriverSnapshot) -> Values:
+        found = np.full(len(lines), np.nan)
+        if not some:
+            return found
         values = frame.values[at] * scale + offset
-        values[(frame.status[at] & _NO_VALUE) != 0] = np.nan
-        parts = np.split(values, ends)
-        return np.array([np.nan if np.isnan(part).all() else np.nansum(part) for part in parts])
+        unknown = np.isnan(values) | ((frame.status[at] & _NO_VALUE) != 0)
+        values[unknown] = 0
+        of_lines = np.add.reduceat(values, starts)
+        of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan
+        found[has_sensors] = of_lines
+        return found
 
     return sums
 

@@ -43,7 +43,6 @@ _STATUSES = {
 
 def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
     """Return the part of the tree for a driver, as the page reads it."""
-    dropped = [bus.counters.get("dropped", 0) for bus in report.buses]
     loads = [bus.load for bus in report.buses if bus.load is not None]
     return {
         "id": driver.number,
@@ -54,7 +53,7 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "age_ms": _milliseconds(report.age_ns),
         "sensors": driver.structure.n_sensors,
         "fresh": int(np.count_nonzero(driver.status == 0)),
-        "dropped": sum(dropped),
+        "dropped": _dropped(report),
         "load": max(loads, default=None),
         "buses": [
             {
@@ -62,10 +61,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
                 "state": report.last(bus.state),
                 "reason": bus.reason,
                 "load": bus.load,
-                "dropped": own_dropped,
-                "counters": _nonzero(bus.counters),
             }
-            for bus, own_dropped in zip(report.buses, dropped, strict=True)
+            for bus in report.buses
         ],
         "patches": [
             {
@@ -76,7 +73,6 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
                 "sensors": patch.sensors,
                 "fresh": patch.fresh,
                 "rate_hz": _rounded(patch.rate_hz),
-                "counters": _nonzero(patch.counters),
             }
             for patch in report.patches
         ],
@@ -117,7 +113,7 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
         if len(sensors) and driver.frame is not None:
             shares = f"{count_text(len(sensors))} of {plural(driver.structure.n_sensors, 'sensor')}"
             add(text, severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
-    dropped = sum(bus.counters.get("dropped", 0) for bus in report.buses)
+    dropped = _dropped(report)
     if dropped:
         add("dropped", NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
     return found
@@ -140,8 +136,8 @@ def _common_patch(structure: Structure, sensors: npt.NDArray[np.intp]) -> dict[s
     return {"bus": structure.buses[int(structure.patch_bus[patch])], "patch": structure.patch_names[patch]}
 
 
-def _nonzero(counters: dict[str, int]) -> dict[str, int]:
-    return {name: count for name, count in counters.items() if count}
+def _dropped(report: DriverReport) -> int:
+    return sum(bus.counters.get("dropped", 0) for bus in report.buses)
 
 
 def _rounded(rate_hz: float | None) -> float | None:

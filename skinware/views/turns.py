@@ -160,6 +160,7 @@ class Viewer:
             "protocol": PROTOCOL,
             "namespaces": [namespace.name for namespace in namespaces],
             "names": list(follower.names),
+            "posed": bool(follower.robot.poses),
             "drivers": [_driver(driver, scene, blobs) for driver in follower.drivers],
             "links": [
                 {
@@ -193,7 +194,6 @@ class Viewer:
             "driver": driver.number,
             "type": quantity.name,
             "generation": str(driver.generation),
-            "sequence": str(frame.sequence),
             "acquired_ns": str(frame.acquired_ns),
             "scale": picture.scale,
             "unit": quantity.type.unit,
@@ -307,10 +307,6 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
             {
                 "name": quantity.name,
                 "unit": quantity.type.unit,
-                "scale": quantity.type.scale,
-                "offset": quantity.type.offset,
-                "minimum": quantity.type.minimum,
-                "maximum": quantity.type.maximum,
                 "touch": quantity.is_touch,
                 "n": len(quantity),
                 "index": blobs.add(index, "<u4"),
@@ -333,7 +329,6 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
         "namespace": driver.namespace,
         "generation": str(driver.generation),
         "type": driver.live.reader.driver_type,
-        "dtype": structure.dtype.name,
         "types": types,
         "buses": list(structure.buses),
         "patches": [

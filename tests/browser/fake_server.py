@@ -73,7 +73,6 @@ class FakeDriver:
         self.scale: tuple[float, float] = (0, 250)
         self.state = "live"
         self.generation = "1"
-        self.sequence = 0
         self.problems: list[Header] = []
         self.contacts: list[Header] = []
         self.regions: list[Header] = []
@@ -108,10 +107,6 @@ class FakeDriver:
             "name": self.type,
             "unit": self.unit,
             "touch": self.is_touch,
-            "scale": 1.0,
-            "offset": 0.0,
-            "minimum": 0,
-            "maximum": 255,
             "n": self.n,
             "index": np.arange(self.n, dtype=np.uint32),
             "uid": np.arange(self.n, dtype=np.uint64) + 0x70000,
@@ -132,7 +127,6 @@ class FakeDriver:
             "namespace": "default",
             "generation": self.generation,
             "type": self.name,
-            "dtype": "uint16",
             "types": [kind],
             "buses": ["can0"],
             "patches": [{"name": f"board {8 + i}", "bus": 0} for i in range(self.boards)],
@@ -143,12 +137,10 @@ class FakeDriver:
         }
 
     def picture(self) -> Header:
-        self.sequence += 1
         picture: Header = {
             "driver": self.number,
             "type": self.type,
             "generation": self.generation,
-            "sequence": str(self.sequence),
             "acquired_ns": str(MONOTONIC_NS + time.monotonic_ns()),
             "scale": list(self.scale),
             "unit": self.unit,
@@ -219,6 +211,7 @@ class FakeServer:
         self.muted = False
         self.links: list[Header] = []
         self.names: list[str] = []
+        self.posed = False
         self.findings: list[Header] = []
         self.files: dict[str, bytes] = {}
         self._server = serve(
@@ -273,7 +266,7 @@ class FakeServer:
                     told = self.version
                     drivers = [d.told() for d in self.drivers]
                     header["skin"] = {"namespaces": ["default"], "drivers": drivers, "links": self.links}
-                    header["skin"]["names"] = self.names
+                    header["skin"] |= {"names": self.names, "posed": self.posed}
                 header["mode"] = self.look["mode"]
                 header["pictures"] = [d.picture() for d in self.drivers if d.state == "live"]
                 if last - state_at > 0.5:

@@ -213,6 +213,7 @@ def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
         "normals": True,
         "names": False,
         "theme": "light",
+        "shifts": {"default/a b": [0.5, -1, 0]},
     }
     assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False, "sharp": False}
 

@@ -173,6 +173,42 @@ def test_only_what_is_fresh_is_green_and_a_dead_driver_is_one_line(page: Page, s
     until(page, f"({rows}).filter(key => key.startsWith('default/sheet')).length === 4")
 
 
+def test_bodies_are_dragged_apart(page: Page, server: FakeServer, open_page: OpenPage) -> None:
+    def places() -> list[list[float]]:
+        return [tell(page, "skin.pixelOf(a[0], 0)", driver) for driver in (0, 1)]
+
+    def drag(driver: int) -> None:
+        page.mouse.move(*places()[driver])
+        page.keyboard.down("Alt")
+        page.mouse.down()
+        x, y = places()[driver]
+        page.mouse.move(x + 60, y - 40, steps=4)
+        page.mouse.up()
+        page.keyboard.up("Alt")
+
+    still, before = places()
+    drag(1)
+    assert places()[0] == pytest.approx(still)
+    assert places()[1] == pytest.approx([before[0] + 60, before[1] - 40], abs=1)
+    assert tell(page, "skin.pins") == []
+    choose(page, "default/sheet")
+    page.locator("#stage").focus()
+    still = places()[0]
+    page.keyboard.press("Shift+ArrowRight")
+    assert places()[0] == pytest.approx([still[0] + 12, still[1]], abs=1)
+    until(page, "(location.hash.match(/at=/g) ?? []).length === 2")
+    other = open_page(page.url)
+    until(other, "skin.connected && skin.drawn > 2 && skin.pixelOf(1, 0)")
+    assert tell(other, "skin.pixelOf(1, 0)") == pytest.approx(places()[1], abs=1.5)
+    server.posed = True
+    server.restructure()
+    turn = tell(page, "skin.turn")
+    until(page, "skin.turn > a[0] + 3", turn)
+    still = places()[0]
+    page.keyboard.press("Shift+ArrowRight")
+    assert places()[0] == pytest.approx(still)  # its place is known
+
+
 def test_the_doctor_is_asked_about_a_problem(sleeve: Sleeve, address: str, open_page: OpenPage) -> None:
     sleeve.patch_state[2] = PatchState.STALE
     sleeve.status[sleeve.structure.patch_index(2)] = Status.STALE

@@ -15,9 +15,19 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware import state as health
 from skinware.cli import _top_app
-from skinware.cli._painting import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, HeatMap, Palette
+from skinware.cli._painting import (
+    CHARACTERS,
+    COLOURS_16,
+    COLOURS_256,
+    MARK_NAMES,
+    TRUE_COLOURS,
+    HeatMap,
+    Palette,
+)
 from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
+from skinware.cli._top_help import KEYS, Help
+from skinware.cli._top_rows import COLUMNS
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
@@ -400,5 +410,24 @@ def test_a_key_goes_from_region_to_region_where_there_are_any() -> None:
                 await pilot.press("r")
                 await pilot.pause()
                 assert app.check_action("next_region", ()) is False
+
+    go(scene)
+
+
+@pytest.mark.parametrize("size", [(100, 40), (60, 15)])
+def test_a_question_mark_explains_every_column_mark_and_key(size: tuple[int, int]) -> None:
+    async def scene() -> None:
+        with publishing(FakeSkin("a", fake_structure(1, 2))):
+            async with shown(size) as (app, pilot):
+                await until(pilot, lambda: listed(app)[:1] == ["a live"])
+                await pilot.press("?")
+                await until(pilot, lambda: isinstance(app.screen, Help))
+                explained = str(app.screen.query_one(Static).content)
+                assert all(title in explained for title in COLUMNS)
+                assert all(name in explained for name in MARK_NAMES.values())
+                assert all(f"  {key}" in explained for key in KEYS)
+                await pilot.press("escape")
+                await until(pilot, lambda: not isinstance(app.screen, Help))
+                assert listed(app)[:1] == ["a live"]
 
     go(scene)

@@ -83,19 +83,20 @@ def test_each_sample_comes_once_and_a_gap_is_seen(namespace: Namespace) -> None:
         assert np.isfinite(values).sum() + lines.missed == count
     skin.publish()
     lines.take()
-    lines.choose(2, [Line(0, position=4), Line(0, position=3)], follower.edition)  # what waits is not lost
+    nothing = Line(0, type="force", modules=(1,))
+    lines.choose(2, [Line(0, position=4), nothing, Line(0, position=3)], follower.edition)  # what waits is not lost
     skin.publish()
     lines.take()
     blocks = lines.blocks()
     assert [(block.number, block.lines, len(block.time_ns)) for block in blocks] == [
         (1, [0], 1),
         (2, [0], 1),
-        (2, [0, 1], 1),
+        (2, [0, 1, 2], 1),
     ]
     skin.status[3] = Status.STALE
     skin.publish()
     lines.take()
-    assert np.isnan(lines.blocks()[0].values).tolist() == [[False, True]]
+    assert np.isnan(lines.blocks()[0].values).tolist() == [[False, True, True]]
     lines.close()
     follower.close()
     skin.close()
@@ -137,7 +138,7 @@ def test_the_load_of_a_contact_and_the_sum_of_what_is_calm(namespace: Namespace,
             return bool(follower.drivers and follower.drivers[0].newest and follower.drivers[0].newest.calm)
 
         wait_until(is_calm)
-        wait_until(lambda: follower.take(0) is not None and follower.contacts_reader("torso") is not None)
+        wait_until(lambda: follower.take(0) is not None and follower.services.contacts_reader("torso") is not None)
         lines = Plots(follower)
         lines.choose(1, [Line(0, type="pressure", modules=(1,)), Line(0, contact=1)], follower.edition)
         lines.take()

@@ -4,7 +4,7 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
+ *     null), `shifts` (by which drivers are moved, by their keys), `selected` (key of a row or null), `pins` (texts), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
  *     left out.
  */
 export function toHash(view) {
@@ -15,6 +15,7 @@ export function toHash(view) {
   if (view.scale) parts.set("scale", numbers(view.scale));
   if (view.selected) parts.set("selected", view.selected);
   for (const pin of view.pins ?? []) parts.append("pin", pin);
+  for (const [key, shift] of Object.entries(view.shifts ?? {})) parts.append("at", `${numbers(shift)},${key}`);
   if (view.theme) parts.set("theme", view.theme);
   for (const how of ["normals", "flat", "sharp"]) if (view[how]) parts.set(how, "1");
   if (view.names === false) parts.set("names", "0");
@@ -34,6 +35,7 @@ export function fromHash(hash) {
     return found.length === length && found.every(Number.isFinite) ? found : null;
   };
   const eye = list("eye", 6);
+  const shifts = parts.getAll("at").map((text) => [text.split(",").slice(3).join(), text.split(",").slice(0, 3).map(Number)]);
   const theme = parts.get("theme");
   return {
     camera: eye && { position: eye.slice(0, 3), target: eye.slice(3) },
@@ -42,6 +44,7 @@ export function fromHash(hash) {
     scale: list("scale", 2),
     selected: parts.get("selected"),
     pins: parts.getAll("pin"),
+    shifts: Object.fromEntries(shifts.filter(([key, shift]) => key && shift.every(Number.isFinite))),
     normals: parts.get("normals") === "1",
     names: parts.get("names") !== "0",
     theme: theme === "dark" || theme === "light" ? theme : undefined,

@@ -40,7 +40,8 @@ export function fillHelp(dialog, theme) {
   const close = { type: "button", class: "plain", "aria-label": "Close", onclick: () => dialog.close() };
   const pointing =
     "The mouse turns, the right button or shift moves, the wheel zooms; " +
-    "on a touch screen one finger turns, two move and zoom.";
+    "on a touch screen one finger turns, two move and zoom. " +
+    "Drag a body with alt to move it, or select it and press shift and arrows; not where a file of links says its place.";
   dialog.replaceChildren(
     h("header", {}, h("h2", {}, "Keys and marks"), h("button", close, "✕")),
     h("div", { class: "columns" }, h("dl", {}, ...keys), h("dl", {}, ...marks)),

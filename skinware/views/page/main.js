@@ -13,6 +13,7 @@ import { fillHelp, onKeys } from "./keys.js";
 import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
+import { Moving } from "./moving.js";
 import { Names, partAt } from "./names.js";
 import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
@@ -100,6 +101,16 @@ const touches = new Touches(byId("contacts"), byId("regions"), (row, contactOf) 
 const legend = new Legend((scale) => {
   view.scale = scale;
   look();
+});
+skin.shifts = wanted.shifts;
+const moving = new Moving(byId("view"), stage, {
+  mayMove: () => !skin.isPosed,
+  moved: () => {
+    stage.isTurned = true;
+    stage.setSheets(stage.sheets);
+    names.arrange(stage.sheets);
+    keep();
+  },
 });
 const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: byId("when") }, past, () => {
   if (rewind.isPaused !== wasPaused) plotting.strips.freeze((wasPaused = rewind.isPaused));
@@ -383,6 +394,13 @@ function release() {
   showFigures();
 }
 
+/** Go around; with shift, move the selected driver. */
+function go({ shiftKey }, right, up) {
+  const row = selected();
+  if (shiftKey && row) moving.step(row.driver, right, up);
+  else stage.orbit(TURN * right, -TURN * up);
+}
+
 /** Plot what is pointed at, or what is selected. */
 function plot() {
   const row = selected();
@@ -410,6 +428,7 @@ function keep() {
       camera: { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() },
       selected: tree.selected,
       pins: probes.keys,
+      shifts: Object.fromEntries([...skin.drivers.values()].filter(({ shift }) => shift.some(Boolean)).map(({ key, shift }) => [key, shift])),
       theme: view.isThemeChosen ? view.theme : null,
     });
     history.replaceState(null, "", location.pathname + location.search + hash);
@@ -461,10 +480,10 @@ onKeys({
   g: plot,
   m: () => plotting.mark(),
   f: () => frameAll(),
-  ArrowLeft: () => stage.orbit(-TURN, 0),
-  ArrowRight: () => stage.orbit(TURN, 0),
-  ArrowUp: () => stage.orbit(0, -TURN),
-  ArrowDown: () => stage.orbit(0, TURN),
+  ArrowLeft: (event) => go(event, -1, 0),
+  ArrowRight: (event) => go(event, 1, 0),
+  ArrowUp: (event) => go(event, 0, 1),
+  ArrowDown: (event) => go(event, 0, -1),
   "+": () => stage.orbit(0, 0, NEARER),
   "-": () => stage.orbit(0, 0, 1 / NEARER),
   j: () => step(1),

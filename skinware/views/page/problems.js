@@ -7,6 +7,8 @@ const MOST = 12;
 const COPIED_MS = 1500;
 const SEVERITIES = ["error", "warning", "note"];
 
+const rank = ({ severity }) => SEVERITIES.indexOf(severity);
+
 /**
  * The problems that are seen and those that skin-doctor finds, together.
  * @param {object[]} seen `severity`, `text`, `key` (of a row; null: none), `driver`, `bus`, `patch` (names or null), `since_ns`.
@@ -18,13 +20,13 @@ export function explained(seen, findings) {
   const known = new Set(own.flatMap((problem) => problem.findings));
   const others = findings.filter((finding) => !known.has(finding) && finding.severity !== "note");
   const alone = others.map((finding) => ({ severity: finding.severity, text: `${finding.where}: ${finding.what}`, key: null, findings: [finding] }));
-  const rank = ({ severity }) => SEVERITIES.indexOf(severity);
   return [...own, ...alone].sort((one, other) => rank(one) - rank(other)); // stable
 }
 
-/** Whether a finding, of "driver torso, bus can0, board 9", is about the driver, bus or patch of a problem. */
-function isAbout({ where }, { driver, bus, patch }) {
-  const parts = where.split(", ");
+/** Whether a finding, of "driver torso, bus can0, board 9", explains a problem of this driver, bus or patch. */
+function isAbout(finding, { driver, bus, patch, severity }) {
+  const parts = finding.where.split(", ");
+  if (rank(finding) > rank({ severity })) return false; // a lesser matter
   if (!parts.includes(`driver ${driver}`)) return false;
   return patch ? parts.includes(patch) : !bus || parts.includes(`bus ${bus.split("?")[0]}`);
 }
@@ -33,7 +35,7 @@ class Item {
   constructor(choose) {
     this.what = h("button", { type: "button", class: "problem" });
     this.what.addEventListener("click", () => choose(this.key));
-    this.since = h("small");
+    this.since = h("small", { "aria-live": "off" }); // it changes all the time
     this.advice = h("div", { class: "advice" });
     this.more = h("details", {}, h("summary", {}, "What to do"), this.advice);
     this.element = h("li", {}, h("div", {}, this.what, " ", this.since, this.more));

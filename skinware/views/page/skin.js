@@ -41,11 +41,18 @@ class Sheet {
   /** Where the taxels are; that may change while they stay the same. */
   arrange(table, blob) {
     this.placed = table.placed;
-    this.position = blob(table.position, Float32Array);
+    this.scenePosition = blob(table.position, Float32Array);
+    this.moved();
     this.normal = withZeros(table.normal ? blob(table.normal, Float32Array) : new Float32Array(3 * this.n));
     const spacing = table.neighbour_spacing_m || smallestStep(this.position);
     const given = table.radius ? blob(table.radius, Float32Array) : new Float32Array(this.n).fill(NaN);
     this.radius = given.map((r) => (spacing > 0 ? DRAWN_PART * spacing : r > 0 ? r : 0.002));
+  }
+
+  /** Its driver was moved. */
+  moved() {
+    const { shift } = this.driver;
+    this.position = this.scenePosition.map((x, i) => x + shift[i % 3]);
   }
 
   /** Take a picture of a turn; arrays are kept, never written to again. */
@@ -58,7 +65,6 @@ class Sheet {
     this.regions = picture.regions ?? [];
     this.scale = picture.scale ?? this.scale;
     this.mode = mode;
-    this.sequence = picture.sequence;
   }
 
   /** Show the newest, or a picture of the past, all of one moment. */
@@ -69,7 +75,7 @@ class Sheet {
 
   /** Where a contact is, or else its taxel; null if neither is known. */
   #placeOf({ position, sensor }) {
-    if (position?.every(Number.isFinite)) return position;
+    if (position?.every(Number.isFinite)) return position.map((x, c) => x + this.driver.shift[c]);
     const i = this.index.indexOf(sensor);
     return i < 0 ? null : [...this.place(i)];
   }
@@ -94,7 +100,8 @@ class Sheet {
 
 /** A driver of a generation. */
 class Driver {
-  constructor(table, blob) {
+  constructor(table, blob, shift = [0, 0, 0]) {
+    this.shift = shift; // by which a person moved it, m
     this.id = table.id;
     this.name = table.name;
     this.namespace = table.namespace;
@@ -109,6 +116,11 @@ class Driver {
     this.sheets = new Map(table.types.map((type) => [type.name, new Sheet(this, type, blob)]));
   }
 
+  move(by) {
+    this.shift = this.shift.map((x, c) => x + by[c]);
+    for (const sheet of this.sheets.values()) sheet.moved();
+  }
+
   get isOld() {
     return this.isCut || this.state !== "live";
   }
@@ -119,7 +131,9 @@ export class Skin {
   links = [];
   namespaces = [];
   names = []; // of the drivers that are followed; empty: all
+  isPosed = false; // a file says where coordinate frames are
   mode = "raw"; // of the newest pictures
+  shifts = {}; // of drivers that a person moved, by key
 
   /**
    * Take tables, names and values from a turn.
@@ -129,6 +143,8 @@ export class Skin {
     if (header.skin) {
       this.namespaces = header.skin.namespaces ?? [];
       this.names = header.skin.names ?? [];
+      this.isPosed = header.skin.posed ?? false;
+      for (const { key, shift } of this.drivers.values()) if (shift.some(Boolean)) this.shifts[key] = shift;
       this.links = header.skin.links ?? [];
       this.drivers = new Map(header.skin.drivers.map((table) => [table.id, this.#driver(table, blob)]));
     }
@@ -149,7 +165,7 @@ export class Skin {
   /** A driver whose structure is known is kept, with what is known of its taxels. */
   #driver(table, blob) {
     const driver = this.drivers.get(table.id);
-    if (driver?.generation !== table.generation || driver.key !== keyOf(table)) return new Driver(table, blob);
+    if (driver?.generation !== table.generation || driver.key !== keyOf(table)) return new Driver(table, blob, this.shifts[keyOf(table)]);
     for (const type of table.types) driver.sheets.get(type.name).arrange(type, blob);
     return driver;
   }

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     "--config",
     metavar="FILE",
     type=cli.FILE,
-    help="TOML file with the stages: baseline, curve, filter, scaler, amplifier.  [default: a baseline]",
+    help="TOML file with the stages: field, baseline, vector, curve, filter, scaler, amplifier.  [default: a baseline]",
 )
 @click.option(
     "--state",

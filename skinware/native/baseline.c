@@ -11,7 +11,8 @@ enum { NO_VALUE = -1, NO_NOISE = -2 }; /* of a tare */
 
 SKINWARE_EXPORT void skinware_baseline_begin(struct baseline *b);
 SKINWARE_EXPORT void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values,
-                                              const uint8_t *usable, const uint8_t *jumped, float *to);
+                                              const uint8_t *usable, const uint8_t *jumped, const uint8_t *bears,
+                                              float *to);
 SKINWARE_EXPORT int64_t skinware_baseline_tare(struct baseline *b, int64_t patch);
 SKINWARE_EXPORT void skinware_baseline_lose_common(struct baseline *b);
 
@@ -184,7 +185,7 @@ static void show(struct baseline *b, float *to) {
 }
 
 void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values, const uint8_t *usable,
-                              const uint8_t *jumped, float *to) {
+                              const uint8_t *jumped, const uint8_t *bears, float *to) {
     double passed_s, smoothing;
     float rustle_share;
     int64_t i;
@@ -194,6 +195,8 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
     b->time_ns = time_ns;
     b->has_time = 1;
     take_in(b, values, usable, jumped, passed_s);
+    if (bears)
+        memcpy(b->bears, bears, (size_t)b->n);
     if (!b->all_ready) {
         measure(b, time_ns, passed_s);
         for (i = 0; i < b->n; i++)

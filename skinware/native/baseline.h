@@ -103,6 +103,7 @@ struct baseline {
     int64_t n, n_patches, n_modules, n_runs;
     int64_t n_near; /* columns of the table of neighbours */
     int64_t is_signed, is_held;
+    int64_t has_no_common; /* what taxels had in common was taken off before */
     double resolution, least, most;
     double forget_after_s; /* without data: then a baseline is measured again */
 
@@ -134,6 +135,7 @@ struct baseline {
     /* of this frame: deviation, thresholds, room for what is sorted */
     float *deviation, *on, *off, *scratch;
     uint8_t *live, *at_end, *low, *flag;
+    uint8_t *bears; /* the vector of which this is an axis bears a load */
 
     uint8_t *ready, *seen, *touched, *high, *felt, *before, *below, *sagging, *returned, *held, *forced;
 

@@ -82,7 +82,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
 void follow_common(struct baseline *b, double passed_s) {
     const struct baseline a = *b; /* no store can change it */
     int64_t number, i;
-    if (passed_s <= 0)
+    if (passed_s <= 0 || b->has_no_common)
         return;
     for (number = 0; number < b->n_patches; number++)
         for (i = 0; i < 4; i++)
@@ -172,7 +172,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         }
         INDEPENDENT
         for (i = first; i < last; i++)
-            a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1);
+            a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1) & (a.bears[i] ^ 1);
         INDEPENDENT
         for (i = first; i < last; i++) {
             const int is_measured = a.flag[i], is_calm = is_measured & (fabsf(a.smooth[i]) < rustle_share * a.off[i]);

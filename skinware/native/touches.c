@@ -87,7 +87,8 @@ static int64_t judge(struct baseline *b, double passed_s) {
         a.high[i] = a.live[i] ? (uint8_t)high : a.high[i];
         if (high && !was_high)
             a.onset[i] = a.deviation[i];
-        if (high && !a.touched[i] && (was_high || passed_s >= QUICK_S) && load_of(&a, a.smooth[i]) > a.on[i])
+        if (high && !a.touched[i] && (was_high || passed_s >= QUICK_S) &&
+            load_of(&a, a.smooth[i]) > (a.bears[i] ? a.off[i] : a.on[i]))
             begin_touch(b, i, load_of(&a, a.smooth[i]));
         if (a.touched[i])
             b->list[b->n_touched++] = i;
@@ -107,8 +108,9 @@ static int64_t judge(struct baseline *b, double passed_s) {
         is_faded = fades(b, i, load, passed, follows);
         if (is_faded)
             note_remainder(b, i, a.noted[i], a.used_then[i]);
-        a.flag[i] = is_faded || load < a.off[i] || a.contact_s[i] > most_s ||
-                     (load < FALLEN * a.peak[i] && load * load < DRIFT_SIGMA * DRIFT_SIGMA * variance);
+        a.flag[i] = !a.bears[i] &&
+                    (is_faded || load < a.off[i] || a.contact_s[i] > most_s ||
+                     (load < FALLEN * a.peak[i] && load * load < DRIFT_SIGMA * DRIFT_SIGMA * variance));
         n_over += a.flag[i];
     }
     if (b->n_touched)

@@ -55,7 +55,7 @@ for _call in (_begin, _lose_common, _update, _tare):
     _call.restype = None
 _begin.argtypes = _lose_common.argtypes = (ctypes.c_void_p,)
 _tare.argtypes, _tare.restype = (ctypes.c_void_p, ctypes.c_int64), ctypes.c_int64
-_update.argtypes = (ctypes.c_void_p, ctypes.c_int64, *(ctypes.c_void_p,) * 4)
+_update.argtypes = (ctypes.c_void_p, ctypes.c_int64, *(ctypes.c_void_p,) * 5)
 
 
 def _words_of(name: str) -> int:
@@ -104,6 +104,7 @@ class Baseline:
         settings: default: those of the class.
         resolution: the step of the values; 0 if they have none.
         signed: a touch may move a value to both sides.
+        common: the taxels of a patch may drift together; False: what they have in common was taken off before.
         limits: least and largest value of the type; a taxel there is saturated.
         neighbours: (n, k) int, the taxels near each, filled with -1: they are held with it, instead of its module.
 
@@ -119,6 +120,7 @@ class Baseline:
         *,
         resolution: float = 1.0,
         signed: bool = False,
+        common: bool = True,
         limits: tuple[float, float] = (-math.inf, math.inf),
         neighbours: npt.NDArray[np.integer] | None = None,
     ) -> None:
@@ -137,6 +139,7 @@ class Baseline:
             *(len(runs), near.shape[1]),
         )
         words.resolution, words.is_signed, words.forget_after_s = resolution, signed, FORGET_AFTER_S
+        words.has_no_common = not common
         words.least, words.most = limits
         given = {"runs": np.array(runs, np.int64, order="C"), "patch": patches, "module": modules, "near": near}
         given |= {
@@ -250,6 +253,7 @@ class Baseline:
         usable: npt.ArrayLike | None = None,
         *,
         jumped: npt.ArrayLike | None = None,
+        bears: npt.ArrayLike | None = None,
     ) -> Calm:
         """Calm the next frame, given as arrays.
 
@@ -259,10 +263,11 @@ class Baseline:
             usable: (n,) bool, which values are of this frame; default: all. The others keep their state, and have no
                 influence on anything.
             jumped: (n,) bool, where the hardware moved its own baseline just before this frame; default: nowhere.
+            bears: (n,) bool, where the vector of which a value is an axis bears a load; default: nowhere.
         """
         n = self._n
         given = self._checked(values, np.float32)
-        flags = [None if of is None else self._checked(of, np.bool_) for of in (usable, jumped)]
+        flags = [None if of is None else self._checked(of, np.bool_) for of in (usable, jumped, bears)]
         memory = np.empty(_SHOWN * n, np.uint8)
         at = [None if of is None else of.ctypes.data for of in (*flags, memory)]
         _update(self._at, time_ns, given.ctypes.data, *at)

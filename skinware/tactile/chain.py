@@ -24,11 +24,12 @@ The file is TOML; every key of a stage except ``stage`` is optional::
     [[stage]]
     stage = "amplifier"         # gain * value ** exponent + offset
     exponent = 0.5
+
+``field`` before a baseline and ``vector`` behind it are for taxels with three axes: see skinware.tactile.vectors.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,21 +41,20 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.curves import TEMPERATURE, CurveTable, read_curves, temperature_of
-from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE, BaselineSettings
+from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
+from skinware.tactile.rule import UNUSABLE, BaselineSettings
 from skinware.tactile.stages import (
     AmplifierSettings,
     FilterSettings,
     ScalerSettings,
     Signal,
     Stage,
-    StageSettings,
     Taxels,
 )
+from skinware.tactile.vectors import FieldSettings, VectorSettings, vectors_of
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
@@ -104,17 +104,17 @@ class BaselineStage(Stage):
     def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
         self.before = taxels
         before = taxels.type
-        signed = before.name.startswith(SIGNED_TYPES)
         span = before.maximum - before.minimum
         self.taxels = replace(
-            taxels, type=replace(before, minimum=-span if signed else 0.0, maximum=span), resolution=0.0
+            taxels, type=replace(before, minimum=-span if taxels.signed else 0.0, maximum=span), resolution=0.0
         )
         self.baseline = Baseline(
             taxels.module,
             taxels.patch,
             settings,
             resolution=taxels.resolution,
-            signed=signed,
+            signed=taxels.signed,
+            common=taxels.common,
             limits=(before.minimum, before.maximum),
         )
         self.given: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
@@ -127,62 +127,24 @@ class BaselineStage(Stage):
 
     def step(self, signal: Signal) -> None:
         self.given = signal.values
-        self.calm = calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
+        self.calm = calm = self.baseline.update(
+            signal.time_ns, signal.values, signal.usable, jumped=signal.jumped, bears=signal.bears
+        )
+        signal.deviation = signal.values - calm.baseline
         signal.values = calm.value
         signal.forced |= calm.forced
         signal.unknown |= np.isnan(calm.baseline)
 
 
-class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
-    """Settings of curves from values to a unit of force or pressure.
-
-    Attributes:
-        file: file with the curves; a relative path starts at the folder of the chain's file.
-    """
-
-    file: str
-
-    def stage(self, taxels: Taxels) -> CurveStage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
-        """
-        table = CurveTable(read_curves(self.file), taxels.type.name, taxels.uid)
-        if table.from_unit != taxels.type.unit:
-            raise ConfigurationError(f"the curves are for {table.from_unit}, and the values are in {taxels.type.unit}")
-        return CurveStage(taxels, table)
-
-
-class CurveStage(Stage):
-    """Applies the curves of n taxels.
-
-    Attributes:
-        table: the curves.
-        temperature_c: of the skin in the next frame; NaN: not known.
-        error: (n,) float32, standard deviations of the newest results; NaN: not known.
-    """
-
-    name = "curve"
-
-    def __init__(self, taxels: Taxels, table: CurveTable) -> None:
-        meant = replace(
-            taxels.type, unit=table.unit, minimum=float(table.minimum.min()), maximum=float(table.maximum.max())
-        )
-        self.taxels = replace(taxels, type=meant, resolution=0.0)
-        self.table = table
-        self.temperature_c = math.nan
-        self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
-        self._time_ns: int | None = None
-
-    def step(self, signal: Signal) -> None:
-        passed_s = 0.0 if self._time_ns is None else max(signal.time_ns - self._time_ns, 0) / NS_PER_S
-        self._time_ns, given = signal.time_ns, signal.values
-        signal.values = self.table.step(given, passed_s, self.temperature_c)
-        self.error = self.table.error(given, signal.values)
-
-
-AnySettings = BaselineStageSettings | CurveSettings | FilterSettings | ScalerSettings | AmplifierSettings
+AnySettings = (
+    BaselineStageSettings
+    | CurveSettings
+    | FilterSettings
+    | ScalerSettings
+    | AmplifierSettings
+    | FieldSettings
+    | VectorSettings
+)
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -236,27 +198,33 @@ class ChainSettings:
         Raises:
             ConfigurationError: a stage cannot be made for a type that it names, or for none; the message says why.
         """
-        stages: dict[str, list[Stage]] = {sensor_type.name: [] for sensor_type in structure.types}
-        taxels = {name: Taxels.of(structure, name) for name in stages}
+        taxels = {sensor_type.name: Taxels.of(structure, sensor_type.name) for sensor_type in structure.types}
+        steps: list[tuple[Stage, tuple[str, ...]]] = []
         for number, settings in enumerate(self.stages):
-            refused: list[str] = []
-            for name in stages if settings.types is None else settings.types:
-                if name not in stages:
+            refused, tag = [], settings.__struct_config__.tag
+            wanted = taxels if settings.types is None else settings.types
+            for name in wanted:
+                if name not in taxels:
                     raise ConfigurationError(
-                        f"{self._place(number)}: no sensor type {name!r}; there are: {', '.join(stages)}"
+                        f"{self._place(number)}: no sensor type {name!r}; there are: {', '.join(taxels)}"
                     )
+            groups: list[tuple[str, ...]] = [(name,) for name in wanted]
+            if isinstance(settings, FieldSettings | VectorSettings):
+                groups = [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
+            for names in groups:
                 try:
-                    stage = settings.stage(taxels[name])
+                    stage = settings.stage(*(taxels[name] for name in names))
                 except ConfigurationError as error:
-                    refused.append(f"{settings.__struct_config__.tag}: {error}")
+                    refused.append(f"{tag}: {error}")
                     if settings.types is not None:
                         raise ConfigurationError(f"{self._place(number)}: {refused[-1]}") from None
                 else:
-                    stages[name].append(stage)
-                    taxels[name] = stage.taxels
-            if len(refused) == len(stages):
-                raise ConfigurationError(f"{self._place(number)}: {'; '.join(refused)}")
-        return Chain(structure, stages, taxels)
+                    steps.append((stage, names))
+                    taxels |= zip(names, stage.axes, strict=True)
+            if len(refused) == len(groups):
+                why = "; ".join(refused) or f"{tag}: no three types in one unit are the axes of the same taxels"
+                raise ConfigurationError(f"{self._place(number)}: {why}")
+        return Chain(structure, steps, taxels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +247,7 @@ class Chain:
 
     Args:
         structure: structure of the driver.
-        stages: by type, in their order.
+        steps: its stages in their order, each with the types that it is for.
         taxels: by type, as they come out.
 
     Attributes:
@@ -287,8 +255,11 @@ class Chain:
         stages: by type.
     """
 
-    def __init__(self, structure: Structure, stages: dict[str, list[Stage]], taxels: dict[str, Taxels]) -> None:
-        self.stages = stages
+    def __init__(
+        self, structure: Structure, steps: list[tuple[Stage, tuple[str, ...]]], taxels: dict[str, Taxels]
+    ) -> None:
+        self._steps = steps
+        self.stages = {name: [stage for stage, names in steps if name in names] for name in taxels}
         self._before = structure
         self._suspect: dict[str, npt.NDArray[np.bool_]] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
@@ -375,17 +346,19 @@ class Chain:
             temperature_c = temperature_of(frame)
             for curve in self.curve_stages.values():
                 curve.temperature_c = temperature_c
-        for name, stages in self.stages.items():
-            index = self._before.index(name)
-            of_type = status[index]
-            suspect = (of_type & Status.SUSPECT) != 0
-            signal = Signal.of(frame.acquired_ns, frame.physical(name), (of_type & UNUSABLE) == 0)
+        signals: dict[str, Signal] = {}
+        for name in self.stages:
+            suspect = (frame.status_of(name) & Status.SUSPECT) != 0
+            usable = (frame.status_of(name) & UNUSABLE) == 0
+            signals[name] = signal = Signal.of(frame.acquired_ns, frame.physical(name), usable)
             signal.jumped = suspect & ~self._suspect.get(name, suspect)
             self._suspect[name] = suspect
-            for stage in stages:
-                stage.step(signal)
+        for stage, names in self._steps:
+            stage.step(*(signals[name] for name in names))
+        for name, signal in signals.items():
+            index = self._before.index(name)
             values[index] = signal.values
-            of_type = of_type | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
+            of_type = status[index] | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
 
     def explain(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:

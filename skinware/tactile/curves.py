@@ -27,6 +27,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,15 +37,15 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
 from skinware.tactile.rule import UNUSABLE
+from skinware.tactile.stages import Floats, Signal, Stage, StageSettings, Taxels
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
 MOST_KNOTS = 8
 TEMPERATURE = "temperature"
 """The sensor type of temperatures."""
-
-Floats = npt.NDArray[np.float32]
 
 
 class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -244,6 +245,55 @@ class LoadMemory:
         self._follows = np.where(values > 0, np.clip(self._follows, values - play, values + play), 0)
         self._slow += (values - self._slow) * -np.expm1(-passed_s / np.asarray(creep_s))
         return np.array([self._follows - values, self._slow])
+
+
+class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
+    """Settings of curves from values to a unit of force or pressure.
+
+    Attributes:
+        file: file with the curves; a relative path starts at the folder of the chain's file.
+    """
+
+    file: str
+
+    def stage(self, taxels: Taxels) -> CurveStage:
+        """Make the stage for some taxels.
+
+        Raises:
+            ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
+        """
+        table = CurveTable(read_curves(self.file), taxels.type.name, taxels.uid)
+        if table.from_unit != taxels.type.unit:
+            raise ConfigurationError(f"the curves are for {table.from_unit}, and the values are in {taxels.type.unit}")
+        return CurveStage(taxels, table)
+
+
+class CurveStage(Stage):
+    """Applies the curves of n taxels.
+
+    Attributes:
+        table: the curves.
+        temperature_c: of the skin in the next frame; NaN: not known.
+        error: (n,) float32, standard deviations of the newest results; NaN: not known.
+    """
+
+    name = "curve"
+
+    def __init__(self, taxels: Taxels, table: CurveTable) -> None:
+        meant = replace(
+            taxels.type, unit=table.unit, minimum=float(table.minimum.min()), maximum=float(table.maximum.max())
+        )
+        self.taxels = replace(taxels, type=meant, resolution=0.0)
+        self.table = table
+        self.temperature_c = math.nan
+        self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self._time_ns: int | None = None
+
+    def step(self, signal: Signal) -> None:
+        passed_s = 0.0 if self._time_ns is None else max(signal.time_ns - self._time_ns, 0) / NS_PER_S
+        self._time_ns, given = signal.time_ns, signal.values
+        signal.values = self.table.step(given, passed_s, self.temperature_c)
+        self.error = self.table.error(given, signal.values)
 
 
 def temperature_of(frame: DriverSnapshot) -> float:

@@ -28,7 +28,6 @@ from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.chain import BaselineStage, Chain, ChainState
 from skinware.tactile.health import COLUMNS, Health, HealthReport
-from skinware.tactile.rule import SIGNED_TYPES
 from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -171,9 +170,9 @@ class ChainHealth:
         self._watched: dict[str, tuple[BaselineStage, Health]] = {}
         structure = chain.structure
         for name, stage in chain.baseline_stages.items():
-            if name.startswith(SIGNED_TYPES):
-                continue
             taxels = stage.before
+            if taxels.signed:
+                continue
             geometry = None if structure.geometry is None else structure.geometry[structure.index(name)]
             limits = taxels.type.minimum, taxels.type.maximum
             try:

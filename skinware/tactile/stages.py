@@ -25,7 +25,7 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
-from skinware.tactile.rule import resolution_of
+from skinware.tactile.rule import SIGNED_TYPES, resolution_of
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -44,7 +44,9 @@ class Signal:
         usable: (n,) bool, which values are of this frame.
         jumped: (n,) bool, where the hardware moved its own baseline just before it.
         forced: (n,) bool, where a stage moved a baseline by force.
+        bears: (n,) bool, where the vector of which a value is an axis bears a load; None: not known.
         unknown: (n,) bool, where a stage has no result yet; the value is 0.
+        deviation: (n,) float32, how far a baseline found the values from it, touched or not; before that, the values.
     """
 
     time_ns: int
@@ -53,6 +55,8 @@ class Signal:
     jumped: Flags
     forced: Flags
     unknown: Flags
+    deviation: Floats
+    bears: Flags | None = None
 
     @classmethod
     def of(cls, time_ns: int, values: npt.ArrayLike, usable: npt.ArrayLike | None = None) -> Self:
@@ -60,7 +64,7 @@ class Signal:
         taken = np.array(values, np.float32)
         known = np.isfinite(taken) if usable is None else np.isfinite(taken) & usable
         none = np.zeros(len(taken), bool)
-        return cls(time_ns, taken, known, none, none.copy(), none.copy())
+        return cls(time_ns, taken, known, none, none.copy(), none.copy(), taken)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,8 @@ class Taxels:
         module: (n,) their modules.
         patch: (n,) their patches.
         resolution: step of the values; 0 if they have none.
+        signed: a touch may move a value to both sides.
+        common: the taxels of a patch may drift together.
     """
 
     type: SensorType
@@ -80,6 +86,8 @@ class Taxels:
     module: npt.NDArray[np.int64]
     patch: npt.NDArray[np.int64]
     resolution: float = 0.0
+    signed: bool = False
+    common: bool = True
 
     @classmethod
     def of(cls, structure: Structure, type_name: str) -> Taxels:
@@ -95,6 +103,7 @@ class Taxels:
             structure.module_of(type_name),
             structure.patch_of(type_name),
             resolution_of(structure, type_name),
+            type_name.startswith(SIGNED_TYPES),
         )
 
     def __len__(self) -> int:
@@ -112,9 +121,14 @@ class Stage(ABC):
     name: ClassVar[str]
     taxels: Taxels
 
+    @property
+    def axes(self) -> tuple[Taxels, ...]:
+        """The taxels as they come out, for each type that the stage changes together."""
+        return (self.taxels,)
+
     @abstractmethod
     def step(self, signal: Signal) -> None:
-        """Change one frame in place; frames come in the order of their times."""
+        """Change one frame in place, of each type where it is for several; frames come in the order of their times."""
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):

@@ -114,7 +114,7 @@ def test_every_driver_decodes_its_wire_to_the_same_values(tmp_path: Path, driver
 
     def capture(file: Path) -> None:
         adapter = kind(kind.Options(**options))
-        record(file, adapter, make_bus("virtual", payload_size=adapter.payload_size, driver=driver), 25)
+        record(file, adapter, make_bus("virtual", payload_size=adapter.payload_size, driver=driver), 25, updates=12)
 
     require_equal(tmp_path, capture, kind, options)
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual.serial_device import text_registers
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
 _SWITCHES = {
@@ -93,7 +94,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
 
     def beside(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
         prefix = "BCXTL" if self.options.side == "left" else "BCXTR"
-        return _text(3000, "1.0.14.U") | _text(3010, f"{prefix}0000000001")
+        return text_registers(3000, "1.0.14.U") | text_registers(3010, f"{prefix}0000000001")
 
     def of_other_function(self, device: Device) -> Mapping[int, int]:
         options = self.options
@@ -123,8 +124,3 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         options = self.options
         status = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
         return dict(enumerate([*words, *status], 4200))
-
-
-def _text(address: int, text: str) -> dict[int, int]:
-    data = text.encode().ljust(20, b"\0")
-    return {address + place: int.from_bytes(data[2 * place : 2 * place + 2], "big") for place in range(10)}

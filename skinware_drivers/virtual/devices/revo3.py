@@ -14,6 +14,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual.serial_device import text_registers
 
 _PRESSURE = {
     4200: 36,
@@ -141,10 +142,5 @@ def _pair(first: int, second: int) -> int:
     return first << 8 | second
 
 
-def _text(address: int, text: str) -> dict[int, int]:
-    data = text.encode().ljust(20, b"\0")
-    return dict(enumerate(map(_pair, data[::2], data[1::2]), address))
-
-
-_TEXTS = _text(3030, "1.0.0") | _text(3040, "1.0") | _text(3050, _SERIAL_NUMBER)
+_TEXTS = text_registers(3030, "1.0.0") | text_registers(3040, "1.0") | text_registers(3050, _SERIAL_NUMBER)
 """Firmware, hardware and serial number, read with function 4."""

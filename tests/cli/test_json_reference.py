@@ -28,6 +28,7 @@ from skinware.cli.regions import command as regions
 from skinware.cli.top import command as top
 from skinware.geometry import geometry_to_toml
 from skinware.realtime import now_ns
+from skinware.tactile.calibration.state import PressSession
 from skinware_drivers.cli.config import command as config
 from skinware_drivers.cli.doctor import command as doctor
 from skinware_drivers.cli.dump import command as dump
@@ -53,6 +54,7 @@ from tests.icub.test_positions import TRIANGLE, positions
 from tests.recording.test_wire_export import ON_VCAN1, keep, write_recording
 from tests.ros2.alone import own_domain
 from tests.streams.peers import free_port
+from tests.tactile.calibrating import Tool, presses, with_tool
 from tests.virtual.test_emulate import HostBus
 from tests.yarp.peers import LOCAL, robot, until_gone
 
@@ -422,6 +424,11 @@ def test_calibrate(printing: Print, tmp_path: Path) -> None:
             live += printing(
                 calibrate, "force", "-o", str(tmp_path / "curves.toml"), "-T", "0", status=int(not follows)
             )
+        drifting, touched = PressSession(len(surface)), tmp_path / "touched.toml"
+        drifting.presses = with_tool(surface, presses(surface, 1), 1, Tool(drift_m=(0.01, 0, 0)))
+        gathered(touched, drifting, skin.structure)
+        with ServiceWriter("robot", {"point_m": ("<f8", 3)}):
+            live += printing(calibrate, "touch", "--poses", "robot", "-o", str(touched), "-T", "0")
         wrong = skin.structure.geometry
         assert wrong is not None
         wrong.position_m[:] = np.roll(wrong.position_m, len(surface) // 2, axis=0)  # exchanged patches

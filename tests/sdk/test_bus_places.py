@@ -97,7 +97,9 @@ def test_only_the_buses_that_can_are_asked() -> None:
         assert reader.call("press", at_m=at, bus="bus0", seconds=30) == {
             "bus0": {"board": 7, "triangle": 0, "channel": 0, "distance_m": 0}
         }
-        with pytest.raises(RequestRefused, match=r"no bus 'bus1' with patches; there are: bus0, bus2"):
+        with pytest.raises(
+            RequestRefused, match=r"no bus 'bus1' with patches; did you mean 'bus2'[?] There are: bus0, bus2"
+        ):
             reader.call("press", at_m=at, bus="bus1")
         with pytest.raises(RequestFailed, match="bus0: no taxel is there"):
             reader.call("press", at_m=[0.07, -0.0225, 0.0])

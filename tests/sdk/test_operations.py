@@ -101,7 +101,12 @@ def test_another_rate() -> None:
         ("rate", {"hz": 20, "patch": "board 7"}, RequestFailed, "do not name a patch"),
         ("rate", {}, RequestRefused, "missing a required argument: 'hz'; it takes: bus, patch, hz: 'float'"),
         ("enable", {"off": True}, RequestRefused, "unexpected keyword argument 'off'; it takes: bus, patch, on"),
-        ("enable", {"patch": "board 9"}, RequestRefused, "no patch 'board 9'; there are: board 7, board 8"),
+        (
+            "enable",
+            {"patch": "board 9"},
+            RequestRefused,
+            "no patch 'board 9'; did you mean 'board 8'[?] There are: board 7, board 8",
+        ),
         ("enable", {"bus": "can5"}, RequestRefused, "no bus 'can5' with patches; there are: bus0"),
         ("describe", {}, RequestRefused, "no operation 'describe'; there are: enable, rate, rebaseline"),
     ],

@@ -5,6 +5,7 @@ All commands and views use these, so that an age or a count looks the same every
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable, Sequence
 
@@ -20,8 +21,6 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 def nearest_name(wrong: str, right: Iterable[str]) -> str:
     """Return the end of an error message about an unknown name: the nearest name that exists, and all that do."""
-    import difflib
-
     names = [*dict.fromkeys(right)]
     nearest = difflib.get_close_matches(wrong, names, n=1)
     hint = f"; did you mean {nearest[0]!r}? There" if nearest else "; there"

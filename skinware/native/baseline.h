@@ -95,7 +95,7 @@ struct module {
     double old_s;   /* how long ago it was touched by a touch that is not new */
     double touched; /* number of its taxels */
     double near;    /* 1: something touches it */
-    double looked;  /* 1: a touch on it is looked at again */
+    double looked;  /* a touch on it is looked at: touches.c has when */
     double median, onset, slow, on, off, number, alike; /* of a module that is looked at */
 };
 

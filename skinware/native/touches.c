@@ -135,7 +135,7 @@ static void let_go(struct baseline *b) {
     }
 }
 
-enum { LATER = 1, NOW = 2 }; /* when a module is looked at: a moment after a touch began, or as it begins */
+enum { NOW = 1, LATER = 2 }; /* when a module is looked at: as a touch begins, or a moment after that */
 
 static int64_t find_new_modules(struct baseline *b, double passed_s) {
     int64_t k, found = 0;
@@ -147,7 +147,7 @@ static int64_t find_new_modules(struct baseline *b, double passed_s) {
         if (is_looked_at(b, i, passed_s) == 1)
             m->looked = LATER, found++;
         else if (b->touched[i] && b->contact_s[i] <= (float)passed_s)
-            m->looked = fmax(m->looked, NOW), found++;
+            m->looked = fmax(m->looked, NOW), found++; /* LATER stays */
     }
     return found;
 }

@@ -147,3 +147,18 @@ def test_a_world_with_everything_that_goes_wrong() -> None:
     both = Both(world.surface.module, world.surface.patch)
     for sample in world.samples(60):
         both.update(sample.time_ns, sample.values, sample.usable)
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+@pytest.mark.parametrize("later", range(4, 12))
+def test_a_module_that_is_looked_at_again_while_a_touch_begins_on_it(later: int, is_first: bool) -> None:
+    both = Both(np.zeros(12, int), np.zeros(12, int))
+    random = np.random.default_rng(later)
+    for number in range(160):
+        values = np.round(20 + 0.5 * random.standard_normal(12))
+        if number >= 130:  # not at once, so that it is looked at again
+            values[:9] += 3 if number == 130 else 7
+        if number >= 130 + later:
+            values[0 if is_first else 11] += 30
+        both.update(number * _STEP_NS // 20, values)
+    both.compare_states()

@@ -148,7 +148,7 @@ class Touches:
         alike &= median < np.float32(STEP_OVER_ON / OFF_TO_ON) * modules.median(off, here)
         typical = modules.spread(median)
         stepped = np.flatnonzero(live & alike[modules.group] & (deviation >= np.float32(0.5) * typical))
-        return stepped, typical[stepped]
+        return stepped, median[modules.group[stepped]].astype(np.float32)
 
     def forget(self, taxels: Rows) -> None:
         """Drop what is known of some taxels."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _STRUCT = re.compile(r"^struct (\w+) \{(.*?)^\};", re.DOTALL | re.MULTILINE)
@@ -14,6 +17,13 @@ _FUNCTION = re.compile(r"(\w+) \(\*(\w+)\)\((.*)\)", re.DOTALL)
 _VARIABLES = re.compile(r"(?:const )?(?:struct )?(\w+) (.*)", re.DOTALL)
 _ARRAY = re.compile(r"(\w+)\[(\d+)\]")
 _NUMBERS: dict[str, Any] = {"void": None, "int64_t": ctypes.c_int64, "double": ctypes.c_double}
+_DTYPES: dict[str, npt.DTypeLike] = {
+    "float": np.float32,
+    "double": np.float64,
+    "int32_t": np.int32,
+    "int64_t": np.int64,
+    "uint8_t": np.bool_,
+}
 
 
 def _fields(declaration: str, kinds: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
@@ -58,3 +68,23 @@ def read_structs(headers: Iterable[Path], left_out: Sequence[str] = ()) -> dict[
             }
             classes[in_python] = kinds[name] = type(in_python, (ctypes.Structure,), members)
     return classes
+
+
+def give_arrays(
+    words: Any, n: int, sizes: Mapping[str, int], given: Mapping[str, npt.NDArray[Any]] | None = None
+) -> dict[str, npt.NDArray[Any]]:
+    """Point a struct at arrays, and return them by name; they have to live as long as it.
+
+    Args:
+        words: the struct. Its pointers to other structs are left alone, unless their memory is given.
+        n: number of elements of an array.
+        sizes: of arrays with other numbers of elements.
+        given: arrays that there are; the others are new, and 0.
+    """
+    arrays = dict(given or {})
+    for name, of in words.pointers.items():
+        if name not in arrays and of in _DTYPES:
+            arrays[name] = np.zeros(sizes.get(name, n), _DTYPES[of])
+    for name, array in arrays.items():
+        setattr(words, name, array.ctypes.data)
+    return arrays

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from skinware import native
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.native.structs import read_structs
+from skinware.native.structs import give_arrays, read_structs
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.rule import FORGET_AFTER_S, SIGNED_TYPES, UNUSABLE, BaselineSettings, resolution_of
@@ -38,7 +38,6 @@ Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
 _STRUCTS = read_structs([Path(native.__file__).with_name("baseline.h")])
-_DTYPES = {"float": np.float32, "uint8_t": np.bool_, "int64_t": np.int64}
 _BLOCKS, _SHOWN = 60, 21
 """Numbers of a taxel that is measured, and bytes of a taxel that is shown."""
 _WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
@@ -141,16 +140,15 @@ class Baseline:
         words.resolution, words.is_signed, words.forget_after_s = resolution, signed, FORGET_AFTER_S
         words.has_no_common = not common
         words.least, words.most = limits
-        given = {"runs": np.array(runs, np.int64, order="C"), "patch": patches, "module": modules, "near": near}
-        given |= {
+        given: dict[str, npt.NDArray[Any]] = {
+            "runs": np.array(runs, np.int64, order="C"),
+            "patch": patches,
+            "module": modules,
+            "near": near,
             "patches": np.zeros((n_patches, _words_of("Patch"))),
             "modules": np.zeros((n_modules, _words_of("Module"))),
         }
-        self._arrays = given | {
-            name: np.zeros(room.get(name, n), _DTYPES[of]) for name, of in words.pointers.items() if name not in given
-        }
-        for name, array in self._arrays.items():
-            setattr(words, name, array.ctypes.data)
+        self._arrays = give_arrays(words, n, room, given)
         self._at = ctypes.addressof(words)
         self.settings = settings or BaselineSettings()
         _begin(self._at)

@@ -11,14 +11,13 @@ import ctypes
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware import native
 from skinware.errors import ConfigurationError
-from skinware.native.structs import read_structs
+from skinware.native.structs import give_arrays, read_structs
 from skinware.realtime import NS_PER_S
 from skinware.tactile.rule import FORGET_AFTER_S
 from skinware.tactile.stages import Floats, Positive, Signal, Stage, StageSettings, Taxels
@@ -33,8 +32,8 @@ LEAST_ARRAY = 4
 """Taxels of a patch that it takes to know a touch from a field."""
 
 _STRUCTS = read_structs([Path(native.__file__).with_name("field.h")])
-_DTYPES = {"double": np.float64, "int64_t": np.int64, "uint8_t": np.bool_}
-_SIZES = {"response": 12, "covariance": 16, "load": 3, "rest": 3}
+_NUMBERS = {"response": 12, "covariance": 16, "load": 3, "rest": 3}
+"""Numbers of a taxel, where there are several."""
 
 _update = native.core().quick.skinware_field_update
 _update.argtypes, _update.restype = (*(ctypes.c_void_p,) * 3, ctypes.c_double, ctypes.c_void_p), None
@@ -69,14 +68,8 @@ class ArrayField:
         self._words = words = _STRUCTS["Field"]()
         words.n, words.n_arrays, words.arrays = n, len(rigid), ctypes.addressof(self._memory)
         words.spread2, words.forget_after_s = spread**2, FORGET_AFTER_S
-        self._arrays: dict[str, npt.NDArray[Any]] = {
-            name: np.zeros(_SIZES.get(name, 1) * n, _DTYPES[of])
-            for name, of in words.pointers.items()
-            if name != "arrays"
-        }
+        self._arrays = give_arrays(words, n, {name: numbers * n for name, numbers in _NUMBERS.items()})
         self._arrays["away_s"][:] = np.inf
-        for name, array in self._arrays.items():
-            setattr(words, name, array.ctypes.data)
         self._at = ctypes.addressof(words)
 
     def __len__(self) -> int:

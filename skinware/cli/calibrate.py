@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from skinware.cli._gathering import Gathering
+    from skinware.geometry import Geometry
     from skinware.structure import Structure
     from skinware.tactile.calibration.placing import Placement
     from skinware.tactile.calibration.shapes import Shape
@@ -178,8 +179,9 @@ def touch(
     with _opened(file, session_of, how, where) as (gathering, session):
         structure, type_name, shapes, layout_m, is_here = gathering.structure, gathering.type_name, None, None, False
         if layout is not None:
-            shapes = _shapes(structure, type_name, layout)
-            layout_m, is_here = _layout(structure, type_name, layout, frame or service)
+            places = _places(structure, type_name, layout)
+            shapes = _shapes(structure, type_name, layout, places)
+            layout_m, is_here = _layout_m(places, frame or service)
         gathering.run(_PRESS, how.share, how.duration_s)
         placement = place(session.presses, shapes, offset_m=offset_m, layout_m=layout_m, is_here=is_here)
         _write(file, gathering, placement, frame or service, pitch_m)
@@ -232,7 +234,8 @@ def finger(
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
     where = (service, poses_namespace, column, (4, 4))
     with _opened(file, session_of, how, where) as (gathering, session):
-        shapes = _shapes(gathering.structure, gathering.type_name, layout)
+        structure, type_name = gathering.structure, gathering.type_name
+        shapes = _shapes(structure, type_name, layout, _places(structure, type_name, layout))
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
         _write(file, gathering, found.placement, frame or service, pitch_m)
@@ -374,25 +377,26 @@ def _opened(
         yield gathering, session
 
 
-def _layout(structure: Structure, type_name: str, layout: Path, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
+def _places(structure: Structure, type_name: str, layout: Path) -> Geometry:
+    from skinware.geometry import read_geometry
+
+    return read_geometry(layout).of(structure, type_name)
+
+
+def _layout_m(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
     """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
     from collections import Counter
 
     import numpy as np
 
-    from skinware.geometry import read_geometry
-
-    places = read_geometry(layout).of(structure, type_name)
     frames = Counter(places.frame[places.known].tolist())
     here = frame if frame in frames else max(frames, key=lambda name: frames[name])
     return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
 
 
-def _shapes(structure: Structure, type_name: str, layout: Path) -> Mapping[int, Shape]:
-    from skinware.geometry import read_geometry
+def _shapes(structure: Structure, type_name: str, layout: Path, places: Geometry) -> Mapping[int, Shape]:
     from skinware.tactile.calibration.shapes import shapes_of
 
-    places = read_geometry(layout).of(structure, type_name)
     kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
     shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
     if not shapes:

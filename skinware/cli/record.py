@@ -59,7 +59,7 @@ def on_enter(call: Callable[[], object]) -> Iterator[None]:
 
 def _listen_until_eof(mark: Callable[[str, int], object]) -> None:
     for line in sys.stdin:
-        with contextlib.suppress(ValueError, KeyError):
+        with contextlib.suppress(ValueError, KeyError, TypeError):
             told = json.loads(line)
             mark(str(told["text"]), int(told["time_ns"]))
     os.kill(os.getpid(), signal.SIGINT)  # the kernel closes it when the other program is killed

@@ -10,7 +10,6 @@ from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from skinware.cli._heat_map import FRESH
 from skinware.cli._painting import MARK_CHARACTERS, MARK_NAMES
 from skinware.cli._top_rows import COLUMNS
 
@@ -46,7 +45,7 @@ KEYS = {
 
 def text() -> str:
     """Return the explanations, in lines of at most 76 columns."""
-    marks = {repr(MARK_CHARACTERS[mark])[1:-1]: name for mark, name in MARK_NAMES.items() if mark != FRESH}
+    marks = {MARK_CHARACTERS[mark]: name for mark, name in MARK_NAMES.items()}
     parts = {"Columns": MEANINGS, "Marks over sensors": marks, "Keys": KEYS}
     lines = []
     for title, meanings in parts.items():

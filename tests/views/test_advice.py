@@ -1,4 +1,4 @@
-"""skin-doctor is asked while there are problems, and by nobody else."""
+"""The page asks skin-doctor for advice while drivers have problems, and only then."""
 
 from __future__ import annotations
 

@@ -39,9 +39,9 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from skinware.ros2.cyclone import join, reason, struct_type
-from skinware.ros2.cyclone import write_bytes as _write_bytes
+from skinware.ros2.cyclone import join, reason, struct_type, write_bytes
 
+_write_bytes = write_bytes
 _SERVICE_QOS = Qos(depth=10)
 _REQUESTS_AT_ONCE = 16
 _ENCAPSULATION = 4

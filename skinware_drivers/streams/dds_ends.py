@@ -61,7 +61,7 @@ class _Publisher:
 
 
 @dataclass
-class _Source:
+class _HeardPublisher:
     """The publisher that is heard on a topic, and the number of the reader that matched it."""
 
     publisher: int
@@ -84,7 +84,7 @@ class DdsPort(Port):
 
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
         self._name, self._topics = name, topics
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, _HeardPublisher] = {}
         self._publishers: dict[int, _Publisher] = {}
         self._news: list[News] = []
         self._refused = 0
@@ -94,7 +94,7 @@ class DdsPort(Port):
         with _as_bus_error(name):
             self._readers = [DataReader(self._participant, _topic(self._participant, topic), qos) for topic in topics]
             self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-            self._waiting = _Waiting(self._participant, [*self._readers, self._publications])
+            self._waiting = _WaitingThread(self._participant, [*self._readers, self._publications])
 
     def fileno(self) -> int:
         return self._waiting.event
@@ -200,7 +200,7 @@ class DdsPort(Port):
         """
         source = self._sources.get(name)
         if source is None or time_ns - source.heard_ns > _SILENT_NS:
-            source = self._sources[name] = _Source(info.publication_handle, reader, time_ns)
+            source = self._sources[name] = _HeardPublisher(info.publication_handle, reader, time_ns)
         if source.publisher != info.publication_handle:
             self._refused += 1
             return False
@@ -209,7 +209,7 @@ class DdsPort(Port):
         return source.reader == reader
 
 
-class _Waiting:
+class _WaitingThread:
     """A thread that makes ``event`` readable when there is something to read."""
 
     def __init__(self, participant: DomainParticipant, readers: Sequence[Any]) -> None:

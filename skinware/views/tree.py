@@ -46,8 +46,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
     loads = [bus.load for bus in report.buses if bus.load is not None]
     return {
         "id": driver.number,
-        "name": report.name,
-        "namespace": driver.namespace,
+        "name": driver.name,
+        "namespace": driver.origin.title,
         "state": report.life,
         "rate_hz": _rounded(report.rate_hz),
         "age_ms": _milliseconds(report.age_ns),

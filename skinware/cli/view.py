@@ -16,6 +16,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlencode
 
 import click
 
@@ -26,6 +27,7 @@ from skinware.errors import MissingExtra
 if TYPE_CHECKING:
     from skinware.views.access import Access
     from skinware.views.following import Follower
+    from skinware.views.shows import RecordingFiles
 
 DEFAULT_PORT = 8736
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
@@ -46,10 +48,11 @@ def token_text(text: str) -> str:
     "skin-view",
     "skin-view                       all drivers, in the browser",
     "skin-view torso --no-browser    one driver; prints the address to open",
+    "skin-view walk.mcap             a recording; two files: beside each other",
     "skin-view --links robot.urdf    on the meshes of a robot",
     "skin-view --host 0.0.0.0        for other machines too; the address contains a token",
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.argument("names", metavar="[NAME|FILE]...", nargs=-1)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
@@ -88,7 +91,7 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Show drivers NAME..., or all of them, live in a browser.
+    """Show drivers NAME..., or all of them, live in a browser, or recordings FILE....
 
     Where skin-calm runs, changes from its baselines, contacts and regions are shown too.
 
@@ -98,9 +101,14 @@ def command(
         raise MissingExtra("skin-view needs a package that is not installed: pip install 'skinware[view]'")
     from skinware.memory.namespace import Namespace, check_name
     from skinware.views.access import Access, is_loopback
-    from skinware.views.following import Follower
+    from skinware.views.following import Follower, Origin
     from skinware.views.robot import read_robot
+    from skinware.views.shows import SUFFIX, RecordingFiles
 
+    files = [Path(name) for name in names if name.endswith(SUFFIX) or "/" in name]
+    names = tuple(name for name in names if Path(name) not in files)
+    for file in files:
+        _check(file)
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
@@ -111,12 +119,13 @@ def command(
     robot = None if links is None else read_robot(links)
     for what in () if robot is None else robot.left_out:
         cli.warn(f"left out of {links}: {what}")
-    follower = Follower(place, names, calm, robot)
+    follower = Follower(Origin(place, names, calm), robot=robot)
     access = Access(host, token)
 
     def ready(found: int) -> None:
-        url = _address(host, found) + (f"?token={token}" if token else "")
-        what = ", ".join(names) or f"all drivers of namespace {place.name!r}"
+        query = [("token", token)] * bool(token) + [("recording", str(file)) for file in files]
+        url = _address(host, found) + (f"?{urlencode(query, safe='/')}" if query else "")
+        what = ", ".join(map(str, [*files, *names])) or f"all drivers of namespace {place.name!r}"
         ready = {"event": "ready", "url": url, "namespace": place.name, "names": list(names)}
         say(as_json, ready, f"{url} shows {what} (Ctrl-C ends)")
         has_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")  # not a text browser in here
@@ -124,7 +133,7 @@ def command(
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
     try:
-        asyncio.run(_serve(follower, access, host, port, ready))
+        asyncio.run(_serve(follower, access, RecordingFiles(files, names=names), host, port, ready))
     except OSError as error:
         where = f"{host}, port {DEFAULT_PORT if port is None else port}"
         echo(f"skin-view: {where}: {_why(error)}", err=True)
@@ -133,7 +142,28 @@ def command(
         follower.close()
 
 
-async def _serve(follower: Follower, access: Access, host: str, port: int | None, ready: Callable[[int], None]) -> None:
+def _check(file: Path) -> None:
+    """Warn of damage in a recording.
+
+    Raises:
+        BadRecording: it is not a recording.
+        OSError: it cannot be read.
+    """
+    import skinware.recording
+
+    with skinware.recording.open(file) as recording:
+        for problem in recording.problems:
+            cli.warn(f"{file}: {problem}")
+
+
+async def _serve(
+    follower: Follower,
+    access: Access,
+    files: RecordingFiles,
+    host: str,
+    port: int | None,
+    ready: Callable[[int], None],
+) -> None:
     from skinware.views.advice import DoctorProgram
     from skinware.views.recording import RecordingProgram
     from skinware.views.server import ViewServer, show
@@ -142,9 +172,11 @@ async def _serve(follower: Follower, access: Access, host: str, port: int | None
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     program = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
-    namespace = follower.namespace.name
+    origin = follower.origins[0]
+    namespace = origin.namespace.name
     doctor = DoctorProgram((sys.executable, "-m", "skinware_drivers.cli.doctor"), namespace)
-    server = ViewServer(follower, access, RecordingProgram(program, namespace, follower.names), doctor=doctor)
+    recording = RecordingProgram(program, namespace, origin.names)
+    server = ViewServer(follower, access, recording, doctor=doctor, files=files)
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:

@@ -218,29 +218,29 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
 
 /* Takes the present values as the rest, of all taxels or (0 or more) of a patch; returns their number, or why not. */
 int64_t skinware_baseline_tare(struct baseline *b, int64_t patch) {
-    int64_t i, number = 0, n_fresh = 0;
+    const float least = (float)least_on(b);
+    int64_t i, number = 0, n_seen = 0;
     for (i = 0; i < b->n; i++) {
-        b->flag[i] = b->seen[i] && (patch < 0 || b->patch[i] == patch);
-        number += b->flag[i];
-        n_fresh += b->flag[i] && !b->ready[i];
-    }
-    if (!number)
-        return NO_VALUE;
-    if (n_fresh && least_on(b) <= 0)
-        return NO_NOISE;
-    for (i = 0; i < b->n; i++) {
-        if (!b->flag[i])
-            continue;
-        if (!b->ready[i]) {
-            b->noise2[i] = least_noise2(b, b->last[i]);
+        float level = b->level[i] + b->smooth[i], noise2 = 0;
+        const int is_asked = b->seen[i] && (patch < 0 || b->patch[i] == patch);
+        n_seen += is_asked;
+        if (is_asked && !b->ready[i]) {
+            if (!measure_now(b, i, &level, &noise2))
+                level = b->last[i], noise2 = least * least; /* a noise that is not known may be as large as a touch */
+            if (noise2 <= 0 && least <= 0)
+                continue;
+            b->noise2[i] = highest(noise2, least_noise2(b, level));
             b->noise_s[i] = 0;
+            b->ready[i] = 1;
+        } else if (!is_asked) {
+            continue;
         }
-        put_at(b, i, b->ready[i] && isfinite(b->level[i]) ? b->level[i] + b->smooth[i] : b->last[i]);
-        b->ready[i] = 1;
+        number++;
+        put_at(b, i, level);
         forget_touch(b, i);
         b->settling_s[i] = 0;
     }
-    return number;
+    return number ? number : n_seen ? NO_NOISE : NO_VALUE;
 }
 
 /* Forgets where the common modes are, after a time without data: the next frames find them again. */

@@ -172,6 +172,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s);
 
 /* rest.c */
 void measure(struct baseline *b, int64_t time_ns, double passed_s);
+int measure_now(const struct baseline *b, int64_t taxel, float *level, float *noise2);
 void medians(struct baseline *b, const int64_t *group, int64_t n_groups, const float *values, const uint8_t *counts,
              double *first_of_result, int64_t stride);
 

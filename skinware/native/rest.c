@@ -123,6 +123,29 @@ static int add(struct baseline *b, int64_t time_ns) {
     return b->n_blocks >= BLOCKS;
 }
 
+/* What a taxel reads now, over the newest part with enough values of it, and its noise; returns whether there is one. */
+int measure_now(const struct baseline *b, int64_t taxel, float *level, float *noise2) {
+    const int64_t n = b->n, newest = b->n_blocks - (b->block_frames == 0);
+    const int64_t oldest = newest >= BLOCKS ? newest - BLOCKS + 1 : 0;
+    const float at_last = (float)b->patches[b->patch[taxel]].common;
+    float parts[BLOCKS], typical = 1;
+    int64_t block, k = 0;
+    for (block = newest; block >= oldest; block--) {
+        const float *of = block_at(b, block) + taxel;
+        const float count = of[COUNT * n], rest = of[D * n] - of[C * n];
+        if (count < BLOCK_FRAMES)
+            continue;
+        if (k == 0) {
+            *level = b->first[taxel] + at_last + rest / count;
+            typical = count <= BLOCK_FRAMES + 6 ? median_of_variance[(int)count - BLOCK_FRAMES] : 1;
+        }
+        parts[k++] = (of[DD * n] - 2 * of[DC * n] + of[CC * n] - rest * rest / count) / (count - 1);
+    }
+    if (k > 0)
+        *noise2 = highest(median(parts, k) / typical, 0);
+    return k > 0;
+}
+
 /* The share of a variance that the median over the tenths shows: it depends on the frames of a tenth. */
 static float typical_share(const struct baseline *b) {
     int64_t with[BLOCK_FRAMES + 8] = {0}, number = 0, i, block;

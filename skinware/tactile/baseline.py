@@ -216,20 +216,23 @@ class Baseline:
     def tare(self, patch: int | None = None) -> int:
         """Take the present values as the rest, touched or not.
 
+        A taxel that has no baseline yet begins with the mean and the noise of its last half second. With fewer than
+        four values its noise may be as large as the least touch; without a least touch it goes on being measured.
+
         Args:
             patch: only of this one.
 
         Returns:
-            The number of those taxels.
+            The number of taxels that were tared.
 
         Raises:
-            ConfigurationError: no value has come yet; or these values have no steps, and their noise is not known yet.
+            ConfigurationError: too few values have come yet.
         """
         number = int(_tare(self._at, -1 if patch is None else patch))
         if number == _NO_VALUE:
             raise ConfigurationError("nothing to tare: no value has come yet")
         if number == _NO_NOISE:
-            raise ConfigurationError("the noise is not known yet: wait until it is measured, or set minimum_on")
+            raise ConfigurationError("nothing to tare: the noise is known after four values; try again in a moment")
         return number
 
     def take(self, frame: DriverSnapshot) -> Calm:

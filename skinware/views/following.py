@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.state import LIVE, STARTING, DriverReport, life_of, report_of, settling, status_now
+from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, settling, status_now
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
@@ -110,6 +110,40 @@ class Newest:
         return np.bincount(module, loads, structure.n_modules).astype(np.float64)
 
 
+class Origin:
+    """A namespace whose drivers are followed, with the services about them.
+
+    Args:
+        names: of the drivers; default: all.
+        calm: namespace of calmed drivers; None: without it.
+        recording: title of the recording that is published there; None: its drivers are live.
+        is_beside: others are shown too, so that the names of its drivers need its title.
+    """
+
+    def __init__(
+        self,
+        namespace: Namespace,
+        names: Collection[str] = (),
+        calm: Namespace | None = None,
+        recording: str | None = None,
+        *,
+        is_beside: bool = False,
+    ) -> None:
+        self.namespace, self.names, self.calm = namespace, tuple(names), calm
+        self.recording, self.is_beside = recording, is_beside
+        self.live = LiveDrivers(namespace, names)
+        self.services = TactileServices(self.live, names, calm)
+
+    @property
+    def title(self) -> str:
+        """The part of its drivers' keys that is the same whenever they are shown."""
+        return self.recording or self.namespace.name
+
+    def close(self) -> None:
+        self.services.close()
+        self.live.close()
+
+
 class ShownDriver:
     """A driver as all viewers see it.
 
@@ -125,8 +159,8 @@ class ShownDriver:
         since_ns: when each of its problems was first seen, by what it is; see :func:`skinware.views.tree.problems_of`.
     """
 
-    def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
-        self.number, self.live, self.namespace = number, live, namespace
+    def __init__(self, number: int, live: LiveDriver, origin: Origin) -> None:
+        self.number, self.live, self.origin = number, live, origin
         self.life = STARTING
         self.changes = 0
         self.since_ns: dict[tuple[object, ...], int] = {}
@@ -139,7 +173,8 @@ class ShownDriver:
 
     @property
     def name(self) -> str:
-        return self.live.name
+        """Its name for people, which no other driver has that is shown."""
+        return f"{self.live.name} ({self.origin.title})" if self.origin.is_beside else self.live.name
 
     @property
     def frame(self) -> DriverSnapshot | None:
@@ -156,9 +191,18 @@ class ShownDriver:
 
     def report(self) -> DriverReport:
         live = self.live
-        return report_of(live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status)
+        report = report_of(
+            live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status
+        )
+        if self._stands_still(life_of(live.reader, self.frame)):
+            patches = tuple(replace(patch, rate_hz=None, age_ns=None) for patch in report.patches)
+            report = replace(report, rate_hz=None, age_ns=None, patches=patches)
+        return report
 
-    def take(self, frame: DriverSnapshot, services: TactileServices) -> None:
+    def _stands_still(self, life: str) -> bool:
+        return life == PAUSED and self.origin.recording is not None
+
+    def take(self, frame: DriverSnapshot) -> None:
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)
@@ -166,32 +210,38 @@ class ShownDriver:
             self.rest = DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
-        self.newest = self._judged(frame, services)
+        self.newest = self._judged(frame)
         self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
         self.changes += 1
 
-    def judge(self, services: TactileServices) -> None:
-        """Judge again a driver that has published nothing newer."""
+    def judge(self) -> None:
+        """Judge again a driver that has published nothing newer. While a recording is paused, time stands still."""
         before = self.newest
         if before is None or now_ns() - self._judged_ns < _JUDGE_EVERY_NS:
             return
-        life, self.life = self.life, life_of(self.live.reader, before.frame)
-        self.newest = self._judged(before.frame, services)
+        before_life, life = self.life, life_of(self.live.reader, before.frame)
+        stands_still = self._stands_still(life)
+        if not stands_still:
+            self.life = life
+        self.newest = self._judged(before.frame, before.status if stands_still else None)
         if (
-            self.life != life
+            self.life != before_life
             or not np.array_equal(self.newest.status, before.status)
-            or (self.newest.contacts is None) != (before.contacts is None)
+            or _number(self.newest.contacts) != _number(before.contacts)
         ):
             self.changes += 1
 
-    def _judged(self, frame: DriverSnapshot, services: TactileServices) -> Newest:
+    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8] | None = None) -> Newest:
         self._judged_ns = now_ns()
-        status, calm = status_now(self.life, frame), services.calm_of(self.name)
+        services, name = self.origin.services, self.live.name
+        calm = services.calm_of(name)
         if calm is not None and not self._fits(calm.structure):
             calm = None
-        if calm is not None:
-            status = status | (calm.status & _UNHEALTHY)
-        return Newest(frame, status, calm, services.contacts_of(self.name), services.motion_of(self.name))
+        if status is None:
+            status = status_now(self.life, frame)
+            if calm is not None:
+                status = status | (calm.status & _UNHEALTHY)
+        return Newest(frame, status, calm, services.contacts_of(name), services.motion_of(name))
 
     def _fits(self, calm: Structure) -> bool:
         """Return whether a calmed driver has the same sensors; the comparison is made once for two structures."""
@@ -204,33 +254,29 @@ class ShownDriver:
         return fits
 
 
-class Follower:
-    """All drivers of a namespace, and what services publish about them.
+def _number(sample: ContactsSample | None) -> tuple[int, int] | None:
+    return None if sample is None else sample.position
 
-    Args:
-        calm: namespace of calmed drivers; None: without it.
+
+class Follower:
+    """All drivers of some namespaces, and what services publish about them.
 
     Attributes:
         edition: changes whenever drivers or structures change.
-        services: about the drivers.
     """
 
-    def __init__(
-        self,
-        namespace: Namespace,
-        names: Collection[str] = (),
-        calm: Namespace | None = None,
-        robot: Robot | None = None,
-    ) -> None:
-        self.namespace, self.names, self.calm_namespace = namespace, tuple(names), calm
+    def __init__(self, *origins: Origin, robot: Robot | None = None) -> None:
+        self.origins = origins
         self.drivers: list[ShownDriver] = []
         self.problem: str | None = None
         self.edition = 0
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
-        self._numbers: dict[str, int] = {}
-        self._live = LiveDrivers(namespace, names)
-        self.services = TactileServices(self._live, names, calm)
+        self._numbers: dict[tuple[str, str], int] = {}
+
+    @property
+    def namespace(self) -> Namespace:
+        return self.origins[0].namespace
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
@@ -246,14 +292,15 @@ class Follower:
         """
         self.problem = None
         try:
-            found = self._live.look()
-            self.services.look()
+            found = [(live, origin) for origin in self.origins for live in origin.live.look()]
+            for origin in self.origins:
+                origin.services.look()
         except NamespaceError as error:
             self.problem = str(error)
             return []
-        if [driver.live for driver in self.drivers] != found:
+        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
             kept = {id(driver.live): driver for driver in self.drivers}
-            self.drivers = [kept.get(id(live)) or self._begin(live) for live in found]
+            self.drivers = [kept.get(id(live)) or self._begin(live, origin) for live, origin in found]
             self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
@@ -262,26 +309,26 @@ class Follower:
         return newer
 
     def close(self) -> None:
-        self.services.close()
-        self._live.close()
+        for origin in self.origins:
+            origin.close()
         self.drivers = []
 
     def _take(self, driver: ShownDriver, period_ns: int) -> bool:
         if now_ns() - driver.taken_ns < period_ns - _EARLY_NS:
             return False
-        live = driver.live
+        live, origin = driver.live, driver.origin
         if live.frame is driver.frame:
-            self._live.poll(live)
+            origin.live.poll(live)
         if live.frame is None or live.frame is driver.frame:
-            driver.judge(self.services)
-        elif self.services.is_due(live):
-            driver.take(live.frame, self.services)
+            driver.judge()
+        elif origin.services.is_due(live):
+            driver.take(live.frame)
             return True
         return False
 
-    def _begin(self, live: LiveDriver) -> ShownDriver:
-        number = self._numbers.setdefault(live.name, len(self._numbers))
-        return ShownDriver(number, live, self.namespace.name)
+    def _begin(self, live: LiveDriver, origin: Origin) -> ShownDriver:
+        number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
+        return ShownDriver(number, live, origin)
 
     def _arrange(self) -> None:
         self.edition += 1

@@ -94,10 +94,11 @@ class Record(msgspec.Struct, tag_field="op", tag="record"):
 
 
 class Replay(msgspec.Struct, tag_field="op", tag="replay"):
-    """Control the replay that is shown."""
+    """Control the replays that are shown, or the one of a number."""
 
     action: Literal["pause", "resume", "step", "seek", "speed", "loop"]
     value: int | float | bool | None = None
+    number: Number | None = None
 
 
 Operation = Next | Choose | Exact | Names | Plot | Mark | Tare | Wipe | Record | Replay

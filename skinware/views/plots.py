@@ -34,7 +34,7 @@ _LOOK_EVERY_NS = NS_PER_S // 2
 _NO_VALUE = np.uint8(WITHOUT_VALUE | Status.STALE)
 
 
-class _Origin(NamedTuple):
+class _PlotSource(NamedTuple):
     """The service that has the values of a line; ``of`` is ``driver``, ``calm`` or ``contacts``."""
 
     of: str
@@ -58,7 +58,7 @@ class PlotBlock(NamedTuple):
 class _Feed:
     """The samples of one service that wait for the next turn."""
 
-    def __init__(self, source: _Origin) -> None:
+    def __init__(self, source: _PlotSource) -> None:
         reader = ContactsReader if source.of == "contacts" else DriverReader
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
         self.of, self.number, self.missed = source.of, 0, 0
@@ -117,7 +117,7 @@ class Plots:
         self._follower = follower
         self._lines: list[Line] = []
         self._edition = self._look_ns = 0
-        self._feeds: dict[_Origin, _Feed] = {}
+        self._feeds: dict[_PlotSource, _Feed] = {}
         self._waiting: deque[PlotBlock] = deque(maxlen=_MOST_BLOCKS)
 
     @property
@@ -163,7 +163,7 @@ class Plots:
         self._look_ns = now_ns() + _LOOK_EVERY_NS
         if self._follower.edition != self._edition:
             return
-        wanted: dict[_Origin, tuple[ShownDriver, dict[int, Line]]] = {}
+        wanted: dict[_PlotSource, tuple[ShownDriver, dict[int, Line]]] = {}
         for at, line in enumerate(self._lines):
             driver = self._follower.get(line.driver)
             source = None if driver is None else self._source_of(driver, line)
@@ -178,15 +178,15 @@ class Plots:
                     self._waiting += [block] if len((block := feed.block()).time_ns) else []
                     feed.choose(self._number, lines, driver)
 
-    def _source_of(self, driver: ShownDriver, line: Line) -> _Origin | None:
-        follower = self._follower
+    def _source_of(self, driver: ShownDriver, line: Line) -> _PlotSource | None:
+        origin = driver.origin
         if line.contact is not None:
-            reader = follower.services.contacts_reader(driver.name)
-            return None if reader is None else _Origin("contacts", reader.namespace, reader.name)
+            reader = origin.services.contacts_reader(driver.live.name)
+            return None if reader is None else _PlotSource("contacts", reader.namespace, reader.name)
         is_calm = driver.newest is not None and driver.newest.calm is not None
-        if line.modules and is_calm and follower.calm_namespace is not None:
-            return _Origin("calm", follower.calm_namespace, driver.name)
-        return _Origin("driver", follower.namespace, driver.name)
+        if line.modules and is_calm and origin.calm is not None:
+            return _PlotSource("calm", origin.calm, driver.live.name)
+        return _PlotSource("driver", origin.namespace, driver.live.name)
 
     def _past_of(self, at: int, line: Line) -> PlotBlock | None:
         driver = self._follower.get(line.driver)

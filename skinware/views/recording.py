@@ -117,7 +117,7 @@ async def _all_of(stream: asyncio.StreamReader | None) -> str:
 
 _STATE = "replay"
 """Operation of every service of a replay that returns its state; the other operations return it too."""
-_VALUES = {"pause": None, "resume": None, "step": "frames", "seek": "time_s", "speed": "factor", "loop": "on"}
+REPLAY_VALUES = {"pause": None, "resume": None, "step": "frames", "seek": "time_s", "speed": "factor", "loop": "on"}
 """The operations, each with the name of its argument."""
 _ASK_EVERY_NS = NS_PER_S // 4
 _PATIENCE_NS = 2 * NS_PER_S
@@ -161,11 +161,11 @@ class ReplayControl:
             complain: called with the reason if the operation failed.
 
         Raises:
-            ConfigurationError: no replay is shown, or there is no such operation.
+            ConfigurationError: no replay is shown.
         """
-        if self._replayed is None or action not in _VALUES:
+        if self._replayed is None:
             raise ConfigurationError("no replay is shown")
-        name = _VALUES[action]
+        name = REPLAY_VALUES[action]
         arguments = {} if name is None or value is None else {name: value}
         self._acts.append(_Question(self._replayed, action, arguments, self._hear, complain))
 
@@ -173,7 +173,7 @@ class ReplayControl:
         return driver.life != DEAD and self._others.get(driver.name) != driver.live.reader.generation
 
     def _learn(self, driver: ShownDriver, operations: dict[str, str]) -> None:
-        if _STATE in operations and operations.keys() >= _VALUES.keys():
+        if _STATE in operations and operations.keys() >= REPLAY_VALUES.keys():
             self._replayed, self._next_ns = driver, 0
         else:
             self._forget(driver)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
@@ -23,7 +23,8 @@ from skinware.views import looks
 from skinware.views.access import Access, AccessRefused
 from skinware.views.advice import DoctorProgram
 from skinware.views.following import Follower
-from skinware.views.recording import RecordingProgram, ReplayControl
+from skinware.views.recording import RecordingProgram
+from skinware.views.shows import RecordingFiles, Show
 from skinware.views.tree import NOTE, problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
@@ -35,6 +36,7 @@ _LONGEST_TURN_S = 0.5
 _MOST_VIEWERS = 32
 _MOST_MARKS = 64
 _LONGEST_OPERATION = 1 << 16
+_RECORDINGS = "/recordings/"
 _CLOSE_TIMEOUT_S = 1.0
 """Time for a viewer to close its connection."""
 _HEADERS = {
@@ -55,6 +57,7 @@ class ViewServer:
         follower: of the drivers; used in the event loop's thread only.
         recording: that viewers may begin and end; None: they may not record.
         doctor: that is asked for advice; None: without it.
+        files: recordings that viewers may see instead; each plays them for itself.
     """
 
     def __init__(
@@ -64,9 +67,10 @@ class ViewServer:
         recording: RecordingProgram | None = None,
         page: Path = PAGE,
         doctor: DoctorProgram | None = None,
+        files: RecordingFiles | None = None,
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
-        self._replay = ReplayControl()
+        self._live, self._files = Show(follower), files or RecordingFiles()
         self._doctor = doctor or DoctorProgram((), follower.namespace.name)
         self._viewers: set[Viewer] = set()
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
@@ -95,13 +99,15 @@ class ViewServer:
         """Follow the drivers while there are viewers, without end."""
         while True:
             if self._viewers:
-                period_ns = round(NS_PER_S / max(viewer.look.fps for viewer in self._viewers))
-                for driver in self._follower.take(period_ns):
-                    for viewer in self._viewers:
-                        viewer.look.follow(driver)
+                for show in {viewer.show for viewer in self._viewers}:
+                    viewers = [viewer for viewer in self._viewers if viewer.show is show]
+                    period_ns = round(NS_PER_S / max(viewer.look.fps for viewer in viewers))
+                    for driver in show.follower.take(period_ns):
+                        for viewer in viewers:
+                            viewer.look.follow(driver)
+                    show.follow()
                 for viewer in self._viewers:
                     viewer.plots.take()
-                self._replay.follow(self._follower.drivers)
                 problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 self._wake()
@@ -132,6 +138,10 @@ class ViewServer:
             return _response(HTTPStatus.BAD_REQUEST, b"", "text/plain")
 
     def _file(self, path: str, request: Request) -> Response:
+        if path.startswith(_RECORDINGS):  # a page asks whether a file that was dropped on it is here too
+            recording = self._files.find(path.removeprefix(_RECORDINGS))
+            size = -1 if recording is None else recording.stat().st_size
+            return _response(HTTPStatus.OK, f"{size}".encode(), "text/plain")
         if path == "/" and self._access.has_token(request.path):  # kept by the browser, and out of the address
             response = _response(HTTPStatus.SEE_OTHER, b"", "text/plain")
             response.headers["Location"] = "/" + self._access.without_token(request.path)
@@ -148,7 +158,10 @@ class ViewServer:
         if len(self._viewers) >= _MOST_VIEWERS:
             await connection.close(1013, "too many viewers")
             return
-        viewer = Viewer(self._follower)
+        address = urlsplit(connection.request.path if connection.request else "")
+        recordings = parse_qs(address.query).get("recording", [])
+        show = await asyncio.to_thread(self._files.open, recordings) if recordings else self._live
+        viewer = Viewer(show)
         self._viewers.add(viewer)
         try:
             with contextlib.suppress(ConnectionClosed):
@@ -156,6 +169,8 @@ class ViewServer:
         finally:
             self._viewers.discard(viewer)
             viewer.plots.close()
+            if show is not self._live:
+                await asyncio.shield(asyncio.to_thread(show.close))
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
         """Carry out the operations of a viewer, and send it a turn for each one that it asks for."""
@@ -187,7 +202,7 @@ class ViewServer:
                     while not viewer.has_news:
                         await self._news.wait()
             last_s = loop.time()
-            await connection.send(viewer.turn(self._besides()))
+            await connection.send(viewer.turn(self._besides(viewer.show)))
 
     def _wake(self) -> None:
         self._news.set()
@@ -206,19 +221,19 @@ class ViewServer:
                 viewer.ask(operation)
             case looks.Plot():
                 viewer.plot(operation)
-            case looks.Mark():
+            case looks.Mark() if viewer.show.is_live:
                 self._mark(operation.text)
             case looks.Tare():
                 viewer.tare()
             case looks.Wipe():
                 viewer.wipe(operation.action == "start")
-            case looks.Record() if self._recording is not None:
+            case looks.Record() if self._recording is not None and viewer.show.is_live:
                 if operation.action == "start":
                     self._recording.start()
                 else:
                     self._recording.stop()
             case looks.Replay():
-                self._replay.act(operation.action, operation.value, viewer.refuse)
+                viewer.show.act(operation, viewer.refuse)
             case _:
                 raise ConfigurationError("this server cannot do that")
 
@@ -228,8 +243,11 @@ class ViewServer:
         in_recording = self._recording is not None and self._recording.mark(text, time_ns)
         self._marks.append({"time_ns": str(time_ns), "text": text, "is_recorded": in_recording})
 
-    def _besides(self) -> dict[str, Any]:
-        besides: dict[str, Any] = {"recording": None, "replay": self._replay.state, "marks": list(self._marks)}
+    def _besides(self, show: Show) -> dict[str, Any]:
+        besides: dict[str, Any] = {"recording": None}
+        if not show.is_live:
+            return besides
+        besides["marks"] = list(self._marks)
         besides["findings"] = self._doctor.findings
         if self._recording is not None:
             besides["recording"] = self._recording.state

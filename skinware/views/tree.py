@@ -55,8 +55,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
     loads = [bus.load for bus in report.buses if bus.load is not None]
     return {
         "id": driver.number,
-        "name": report.name,
-        "namespace": driver.namespace,
+        "name": driver.name,
+        "namespace": driver.origin.title,
         "state": report.life,
         "shown": report.state,
         "bad": badness(report.state),

@@ -17,11 +17,12 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.motion_service import MotionSample
 from skinware.text import why_text
 from skinware.views import looks
-from skinware.views.following import Follower, Newest, ShownDriver
+from skinware.views.following import Newest, ShownDriver
 from skinware.views.live import places_of
 from skinware.views.plots import Plots
 from skinware.views.quantities import Quantity
 from skinware.views.scene import Scene
+from skinware.views.shows import Show
 from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
 
 PROTOCOL = "skinware.view.2"
@@ -53,11 +54,12 @@ class Blobs:
 
 
 class Viewer:
-    """One viewer: its look, its questions, and what it has got so far."""
+    """One viewer of a show: its look, its questions, and what it has got so far."""
 
-    def __init__(self, follower: Follower) -> None:
+    def __init__(self, show: Show) -> None:
         self.look = looks.Look()
-        self._follower = follower
+        self.show, self._follower = show, show.follower
+        self._sent: dict[str, Any] = {}  # of the replays
         self._number = 0
         self._edition = -1
         self._changes: dict[int, tuple[int, int]] = {}
@@ -67,7 +69,7 @@ class Viewer:
         self._exact: list[tuple[int, int]] = []
         self._asked = False
         self._questions: list[looks.Names] = []
-        self.plots = Plots(follower)
+        self.plots = Plots(self._follower)
         self._error: str | None = None
 
     def choose(self, choice: looks.Choose) -> None:
@@ -108,6 +110,7 @@ class Viewer:
             or self.plots.has_news
             or self._error is not None
             or self._edition != self._follower.edition
+            or self._sent != self._of_replays()
             or any(self._changes.get(driver.number) != _seen(driver) for driver in self._follower.drivers)
         )
 
@@ -145,22 +148,30 @@ class Viewer:
             header["plots"] = {"missed": self.plots.missed, "blocks": told}
         if self._error is not None:
             header["error"], self._error = self._error, None
+        replays = self._of_replays()
+        header |= {key: news for key, news in replays.items() if self._sent.get(key) != news}
+        self._sent = replays
         lives = [driver.life for driver in self._follower.drivers]
         if now_ns() >= self._state_due_ns or lives != self._lives:
             self._state_due_ns, self._lives = now_ns() + _STATE_EVERY_NS, lives
             header["state"] = besides | self._state(besides.get("problems", []))
         return blobs.under(header)
 
+    def _of_replays(self) -> dict[str, Any]:
+        return {"replays": self.show.replays, "outlines": self.show.outlines}
+
     def _see_all_again(self) -> None:
         self._changes, self._status = {}, {}
 
     def _skin(self, blobs: Blobs) -> dict[str, Any]:
         follower, scene = self._follower, self._follower.scene
-        namespaces = [follower.namespace, *([follower.calm_namespace] if follower.calm_namespace else [])]
+        of_live = [origin for origin in follower.origins if origin.recording is None]
+        namespaces = [n for origin in of_live for n in (origin.namespace, origin.calm) if n is not None]
         return {
             "protocol": PROTOCOL,
             "namespaces": [namespace.name for namespace in namespaces],
-            "names": list(follower.names),
+            "names": list(next((origin.names for origin in follower.origins), ())),
+            "recordings": [origin.recording for origin in follower.origins if origin.recording is not None],
             "posed": bool(follower.robot.poses),
             "drivers": [_driver(driver, scene, blobs) for driver in follower.drivers],
             "links": [
@@ -273,8 +284,8 @@ class Viewer:
         return {"names": {"driver": driver.number, "type": quantity.name, "of": names}}
 
     def _state(self, problems: list[dict[str, Any]]) -> dict[str, Any]:
-        if self._follower.problem is not None:
-            problems = [*problems, problem_of_all(self._follower.problem)]
+        texts = self.show.problems + ([] if self._follower.problem is None else [self._follower.problem])
+        problems = [*problems, *map(problem_of_all, texts)]
         drivers = []
         for driver in self._follower.drivers:
             report = driver.report()
@@ -328,7 +339,7 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
     return {
         "id": driver.number,
         "name": driver.name,
-        "namespace": driver.namespace,
+        "namespace": driver.origin.title,
         "generation": str(driver.generation),
         "type": driver.live.reader.driver_type,
         "types": types,

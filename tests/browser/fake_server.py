@@ -286,10 +286,9 @@ class FakeServer:
                         "drivers": [d.told_state() for d in self.drivers],
                         "problems": [p for d in self.drivers for p in d.problems],
                         "recording": self.extra.get("recording"),
-                        "replay": self.extra.get("replay"),
                         "findings": self.findings,
                     }
-                header.update({k: v for k, v in self.extra.items() if k not in ("recording", "replay")})
+                header.update({k: v for k, v in self.extra.items() if k != "recording"})
                 header.update(answers)
                 if "exact" in answers:
                     header["exact"] = [self._exact(*pair) for pair in answers["exact"]]

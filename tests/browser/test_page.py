@@ -152,28 +152,53 @@ def test_a_dead_driver_is_old_at_once_and_first_in_the_list(page: Page, server: 
     assert "✕" in row.inner_text()  # told without colour
 
 
-def test_a_replay_is_controlled(page: Page, server: FakeServer) -> None:
+def test_recordings_are_controlled_together_or_alone(page: Page, server: FakeServer) -> None:
     assert not page.locator(role("replay")).is_visible()
-    server.extra["replay"] = {
-        "file": "x.mcap", "time_s": 3.0, "duration_s": 60.0, "speed": 1.5, "paused": False, "loop": False
-    }  # fmt: skip
+    how: dict[str, Any] = {"paused": False, "loop": False, "speed": 1.5}
+    server.extra["replays"] = [
+        {"file": "x.mcap", "title": "x", "time_s": 3.0, "duration_s": 60.0, **how},
+        {"file": "y.mcap", "title": "y", "time_s": 5.0, "duration_s": 50.0, **how},
+    ]
+    mark = {"event": "mark", "text": "slip", "time_s": 30.0}
+    outline: dict[str, Any] = {
+        "until_s": 60,
+        "samples": [9] * 60,
+        "missed": [0, 7] + [0] * 58,
+        "contacts": [2] * 60,
+        "events": [mark],
+    }
+    server.extra["outlines"] = [outline, {}]
     panel = page.locator(role("replay"))
     panel.wait_for()
+    assert not page.locator("#rewind").is_visible()
     assert "0:03.0 of 1:00.0" in panel.inner_text()
     for name in ("Pause", "Back", "Step", "Loop"):
         panel.get_by_role("button", name=name).click()
     assert panel.locator("select").input_value() == "1.5"
     panel.locator("select").select_option("4")
-    panel.locator("input").evaluate("slider => { slider.value = 30; slider.dispatchEvent(new Event('change')) }")
-    wait_until(lambda: len(asked(server, "replay")) == 6)
-    assert [(one["action"], one["value"]) for one in asked(server, "replay")] == [
-        ("pause", None),
-        ("step", -1),
-        ("step", 1),
-        ("loop", True),
-        ("speed", 4),
-        ("seek", 30),
+    first, second = panel.get_by_role("slider").all()
+    width = int((first.bounding_box() or {"width": 0})["width"])
+    first.hover(position={"x": width // 2 + 3, "y": 15})
+    assert first.inner_text() == "0:30.0 slip, 2 contacts"
+    first.hover(position={"x": width / 60 * 1.5, "y": 15})
+    assert "7 samples missed" in first.inner_text()
+    first.click(position={"x": width // 2 + 3, "y": 15})
+    second.click(position={"x": width // 2, "y": 15}, modifiers=["Shift"])
+    second.press("End")
+    wait_until(lambda: len(asked(server, "replay")) == 11)
+    orders = [(one["action"], one["value"], one["number"]) for one in asked(server, "replay")]
+    assert orders[:6] == [
+        ("resume", None, None),  # of the page itself, from the begin on
+        ("pause", None, None),
+        ("step", -1, None),
+        ("step", 1, None),
+        ("loop", True, None),
+        ("speed", 4, None),
     ]
+    assert orders[6:8] == [("seek", 30, 0), ("seek", 32, 1)]  # at the mark, and as far on
+    assert (orders[8][0], orders[8][2]) == ("seek", 1)
+    assert abs(orders[8][1] - 25) < 0.2
+    assert orders[9:] == [("seek", 48, 0), ("seek", 50, 1)]
 
 
 def test_a_wipe_test_lists_what_was_not_touched(page: Page, server: FakeServer, driver: FakeDriver) -> None:

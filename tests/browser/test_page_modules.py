@@ -215,6 +215,7 @@ def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
         "names": False,
         "theme": "light",
         "shifts": {"default/a b": [0.5, -1, 0]},
+        "times": [1.5, 0.125],
     }
     assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False, "sharp": False}
 

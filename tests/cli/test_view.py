@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -13,6 +14,8 @@ from skinware import Namespace
 from skinware.cli import view as view_module
 from skinware.cli._command import exit_status
 from skinware.cli.view import command as view
+from skinware.recording.files import Files
+from skinware.recording.recorder import Recorder
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import refused, run, running
 from tests.views.client import page_of
@@ -46,8 +49,28 @@ def test_its_address_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert opened == ["http://127.0.0.1:5/"]
 
 
-async def ready_at_once(_follower: object, _access: object, _host: str, _port: object, ready: object) -> None:
-    ready(5)  # type: ignore[operator]
+async def ready_at_once(*arguments: object) -> None:
+    arguments[-1](5)  # type: ignore[operator]
+
+
+def test_recordings_are_in_the_address_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with publishing(FakeSkin("torso", fake_structure(1, 1))):
+        Recorder(Files(Path("a b.mcap"))).run(0.3)
+    monkeypatch.setattr(view_module, "_serve", ready_at_once)
+    assert exit_status(view, ["--no-browser", "a b.mcap", "./a b.mcap", "torso"]) == 0
+    url, _, what = capsys.readouterr().out.partition(" shows ")
+    assert url.endswith("/?recording=a+b.mcap&recording=a+b.mcap")
+    assert what == "a b.mcap, a b.mcap, torso (Ctrl-C ends)\n"
+    Path("foreign.mcap").write_text("hello")
+    for name, why in (
+        ("foreign.mcap", "not a recording (not an MCAP file)"),
+        ("gone.mcap", "No such file or directory"),
+    ):
+        assert exit_status(view, ["--no-browser", name]) == 2
+        assert capsys.readouterr().err == f"skin-view: {name}: {why}\n"
 
 
 @pytest.mark.thorough

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
+from skinware.realtime import NS_PER_S
 from skinware.status import Why
 from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.rule import BaselineSettings
@@ -211,13 +212,28 @@ def test_tare_needs_a_frame_and_ends_the_measurement_of_the_rest() -> None:
     assert np.flatnonzero(calm.touched).tolist() == [3]
 
 
-def test_values_without_steps_need_their_noise_measured_before_a_tare() -> None:
-    bench = Bench(resolution=0.0)
-    bench.run(1)
-    with pytest.raises(ConfigurationError, match="noise"):
-        bench.baseline.tare()
-    bench.run(5)
-    assert bench.baseline.tare() == N
+def test_values_without_steps_need_four_values_before_a_tare() -> None:
+    random, baseline = np.random.default_rng(0), Baseline(np.zeros(N), np.zeros(N), resolution=0.0)
+    for number in range(3):
+        baseline.update(number * NS_PER_S // RATE_HZ, random.random(N))
+        with pytest.raises(ConfigurationError, match="known after four values"):
+            baseline.tare()
+    baseline.update(3 * NS_PER_S // RATE_HZ, random.random(N))
+    assert baseline.tare() == N
+
+
+@pytest.mark.parametrize("after_s", [0.8, 1.0, 3.0])
+@pytest.mark.parametrize("rate_hz", [5, 20, 200])
+def test_a_tare_before_the_rest_is_known_measures_the_noise(rate_hz: int, after_s: float) -> None:
+    random = np.random.default_rng(2)
+    values = np.round(220 + 2 * random.standard_normal((20 * rate_hz, 32)))
+    baseline = Baseline(np.zeros(32), np.zeros(32))
+    touched = []
+    for number, frame in enumerate(values):
+        if number == after_s * rate_hz:
+            assert baseline.tare() == 32
+        touched.append(baseline.update(number * NS_PER_S // rate_hz, frame).touched)
+    assert not np.any(touched)
 
 
 @pytest.mark.thorough

@@ -104,6 +104,18 @@ def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
     both.compare_states()
 
 
+@pytest.mark.parametrize("frames", [4, 11, 24, 40, 130])
+def test_tares_before_the_rest_is_known_are_alike(frames: int) -> None:
+    module, patch = np.arange(N) // 12, np.arange(N) // 48
+    both, random = Both(module, patch), np.random.default_rng(frames)
+    for number in range(2 * frames):
+        if number == frames:
+            assert both.ours.tare(0) == both.specified.tare(0) > 0
+        values = np.round(20 + 2 * random.standard_normal(N) + 2 * random.standard_normal())
+        both.update(number * _STEP_NS, values, random.random(N) > 0.1)
+    both.compare_states()
+
+
 def test_a_restored_one_goes_on_alike() -> None:
     module, patch = np.arange(N) // 12, np.arange(N) // 48
     both, random = Both(module, patch), np.random.default_rng(1)

@@ -65,6 +65,8 @@ class Page:
         self.connection = connection
         self.skin: dict[str, Any] = {}
         self.state: dict[str, Any] = {}
+        self.replays: list[dict[str, Any]] = []
+        self.outlines: list[dict[str, Any]] = []
         self.status: dict[tuple[int, str], Array] = {}
         self._number = 0
 
@@ -82,6 +84,8 @@ class Page:
         self._number += 1
         self.skin = turn.header.get("skin", self.skin)
         self.state = turn.header.get("state", self.state)
+        self.replays = turn.header.get("replays", self.replays)
+        self.outlines = turn.header.get("outlines", self.outlines)
         for told in turn.header.get("pictures", ()):
             driver = next(driver for driver in self.skin["drivers"] if driver["id"] == told["driver"])
             shown = next(shown for shown in driver["types"] if shown["name"] == told["type"])

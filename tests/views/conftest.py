@@ -14,10 +14,11 @@ import pytest
 
 from skinware import Namespace
 from skinware.views.access import Access
-from skinware.views.following import Follower
+from skinware.views.following import Follower, Origin
 from skinware.views.recording import RecordingProgram
 from skinware.views.robot import Robot
 from skinware.views.server import ViewServer, show
+from skinware.views.shows import RecordingFiles
 from skinware_drivers.testing.waiting import wait_until
 
 INDEX = "<!doctype html><title>skin</title>"
@@ -45,16 +46,17 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
         *,
         token: str | None = None,
         robot: Robot | None = None,
+        files: RecordingFiles | None = None,
         program: tuple[str, ...] = (sys.executable, "-m", "skinware.cli.record", "--until-eof"),
     ) -> Iterator[str]:
-        follower = Follower(namespace, names, calm, robot)
+        follower = Follower(Origin(namespace, names, calm), robot=robot)
         found: list[Any] = []
         failed: list[BaseException] = []
 
         async def run() -> None:
             stop = asyncio.Event()
             recording = RecordingProgram(program, namespace.name, names, page_folder)
-            server = ViewServer(follower, Access("127.0.0.1", token), recording, page_folder)
+            server = ViewServer(follower, Access("127.0.0.1", token), recording, page_folder, files=files)
             loop = asyncio.get_running_loop()
             await show(server, "127.0.0.1", 0, lambda port: found.append((port, loop, stop)), stop)
 

@@ -10,7 +10,7 @@ import pytest
 from skinware import DriverReader, Namespace, Status
 from skinware.errors import ServiceNotFound
 from skinware.status import Why
-from skinware.views.following import Follower
+from skinware.views.following import Follower, Origin
 from skinware.views.tree import problems_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
@@ -26,7 +26,7 @@ def names(follower: Follower) -> list[str]:
 
 
 def test_each_frame_is_taken_once(namespace: Namespace) -> None:
-    with FakeSkin("b") as skin, FakeSkin("a"), closing(Follower(namespace)) as follower:
+    with FakeSkin("b") as skin, FakeSkin("a"), closing(Follower(Origin(namespace))) as follower:
         assert names(follower) == []
         assert [driver.name for driver in follower.drivers] == ["a", "b"]
         skin.publish()
@@ -41,7 +41,7 @@ def test_each_frame_is_taken_once(namespace: Namespace) -> None:
 def test_a_calmed_driver_settles_and_its_reasons_are_problems(namespace: Namespace) -> None:
     why = np.full(24, int(Why.RELEARNING), np.uint8)
     why[20:] = Why.REST, Why.HELD, Why.DOUBTED, Why.DOUBTED
-    with FakeSkin("a", fake_structure(1, 2), why=why) as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a", fake_structure(1, 2), why=why) as skin, closing(Follower(Origin(namespace))) as follower:
         skin.status[:19] = Status.NEVER_SEEN
         skin.publish()
         (driver,) = follower.take(0)
@@ -53,7 +53,7 @@ def test_a_calmed_driver_settles_and_its_reasons_are_problems(namespace: Namespa
 
 
 def test_no_more_often_than_asked_for(namespace: Namespace) -> None:
-    with FakeSkin("a") as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a") as skin, closing(Follower(Origin(namespace))) as follower:
         skin.publish()
         assert names(follower) == ["a"]
         skin.publish()
@@ -62,7 +62,7 @@ def test_no_more_often_than_asked_for(namespace: Namespace) -> None:
 
 
 def test_numbers_last_over_restarts_and_generations_do_not(namespace: Namespace) -> None:
-    with closing(Follower(namespace)) as follower:
+    with closing(Follower(Origin(namespace))) as follower:
         told = []
         for name in ("b", "a", "b"):
             with FakeSkin(name) as skin:
@@ -77,7 +77,7 @@ def test_numbers_last_over_restarts_and_generations_do_not(namespace: Namespace)
 
 
 def test_a_restart_with_the_same_sensors_changes_no_table(namespace: Namespace) -> None:
-    with FakeSkin("a") as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a") as skin, closing(Follower(Origin(namespace))) as follower:
         skin.publish()
         follower.take(0)
         (driver,), edition, structure = follower.drivers, follower.edition, follower.drivers[0].structure
@@ -89,7 +89,7 @@ def test_a_restart_with_the_same_sensors_changes_no_table(namespace: Namespace) 
 
 
 def test_a_driver_that_goes_at_the_worst_moment(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
-    with FakeSkin("a") as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a") as skin, closing(Follower(Origin(namespace))) as follower:
         skin.publish()
         follower.take(0)
 
@@ -106,7 +106,7 @@ def test_a_driver_that_goes_at_the_worst_moment(namespace: Namespace, monkeypatc
 
 
 def test_a_namespace_that_cannot_be_trusted_is_a_problem_while_it_is(namespace: Namespace) -> None:
-    with FakeSkin("a") as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a") as skin, closing(Follower(Origin(namespace))) as follower:
         mode = namespace.path.stat().st_mode
         namespace.path.chmod(0o777)
         assert names(follower) == []
@@ -118,7 +118,7 @@ def test_a_namespace_that_cannot_be_trusted_is_a_problem_while_it_is(namespace: 
 
 
 def test_the_past_is_ten_seconds(namespace: Namespace) -> None:
-    with FakeSkin("a", fake_structure(1, 1)) as skin, closing(Follower(namespace)) as follower:
+    with FakeSkin("a", fake_structure(1, 1)) as skin, closing(Follower(Origin(namespace))) as follower:
         for value in range(5):
             skin.values = np.full(12, value)
             skin.publish()

@@ -13,7 +13,7 @@ from skinware import DriverReader, Namespace, Status
 from skinware.memory.namespace import Namespace as Place
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import plots
-from skinware.views.following import Follower
+from skinware.views.following import Follower, Origin
 from skinware.views.looks import Line
 from skinware.views.plots import PlotBlock, Plots
 from skinware_drivers.testing.waiting import wait_until
@@ -65,7 +65,7 @@ def test_values_are_those_of_the_ring(serving: Serve) -> None:
 
 def test_each_sample_comes_once_and_a_gap_is_seen(namespace: Namespace) -> None:
     skin = FakeSkin("torso", fake_structure(1, 2), slots=8)
-    follower = Follower(namespace)
+    follower = Follower(Origin(namespace))
     skin.publish()
     follower.take(0)
     lines = Plots(follower)
@@ -105,7 +105,7 @@ def test_each_sample_comes_once_and_a_gap_is_seen(namespace: Namespace) -> None:
 def test_memory_is_bounded_however_slow_a_page_is(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots, "_MOST_SAMPLES", 50)
     skin = FakeSkin("torso", fake_structure(1, 2))
-    follower = Follower(namespace)
+    follower = Follower(Origin(namespace))
     skin.publish()
     follower.take(0)
     lines = Plots(follower)
@@ -125,7 +125,7 @@ def test_the_load_of_a_contact_and_the_sum_of_what_is_calm(namespace: Namespace,
     raw, calm = FakeSkin("torso", structure), FakeSkin("torso", structure, calm_namespace)
     calm.values = np.full(24, 255)  # 0 counts
     calm.values[[12, 13]] = 255 - 60
-    follower = Follower(namespace, (), calm_namespace)
+    follower = Follower(Origin(namespace, calm=calm_namespace))
     with ContactsWriter(structure, driver="torso", tracking=AT_ONCE, namespace=calm_namespace) as contacts:
         value = np.zeros(20, np.float32)
         value[[2, 3]] = 60
@@ -138,7 +138,9 @@ def test_the_load_of_a_contact_and_the_sum_of_what_is_calm(namespace: Namespace,
             return bool(follower.drivers and follower.drivers[0].newest and follower.drivers[0].newest.calm)
 
         wait_until(is_calm)
-        wait_until(lambda: follower.take(0) is not None and follower.services.contacts_reader("torso") is not None)
+        wait_until(
+            lambda: follower.take(0) is not None and follower.origins[0].services.contacts_reader("torso") is not None
+        )
         lines = Plots(follower)
         lines.choose(1, [Line(0, type="pressure", modules=(1,)), Line(0, contact=1)], follower.edition)
         lines.take()

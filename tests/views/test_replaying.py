@@ -37,14 +37,14 @@ def replaying(file: Path, namespace: Namespace) -> Iterator[None]:
 @pytest.mark.thorough
 def test_all_that_a_page_can_ask_for(serving: Serve, recording: Path, namespace: Namespace) -> None:
     with replaying(recording, namespace), serving() as url, page_of(url) as page:
-        page.pull_until(lambda _: page.state.get("replay"))
-        assert page.state["replay"]["file"] == str(recording)
-        assert page.state["replay"]["loop"]
-        assert 0.5 < page.state["replay"]["duration_s"] < 5
+        page.pull_until(lambda _: page.replays)
+        assert page.replays[0]["file"] == str(recording)
+        assert page.replays[0]["loop"]
+        assert 0.5 < page.replays[0]["duration_s"] < 5
         page.say("replay", action="pause")
-        page.pull_until(lambda _: page.state["replay"]["paused"])
+        page.pull_until(lambda _: page.replays[0]["paused"])
         page.say("replay", action="seek", value=0.5)
-        page.pull_until(lambda _: abs(page.state["replay"]["time_s"] - 0.5) < 0.01)
+        page.pull_until(lambda _: abs(page.replays[0]["time_s"] - 0.5) < 0.01)
         for _ in range(3):
             page.pull()  # what was there before the pause
         page.say("replay", action="step")
@@ -52,16 +52,16 @@ def test_all_that_a_page_can_ask_for(serving: Serve, recording: Path, namespace:
         page.say("replay", action="step", value=-1)
         page.say("replay", action="speed", value=0.25)
         page.say("replay", action="loop", value=False)
-        page.pull_until(lambda _: page.state["replay"]["speed"] == 0.25)
-        page.pull_until(lambda _: not page.state["replay"]["loop"])
+        page.pull_until(lambda _: page.replays[0]["speed"] == 0.25)
+        page.pull_until(lambda _: not page.replays[0]["loop"])
         page.say("replay", action="speed", value=-1)
         assert "above 0" in page.pull_until(lambda turn: "error" in turn)["error"]
         page.say("replay", action="resume")
-        page.pull_until(lambda _: not (page.state["replay"] or {}).get("paused"))
+        page.pull_until(lambda _: not page.replays[0]["paused"])
     with publishing(FakeSkin("torso", fake_structure(1, 2))), serving() as url, page_of(url) as page:
         for _ in range(20):
             page.pull()
-        assert page.state["replay"] is None
+        assert page.replays == []
 
 
 def test_a_driver_that_lives_is_no_replay(serving: Serve) -> None:
@@ -71,4 +71,4 @@ def test_a_driver_that_lives_is_no_replay(serving: Serve) -> None:
         assert page.pull_until(lambda turn: "error" in turn)["error"] == "no replay is shown"
         page.state = {}
         page.pull_until(lambda _: page.state)
-        assert page.state["replay"] is None
+        assert page.replays == []

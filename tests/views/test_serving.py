@@ -282,5 +282,5 @@ def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
         lost = next(problem for problem in page.state["problems"] if "frames dropped" in problem["text"])
         assert set(lost) == {"severity", "driver", "text", "since_ns"}  # of none alone
         assert 0 < int(lost["since_ns"]) <= now_ns()
-        assert (page.state["recording"], page.state["replay"]) == (None, None)
+        assert (page.state["recording"], page.replays) == (None, [])
         assert json.dumps(page.state)

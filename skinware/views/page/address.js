@@ -4,7 +4,7 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `shifts` (by which drivers are moved, by their keys), `selected` (key of a row or null), `pins` (texts), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
+ *     null), `shifts` (by which drivers are moved, by their keys), `selected` (key of a row or null), `pins` (texts), `times` (s, of each recording), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
  *     left out.
  */
 export function toHash(view) {
@@ -16,6 +16,7 @@ export function toHash(view) {
   if (view.selected) parts.set("selected", view.selected);
   for (const pin of view.pins ?? []) parts.append("pin", pin);
   for (const [key, shift] of Object.entries(view.shifts ?? {})) parts.append("at", `${numbers(shift)},${key}`);
+  if (view.times) parts.set("t", view.times.map((time_s) => time_s.toFixed(3)).join(","));
   if (view.theme) parts.set("theme", view.theme);
   for (const how of ["normals", "flat", "sharp"]) if (view[how]) parts.set(how, "1");
   if (view.names === false) parts.set("names", "0");
@@ -44,6 +45,7 @@ export function fromHash(hash) {
     scale: list("scale", 2),
     selected: parts.get("selected"),
     pins: parts.getAll("pin"),
+    times: NUMBERS.test(parts.get("t") ?? "") ? parts.get("t").split(",").map(Number) : null,
     shifts: Object.fromEntries(shifts.filter(([key, shift]) => key && shift.every(Number.isFinite))),
     normals: parts.get("normals") === "1",
     names: parts.get("names") !== "0",

@@ -4,7 +4,7 @@ import { DIMMED, MARKS } from "./marks.js";
 import { ramp } from "./palette.js";
 
 /** @param {object} parts of main.js. */
-export function hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts, plotting }) {
+export function hooks({ skin, stage, tree, probes, names, rewind, replay, past, view, now, wipe, contacts, plotting }) {
   const pairOf = ({ sheet, i }) => [sheet.driver.id, sheet.index[i]];
   return {
     get connected() { return now.isAlive; },
@@ -27,6 +27,8 @@ export function hooks({ skin, stage, tree, probes, names, rewind, past, view, no
     get hovered() { return probes.hovered && pairOf(probes.hovered); },
     get pins() { return probes.pins.map(pairOf); },
     get untouched() { return wipe.progress?.untouched.map(pairOf) ?? []; },
+    get replays() { return replay.replays; },
+    get outlines() { return now.outlines; },
     get paused() { return rewind.isPaused; },
     get at_s() { return rewind.at_s; },
     get kept_bytes() { return past.bytes; },

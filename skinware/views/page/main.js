@@ -19,6 +19,7 @@ import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
 import { Plotting } from "./plotting.js";
 import { savePicture, showRecording } from "./keeping.js";
+import { Moments, onDrop, recordingsOf } from "./recordings.js";
 import { Probes } from "./probes.js";
 import { explained, Problems } from "./problems.js";
 import { sheetsOf, taxelsOf, typesOf, whyEmpty } from "./selection.js";
@@ -37,6 +38,7 @@ const FIGURES_EVERY_MS = 90; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
+const recordings = recordingsOf(location.search);
 const system = matchMedia("(prefers-color-scheme: light)");
 
 let wasPaused = false;
@@ -57,6 +59,7 @@ const now = {
   turn: 0,
   problems: [],
   recording: null,
+  outlines: [],
   figures_ms: 0, // when figures were brought up to date
 };
 
@@ -117,7 +120,9 @@ const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: by
   show();
   showFigures();
 });
-const replay = new ReplayControls(byId("replay"), (action, value) => send({ op: "replay", action, value }));
+const act = (action, value, number = null) => send({ op: "replay", action, value, number });
+const replay = new ReplayControls(byId("replay"), act);
+const moments = new Moments(wanted.times, act);
 const modes = new Modes(byId("modes"), MODES, setMode);
 const wipe = new Wipe(byId("wipe"), {
   start: () => send({ op: "wipe", action: "start" }),
@@ -129,6 +134,7 @@ const wipe = new Wipe(byId("wipe"), {
 /** A connection counts from its first turn; until then the picture stays old. */
 function connected() {
   now.isAlive = false;
+  moments.connected();
   sendLook();
 }
 
@@ -157,6 +163,7 @@ function turn(message) {
   now.turn = header.turn;
   if (header.error) notify(header.error);
   if (skin.take(header, taken.blob)) restructured();
+  if (header.replays || header.outlines) takeReplays(header);
   if (header.state) takeState(header.state);
   probes.take(header);
   plotting.take(taken);
@@ -201,8 +208,16 @@ function takeState(state) {
   plotting.takeState(state);
   tree.update(skin, states);
   list.update(now.problems, plotting.now_ns);
-  replay.update(state.replay);
   showRecording(byId("record"), now.recording);
+}
+
+function takeReplays({ replays = replay.replays, outlines = now.outlines }) {
+  now.outlines = outlines;
+  const wasPaused = replay.isPaused;
+  replay.update(replays, outlines);
+  if (replays.length && replay.isPaused !== wasPaused) plotting.strips.freeze(replay.isPaused);
+  setHidden(byId("rewind"), replays.length > 0);
+  if (moments.take(replays)) keep();
 }
 
 function remember(pictures) {
@@ -428,6 +443,7 @@ function keep() {
       camera: { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() },
       selected: tree.selected,
       pins: probes.keys,
+      times: recordings.length ? moments.times_s : null,
       shifts: Object.fromEntries([...skin.drivers.values()].filter(({ shift }) => shift.some(Boolean)).map(({ key, shift }) => [key, shift])),
       theme: view.isThemeChosen ? view.theme : null,
     });
@@ -463,17 +479,22 @@ for (const [id, action] of Object.entries(clicks)) byId(id).addEventListener("cl
 byId("types").addEventListener("change", (event) => setType(event.target.value));
 system.addEventListener("change", () => view.isThemeChosen || setTheme(system.matches ? "light" : "dark", false));
 useTabs(byId("tabs"));
+onDrop(notify);
+if (recordings.length) {
+  document.title = `${recordings.join(", ")} – skin-view`;
+  for (const id of ["record", "rewind"]) setHidden(byId(id), true);
+}
 onKeys({
   ...Object.fromEntries(Object.keys(MODES).map((mode, i) => [String(i + 1), () => setMode(mode)])),
   t: nextType,
   b: clicks.tare,
   w: () => (view.mode === "wipe" ? wipe.toggle() : setMode("wipe")),
   l: () => view.mode === "wipe" && wipe.save(),
-  " ": () => rewind.toggle(),
+  " ": () => (replay.replays.length ? replay : rewind).toggle(),
   ",": () => replay.step(-1),
   ".": () => replay.step(1),
-  "[": () => rewind.scroll(rewind.at_s - SCROLL_S),
-  "]": () => rewind.isPaused && rewind.scroll(rewind.at_s + SCROLL_S),
+  "[": () => (replay.replays.length ? replay.scroll(-SCROLL_S) : rewind.scroll(rewind.at_s - SCROLL_S)),
+  "]": () => (replay.replays.length ? replay.scroll(SCROLL_S) : rewind.isPaused && rewind.scroll(rewind.at_s + SCROLL_S)),
   r: clicks.record,
   s: clicks.picture,
   S: () => picture("svg"),
@@ -508,7 +529,7 @@ onKeys({
   "?": clicks.help,
 });
 
-window.skin = hooks({ skin, stage, tree, probes, names, rewind, past, view, now, wipe, contacts, plotting });
+window.skin = hooks({ skin, stage, tree, probes, names, rewind, replay, past, view, now, wipe, contacts, plotting });
 setTheme(view.theme, false);
 look();
 addEventListener("hashchange", () => location.reload()); // another address was typed

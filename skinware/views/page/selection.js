@@ -41,7 +41,9 @@ export function whyEmpty(skin, row, { type, mode }, sheets) {
   return { text: `${name} has no ${type ?? "sensors of this kind"}.`, advice: `It has ${types.join(", ")}: choose one with t.`, command: "" };
 }
 
-function noDriver({ names, namespaces }) {
+function noDriver({ names, namespaces, recordings }) {
+  if (recordings.length) return { text: `No driver is recorded at this moment of ${recordings.join(", ")}.`, advice: "", command: "" };
+  if (!namespaces.length) return { text: "This recording cannot be shown: the reason is beside.", advice: "", command: "" };
   const [namespace = "default"] = namespaces;
   const who = names.length ? `None of the drivers ${names.join(", ")} runs` : "No driver runs";
   const where = namespace === "default" ? "" : ` --namespace ${namespace}`;

@@ -131,6 +131,7 @@ export class Skin {
   links = [];
   namespaces = [];
   names = []; // of the drivers that are followed; empty: all
+  recordings = []; // titles of those that are shown; empty: drivers are live
   isPosed = false; // a file says where coordinate frames are
   mode = "raw"; // of the newest pictures
   shifts = {}; // of drivers that a person moved, by key
@@ -143,6 +144,7 @@ export class Skin {
     if (header.skin) {
       this.namespaces = header.skin.namespaces ?? [];
       this.names = header.skin.names ?? [];
+      this.recordings = header.skin.recordings ?? [];
       this.isPosed = header.skin.posed ?? false;
       for (const { key, shift } of this.drivers.values()) if (shift.some(Boolean)) this.shifts[key] = shift;
       this.links = header.skin.links ?? [];

@@ -1,7 +1,8 @@
-// Time: pause, 30 s to scroll back, and the controls of a replay.
+// Time: pause, 30 s to scroll back, and the controls of recordings.
 
-import { h, setHidden, setPressed, setText } from "./dom.js";
+import { h, setChildren, setHidden, setPressed, setText } from "./dom.js";
 import { clock } from "./format.js";
+import { Timeline } from "./timeline.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 
@@ -55,45 +56,82 @@ export class Rewind {
   }
 }
 
-/** The controls of a replay, where what is shown is one. */
+/** The controls of the recordings that are shown; all go together, unless one is moved on its timeline with shift. */
 export class ReplayControls {
-  /** @param {(action: string, value: ?(number | boolean)) => void} act */
+  #rows = []; // a timeline and a clock of each
+  #from_s = []; // times at the begin of a drag
+
+  /** @param {(action: string, value: ?(number | boolean), number: ?number) => void} act */
   constructor(host, act) {
     this.host = host;
     this.act = act;
+    this.replays = [];
     const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
-    const toggle = () => act(this.replay.paused ? "resume" : "pause", null);
-    this.play = button("Pause", "Stop or go on with the replay", toggle);
-    this.back = button("Back", "One frame back (,)", () => this.step(-1));
-    this.on = button("Step", "One frame on (.)", () => this.step(1));
-    this.slider = h("input", { type: "range", min: 0, step: 0.1, "aria-label": "Time in the recording, seconds" });
-    this.slider.addEventListener("change", () => act("seek", Number(this.slider.value)));
+    this.play = button("Pause", "Stop or go on (space)", () => this.toggle());
+    this.back = button("Back", "One sample back (,)", () => this.step(-1));
+    this.on = button("Step", "One sample on (.)", () => this.step(1));
     this.speed = h("select", { "aria-label": "Speed" }, ...SPEEDS.map((x) => h("option", { value: x }, `${x}×`)));
     this.speed.addEventListener("change", () => act("speed", Number(this.speed.value)));
-    this.loop = button("Loop", "Begin again at the end", () => act("loop", !this.replay.loop));
-    this.when = h("output");
-    const { play, back, on, slider, when, speed, loop } = this;
-    host.append(h("span", { class: "name" }, "Replay"), play, back, on, slider, when, speed, loop);
+    this.loop = button("Loop", "Begin again at the end", () => act("loop", !this.replays[0].loop));
+    this.list = h("div", { class: "timelines" });
+    host.append(this.play, this.back, this.on, this.speed, this.loop, this.list);
   }
 
-  /** Go so many frames on, or back. */
-  step(frames) {
-    if (this.replay) this.act("step", frames);
+  get isPaused() {
+    return this.replays.every(({ paused }) => paused);
   }
 
-  update(replay) {
-    setHidden(this.host, !replay);
-    this.replay = replay;
-    if (!replay) return;
-    setText(this.play, replay.paused ? "Play" : "Pause");
-    setPressed(this.loop, Boolean(replay.loop));
-    this.slider.max = replay.duration_s;
-    if (!this.slider.matches(":active")) this.slider.value = replay.time_s;
-    if (![...this.speed.options].some(({ value }) => Number(value) === replay.speed)) {
-      this.speed.append(h("option", { value: replay.speed }, `${replay.speed}×`));
+  /** Pause or go on; at the end, begin again. */
+  toggle() {
+    if (this.replays.every(({ time_s, duration_s }) => time_s >= duration_s)) this.act("seek", 0);
+    this.act(this.isPaused ? "resume" : "pause", null);
+  }
+
+  /** Go so many samples on, or back. */
+  step(samples) {
+    if (this.replays.length) this.act("step", samples);
+  }
+
+  /** Go so far on, or back. */
+  scroll(by_s) {
+    this.#seek(0, this.replays[0].time_s + by_s);
+  }
+
+  /** @param {object} how `alone`: the others stay; `goesOn`: a drag, in which their distances stay. */
+  #seek(number, time_s, { alone = false, goesOn = false } = {}) {
+    if (!goesOn) this.#from_s = this.replays.map((replay) => replay.time_s);
+    const by_s = time_s - this.#from_s[number];
+    this.replays.forEach(({ duration_s }, i) => {
+      if (!alone || i === number) this.act("seek", Math.max(0, Math.min(duration_s, this.#from_s[i] + by_s)), i);
+    });
+  }
+
+  update(replays, outlines) {
+    setHidden(this.host, !replays.length);
+    this.replays = replays;
+    if (!replays.length) return;
+    while (this.#rows.length < replays.length) this.#rows.push(this.#row(this.#rows.length));
+    this.#rows.length = replays.length;
+    setChildren(this.list, this.#rows.map(({ row }) => row));
+    setText(this.play, this.isPaused ? "Play" : "Pause");
+    const [{ speed, loop }] = replays;
+    setPressed(this.loop, Boolean(loop));
+    if (![...this.speed.options].some(({ value }) => Number(value) === speed)) {
+      this.speed.append(h("option", { value: speed }, `${speed}×`));
     }
-    if (document.activeElement !== this.speed) this.speed.value = String(replay.speed);
-    setText(this.when, `${clock(replay.time_s)} of ${clock(replay.duration_s)}`);
-    this.host.title = replay.file ?? "";
+    if (document.activeElement !== this.speed) this.speed.value = String(speed);
+    replays.forEach((replay, i) => {
+      const { row, name, timeline, when } = this.#rows[i];
+      setText(name, replay.title ?? "Replay");
+      setText(when, `${clock(replay.time_s)} of ${clock(replay.duration_s)}`);
+      row.title = replay.file ?? "";
+      timeline.update(replay, outlines[i] ?? {});
+    });
+  }
+
+  #row(number) {
+    const timeline = new Timeline((time_s, how) => this.#seek(number, time_s, how));
+    const [name, when] = [h("span", { class: "name" }), h("output")];
+    return { timeline, name, when, row: h("div", { class: "past" }, name, timeline.element, when) };
   }
 }

@@ -55,7 +55,6 @@ export class Tree {
 
   update(skin, states) {
     this.branches = rowsOf(skin.drivers.values(), states);
-    this.severalNamespaces = new Set([...skin.drivers.values()].map(({ namespace }) => namespace)).size > 1;
     this.draw();
   }
 
@@ -117,7 +116,7 @@ export class Tree {
     setText(sign, SIGNS[own]);
     element.dataset.bad = own;
     element.dataset.fresh = String(isFresh(row));
-    setText(name, row.level === 1 && this.severalNamespaces ? `${row.name} · ${row.driver.namespace}` : row.name);
+    setText(name, row.name);
     setText(state, own ? [row.report.shown ?? row.report.state, row.report.reason].filter(Boolean).join(": ") : "");
     const texts = figuresOf(row);
     while (figures.children.length < texts.length) figures.append(h("span"));

@@ -166,27 +166,28 @@ class SpecifiedBaseline:
             patch: only of this one.
 
         Returns:
-            The number of those taxels.
+            The number of taxels that were tared.
 
         Raises:
-            ConfigurationError: no value has come yet; or these values have no steps, and their noise is not known yet.
+            ConfigurationError: too few values have come yet.
         """
-        taxels = self._intake.seen.copy()
+        seen = self._intake.seen.copy()
         if patch is not None:
-            taxels &= self._offsets.patches.group == patch
-        if not taxels.any():
+            seen &= self._offsets.patches.group == patch
+        known, level, noise2 = self._rest.now()
+        level = np.where(known, level, self._intake.last)
+        noise2 = np.where(known, noise2, np.float32(self._minimum_on) ** 2)
+        taxels = seen & (self._ready | (noise2 > 0) | (self._minimum_on > 0))
+        if not seen.any():
             raise ConfigurationError("nothing to tare: no value has come yet")
-        if self._minimum_on == 0 and not self._ready[taxels].all():
-            raise ConfigurationError("the noise is not known yet: wait until it is measured, or set minimum_on")
-        rows = np.flatnonzero(taxels)
-        fresh = rows[~self._ready[rows]]
-        self._offsets.noise2[fresh] = self._least_noise2(self._intake.last[fresh])
+        if not taxels.any():
+            raise ConfigurationError("nothing to tare: the noise is known after four values; try again in a moment")
+        fresh, rows = np.flatnonzero(taxels & ~self._ready), np.flatnonzero(taxels)
+        self._offsets.noise2[fresh] = np.maximum(noise2[fresh], self._least_noise2(level[fresh]))
         self._offsets.noise_s[fresh] = 0
+        now = np.where(self._ready, self._offsets.level + self._touches.smooth, level)
         self._ready |= taxels
-        now = self._intake.last[rows]
-        known = np.isfinite(self._offsets.level[rows]) & ~np.isin(rows, fresh)
-        now = np.where(known, self._offsets.level[rows] + self._touches.smooth[rows], now)
-        self._offsets.put(rows, now)
+        self._offsets.put(rows, now[rows])
         self._touches.forget(rows)
         self._surroundings.forget(taxels)
         self._forced |= taxels

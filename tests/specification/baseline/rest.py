@@ -122,6 +122,21 @@ class Rest:
         self._begun_ns, self._frames = time_ns, 0
         return len(self._blocks) == BLOCKS
 
+    def now(self) -> tuple[Flags, Floats, Floats]:
+        """Where there are enough values for it: what each taxel reads now, and the square of its noise."""
+        n = len(self._first)
+        known, level, typical = np.zeros(n, bool), np.zeros(n, np.float32), np.ones(n, np.float32)
+        parts = [*self._blocks, *([self._sums] if self._frames else [])][-int(BLOCKS) :]
+        noises2 = np.full((len(parts), n), np.nan, np.float32)
+        for noise2, sums in zip(noises2, parts, strict=True):
+            of = sums[0] >= BLOCK_FRAMES
+            count, d, c, dd, dc, cc = sums[:, of]
+            level[of] = self._first[of] + self._patches.spread(self._common)[of] + (d - c) / count
+            noise2[of] = (dd - 2 * dc + cc - (d - c) * (d - c) / count) / (count - 1)
+            typical[of] = [_MEDIAN_OF_VARIANCE.get(int(each), 1.0) for each in count]
+            known |= of
+        return known, level, np.maximum(_median(noises2) / typical, 0) if parts else level
+
     def _result(self, taxels: Rows) -> tuple[Floats, Measured, Floats]:
         """Levels, NaN without enough data; what was measured; and how far each moved from tenth to tenth."""
         blocks = np.array([block[:, taxels] for block in self._blocks])

@@ -1,0 +1,102 @@
+"""Recordings in the page: its moments by an address, beside each other, and files that are dropped on it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+from playwright.sync_api import Page
+
+from skinware.memory.namespace import Namespace
+from skinware.recording.files import Files
+from skinware.recording.recorder import Recorder
+from skinware_drivers.testing.waiting import wait_until
+from tests.browser.browsing import RAW_SCALE, level, look, places, role, tell, until, viewing
+from tests.browser.sleeve import Sleeve
+from tests.cli.fake_skin import publishing
+
+OpenPage = Callable[..., Page]
+FRAMES, LENGTH_S = 30, 1.5
+DROP = """([files, of]) => {
+    const dropped = new DataTransfer();
+    for (const [name, size] of files) dropped.items.add(new File([new Uint8Array(size)], name));
+    document.dispatchEvent(new DragEvent("drop", { dataTransfer: dropped, bubbles: true, cancelable: true }));
+}"""
+
+
+@pytest.fixture
+def recording(namespace: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A sleeve whose first taxel is pressed at the begin, and its last one at the end."""
+    monkeypatch.chdir(tmp_path)
+    file = Path("walk.mcap")
+    with publishing(Sleeve(), 50) as skin:
+        assert isinstance(skin, Sleeve)
+        skin.press(int(skin.taxels[0]))
+        recorder = Recorder(Files(file))
+        running = threading.Thread(target=recorder.run, args=(LENGTH_S,))
+        running.start()
+        wait_until(lambda: skin.writer.sequence > FRAMES)
+        skin.press(int(skin.taxels[-1]))
+        running.join()
+    return file
+
+
+@pytest.fixture
+def address(recording: Path) -> Iterator[str]:
+    """Of the page of the recording; it outlives all pages."""
+    with viewing(str(recording)) as (_, url):
+        yield url
+
+
+def drop(page: Page, *files: tuple[str, int]) -> None:
+    page.evaluate(DROP, [files, None])
+
+
+def times(page: Page) -> list[float]:
+    found: list[float] = tell(page, "skin.replays.map(({ time_s }) => time_s)")
+    return found
+
+
+def test_a_link_leads_to_a_moment(address: str, open_page: OpenPage) -> None:
+    skin = Sleeve("unused")
+    first, last = int(skin.taxels[0]), int(skin.taxels[-1])
+    skin.close()
+    page = open_page(f"{address}#{RAW_SCALE}&t=0.200")
+    until(page, f"{level(first)} > 190 && {level(last)} < 20 && skin.replays[0].paused")
+    x, y = (int(at) for at in places(page, [first])[0])
+    pressed = look(page, x - 2, y - 2, x + 3, y + 3).mean()
+    assert times(page) == [0.2]
+    page.locator(role("replay")).get_by_role("slider").press("End")
+    until(page, f"{level(last)} > 190 && {level(first)} < 20")
+    assert abs(look(page, x - 2, y - 2, x + 3, y + 3).mean() - pressed) > 40
+    until(page, "location.hash.includes('t=' + skin.replays[0].time_s.toFixed(3))")
+    other = open_page(page.url)
+    until(other, f"{level(last)} > 190 && skin.replays[0].time_s > 1")
+    page.keyboard.press(" ")
+    until(page, f"!skin.replays[0].paused && {level(first)} > 190")
+    assert tell(page, "skin.drivers[0].state") == "live"
+    until(page, "skin.outlines[0].samples?.length > 3")
+
+
+def test_dropped_files_are_found_or_asked_for(address: str, recording: Path, open_page: OpenPage) -> None:
+    Path("again.mcap").write_bytes(recording.read_bytes())
+    size = recording.stat().st_size
+    page = open_page(address.partition("?")[0])
+    until(page, "skin.connected")
+    drop(page, ("notes.txt", 5))
+    until(page, "document.getElementById('notice').textContent.includes('no recording')")
+    drop(page, (recording.name, size + 1))  # another file of this name
+    until(page, "document.getElementById('notice').textContent.includes('skin-view walk.mcap')")
+    drop(page, (recording.name, size))
+    until(page, "window.skin?.replays.length === 1 && skin.drivers.length === 1")
+    drop(page, ("again.mcap", size))
+    until(page, "window.skin?.replays.length === 2 && skin.drivers.length === 2")
+    assert parse_qs(urlsplit(page.url).query)["recording"] == ["walk.mcap", "again.mcap"]
+    assert tell(page, "skin.drivers.map(({ name }) => name)") == ["sleeve (walk)", "sleeve (again)"]
+    sides = [tell(page, "a[0].map(p => skin.pixelOf(skin.drivers[a[1]].id, p)[0])", [0, 1, 5, 600], i) for i in (0, 1)]
+    left, right = sorted(sides)  # by the names of their drivers
+    assert max(left) < min(right)
+    assert not page.locator(role("record")).is_visible()

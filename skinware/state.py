@@ -117,7 +117,7 @@ class DriverReport:
 
     @property
     def state(self) -> str:
-        """What it is doing, for people: nothing without a fresh sensor is called live."""
+        """Its state for people: nothing without a fresh sensor is called live."""
         if self.age_ns is None:
             return self.life
         return state_shown(self.life, self.fresh, self.sensors, self.statuses.get("settling", 0))

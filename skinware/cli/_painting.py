@@ -289,7 +289,7 @@ def marks_text(marks: npt.NDArray[np.uint8], reasons: Mapping[str, int], palette
     return text
 
 
-class Lines(ScrollView, can_focus=False):
+class TextLines(ScrollView, can_focus=False):
     """Lines of which only those that changed are made again.
 
     They have all their colours: what Textual does for lines of any widget costs more than making them.
@@ -335,7 +335,7 @@ class Lines(ScrollView, can_focus=False):
         return Style.null() if self.app.no_color else _GROUND_STYLE
 
 
-class HeatMap(Lines):
+class HeatMap(TextLines):
     """A picture in the colours of a palette."""
 
     class Pointed(Message):

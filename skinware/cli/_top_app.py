@@ -202,7 +202,7 @@ class SkinTop(App[None]):
         self._picture.take_baselines()
         self._must_draw = True
 
-    def on_driver_list_chosen(self) -> None:
+    def on_driver_list_row_chosen(self) -> None:
         self._pointed = None
         self._must_draw = True
 

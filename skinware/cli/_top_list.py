@@ -9,7 +9,7 @@ from textual.geometry import Region
 from textual.message import Message
 from textual.strip import Strip
 
-from skinware.cli._painting import Lines
+from skinware.cli._painting import TextLines
 from skinware.cli._top_rows import COLUMNS, DRIVER, ListRow, RowKey
 from skinware.state import GOOD
 from skinware.text import printable
@@ -22,7 +22,7 @@ _MOST_WANTED = (1, 4, 2, 3, 5, 6, 7)
 _LEAST_NAME, _LEAST_OTHERS, _GAP = 16, 20, 2
 _FINE, _PARTLY = "#6cc070", "#e6c440"
 _COLOURS = (_PARTLY, "#5fb3d9", "#e68a3c", "#e8453c")
-"""Of states, by how bad they are; a good one is ``_FINE`` where all sensors are fresh."""
+"""Colours of states, by how bad they are; a good one is ``_FINE`` where all sensors are fresh."""
 
 
 def room_for(width: int) -> dict[int, int]:
@@ -39,7 +39,7 @@ def room_for(width: int) -> dict[int, int]:
     return dict(sorted(found.items()))
 
 
-class DriverList(Lines):
+class DriverList(TextLines):
     """Rows under their titles. The row that a person chose stays chosen, wherever it is, and when it comes back.
 
     Attributes:
@@ -47,7 +47,7 @@ class DriverList(Lines):
         cursor: number of the chosen row.
     """
 
-    class Chosen(Message):
+    class RowChosen(Message):
         """Another row is chosen."""
 
     def __init__(self, *, id: str) -> None:  # noqa: A002 - Textual's name
@@ -89,7 +89,7 @@ class DriverList(Lines):
         self.changed((1 + before, 1 + at))
         seen, top = max(1, self.size.height - 1), self.scroll_offset.y
         self.scroll_to(y=max(min(top, at), at - seen + 1), animate=False)
-        self.post_message(self.Chosen())
+        self.post_message(self.RowChosen())
 
     def on_click(self, event: events.Click) -> None:
         if event.y:

@@ -130,7 +130,8 @@ def test_every_status_has_the_mark_that_says_most(tell: Callable[..., Any]) -> N
         "suspect",
         "unhealthy",
     ]
-    assert names[255] == "not connected"
+    assert names[254] == "not connected"
+    assert names[255] == "settling"
     assert names[2 | 4] == "stale"
     assert tell("marks.js", "m.statusText(6)") == "stale, out of range"
 

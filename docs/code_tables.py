@@ -1,7 +1,8 @@
-"""Directives for tables that the code already has: ``settings CLASS``, ``members ENUM`` and ``columns SOURCE``.
+"""Directives for tables that the code already has: ``settings``, ``members``, ``columns`` and ``catalogue``.
 
-``settings`` shows the fields of a class with their defaults, ``members`` the members of an enumeration, ``columns`` the
-columns of a service, from the source of its values.
+``settings CLASS`` shows the fields of a class with their defaults, ``members ENUM`` the members of an enumeration,
+``columns SOURCE`` the columns of a service, from the source of its values, ``catalogue NAME`` the sensor types of a
+dictionary.
 """
 
 from __future__ import annotations
@@ -57,6 +58,13 @@ def columns(service: str) -> Iterator[str]:
         yield f"| `{name}` | {_form(column)} | {column.unit} | {column.description} |"
 
 
+def catalogue(name: str) -> Iterator[str]:
+    """Yield the lines of a table of sensor types."""
+    yield from ("| number | name | unit |", "|---|---|---|")
+    for one in _named(name).values():
+        yield f"| {one.id} | `{one.name}` | {one.unit} |"
+
+
 def _shown(default: Any) -> str:
     return "" if default is MISSING else f"{default:g}" if isinstance(default, float) else str(default)
 
@@ -65,10 +73,9 @@ def _form(column: Column) -> str:
     return f"{column.dtype} {column.shape[1:]}" if column.shape[1:] else str(column.dtype)
 
 
-def _named(name: str) -> type:
-    module, _, cls = name.rpartition(".")
-    found: type = getattr(import_module(module), cls)
-    return found
+def _named(name: str) -> Any:
+    module, _, own = name.rpartition(".")
+    return getattr(import_module(module), own)
 
 
 def _defaults(cls: type) -> dict[str, Any]:
@@ -77,13 +84,16 @@ def _defaults(cls: type) -> dict[str, Any]:
     return {field.name: field.default for field in msgspec.structs.fields(cls)}
 
 
+TABLES = {"settings": settings, "members": members, "columns": columns, "catalogue": catalogue}
+
+
 class CodeTable(SphinxDirective):
     """Show the table of this directive's name."""
 
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        lines = {"settings": settings, "members": members, "columns": columns}[self.name](self.arguments[0])
+        lines = TABLES[self.name](self.arguments[0])
         found = nodes.container()
         rows = StringList(list(lines), source=self.get_source_info()[0])
         self.state.nested_parse(rows, self.content_offset, found)
@@ -91,6 +101,6 @@ class CodeTable(SphinxDirective):
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    for name in ("settings", "members", "columns"):
+    for name in TABLES:
         app.add_directive(name, CodeTable)
     return {"parallel_read_safe": True}

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware import DriverReader, DriverWriter, ServiceWriter, Status, get_include
+from skinware import BusReason, BusState, DriverReader, DriverWriter, ServiceWriter, Status, get_include
 from tests.compiling import LANGUAGES, compiled
 from tests.core.c_programs import SOURCE, Talk, ended, run, structure, write_flat_out
 from tests.core.workers import PROCESSES, running
@@ -51,10 +51,11 @@ def test_the_header_needs_nothing_and_warns_of_nothing(
     subprocess.run([str(tmp_path / "user")], check=True)
 
 
-def test_the_header_has_the_bits_of_a_status() -> None:
+def test_the_header_has_the_numbers_of_status_and_buses() -> None:
     text = Path(get_include(), "skinware.h").read_text()
-    bits = re.findall(r"#define SKINWARE_STATUS_(\w+) (\d+)u ", text)
-    assert {name: int(value) for name, value in bits} == {bit.name: int(bit) for bit in Status}
+    for prefix, kind in (("STATUS", Status), ("BUS_REASON", BusReason), ("BUS", BusState)):
+        found = re.findall(rf"#define SKINWARE_{prefix}_((?!REASON_)\w+) (\d+)u", text)
+        assert {name: int(value) for name, value in found} == {m.name: m.value for m in kind}
 
 
 @pytest.mark.thorough

@@ -1,7 +1,7 @@
 """The directive ``json-fields CLASS PREFIX -FIELD``: the keys of a printed object, from its class and the docstrings.
 
 ``{json-fields} skinware_drivers.finding.ports.SerialPort ports[].`` is a table of its fields as keys ``ports[].path``
-..., with their types in JSON. Fields with a ``-`` are left out.
+..., with their types in JSON; an array stands for one of its elements. Fields with a ``-`` are left out.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
@@ -58,6 +59,9 @@ def _json_type(key: str, hint: Any) -> tuple[str, str, type | None]:
         (one,) = (part for part in get_args(hint) if part is not type(None))
         key, kind, inner = _json_type(key, one)
         return key, f"{kind or 'object'} or null", inner
+    if get_origin(hint) is np.ndarray:  # one element of it
+        element = get_args(get_args(hint)[1])[0]
+        return key, "number or null" if issubclass(element, np.floating) else "integer", None
     if get_origin(hint) in (list, tuple):
         return _json_type(f"{key}[]", get_args(hint)[0])
     if get_origin(hint) is dict:
@@ -84,7 +88,8 @@ def meanings(cls: type) -> dict[str, str]:
 
 
 def _as_markdown(text: str) -> str:
-    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", " ".join(text.split())).replace("``", "`").replace("|", "\\|")
+    text = re.sub(r"^\([\w, ]+\) \w+, ", "", " ".join(text.split()))  # shape and dtype
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`").replace("|", "\\|")
     return re.sub(r"\b(None|True|False)\b", lambda match: {"None": "null"}.get(match[1], match[1].lower()), text)
 
 

@@ -191,7 +191,8 @@ class ShownDriver:
             self.rest = DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
-        self.newest = self._judged(frame)
+        at_ns = None if self.origin.recording is None else frame.published_ns  # it may have been paused meanwhile
+        self.newest = self._judged(frame, status_now(LIVE, frame, at_ns))
         self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
         self.changes += 1
 
@@ -202,9 +203,8 @@ class ShownDriver:
             return
         before_life, life = self.life, life_of(self.live.reader, before.frame)
         stands_still = self._stands_still(life)
-        if not stands_still:
-            self.life = life
-        self.newest = self._judged(before.frame, before.status if stands_still else None)
+        self.life = before_life if stands_still else life
+        self.newest = self._judged(before.frame, before.status if stands_still else status_now(life, before.frame))
         if (
             self.life != before_life
             or not np.array_equal(self.newest.status, before.status)
@@ -212,16 +212,14 @@ class ShownDriver:
         ):
             self.changes += 1
 
-    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8] | None = None) -> Newest:
+    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8]) -> Newest:
         self._judged_ns = now_ns()
         services, name = self.origin.services, self.live.name
         calm = services.calm_of(name)
         if calm is not None and not self._fits(calm.structure):
             calm = None
-        if status is None:
-            status = status_now(self.life, frame)
-            if calm is not None:
-                status = status | (calm.status & _UNHEALTHY)
+        if calm is not None:
+            status = status | (calm.status & _UNHEALTHY)
         return Newest(frame, status, calm, services.contacts_of(name), services.motion_of(name))
 
     def _fits(self, calm: Structure) -> bool:

@@ -10,7 +10,7 @@ export class Plotting {
 
   /**
    * @param {HTMLElement} host
-   * @param {object} parts `send(op)`, `skin`, `probes`, `stage`, `rewind`, `notify(text)`.
+   * @param {object} parts `send(op)`, `skin`, `probes`, `stage`, `rewind`, `notify(text)`, `keep()`.
    */
   constructor(host, parts) {
     Object.assign(this, parts);
@@ -23,7 +23,10 @@ export class Plotting {
       marks: () => this.marks,
       moment_s: () => (this.rewind.isPaused ? this.rewind.at_s : null),
       footer: (lines, time_ns) => this.footer(lines.map(driverOf), time_ns),
-      changed: () => this.ask(),
+      changed: () => {
+        this.ask();
+        this.keep();
+      },
       refuse: this.notify,
       find: () => this.#dragged,
     });

@@ -113,6 +113,11 @@ class DriverSnapshot(Sample):
         return self._optional("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
 
     @property
+    def why(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8: a :class:`skinware.status.Why` for each; 0 for a driver that is not calmed."""
+        return self._optional("why", (self.structure.n_sensors,), np.uint8)
+
+    @property
     def latency_ns(self) -> int:
         """The longest that frames on a bus wait so that more are taken with them, ns; 0: not at all, or not known."""
         return int(self._optional("latency_ns", (1,), np.int64)[0])

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, BusReason, BusState, PatchState, Status, is_fresh
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, BusReason, BusState, PatchState, Status, Why, is_fresh
+from skinware.text import NOT_FRESH, state_shown
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 LIVE, SILENT, PAUSED, STARTING, DEAD = "live", "silent", "paused", "starting", "dead"
 WITHOUT_NEWS = (SILENT, PAUSED, DEAD)
 """States of a driver in which nothing in its newest snapshot is fresh."""
+GOOD, ODD, OLD, GONE = range(4)
+"""How bad a state is; the worst are shown first."""
+_BAD = {LIVE: GOOD, "stale": OLD, SILENT: OLD, NOT_FRESH: OLD, "gone": GONE, "down": GONE, DEAD: GONE}
 
 _LEAST_SILENCE_NS = NS_PER_S
 _SILENT_PERIODS = 5
@@ -57,6 +61,7 @@ class PatchReport:
         bus: index of its bus.
         state: name of a :class:`skinware.status.PatchState`.
         sensors, fresh, untouched: number of all its sensors, of the fresh ones, and of those that were only 0 so far.
+        settling: number of those of a calmed driver that wait for their baselines.
         age_ns: age of its newest data; None if it never sent any.
         rate_hz: updates per second of its modules; None where that is not known.
         counters: all counters of the driver for this patch, by name.
@@ -68,6 +73,7 @@ class PatchReport:
     sensors: int
     fresh: int
     untouched: int
+    settling: int
     age_ns: int | None
     rate_hz: float | None
     counters: dict[str, int]
@@ -82,7 +88,8 @@ class DriverReport:
         rate_hz: snapshots per second now; None where that is not known yet.
         age_ns: age of its newest data; None before the first snapshot.
         statuses: number of sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``
-            counts those of modules that sent only 0 so far; they are fresh all the same.
+            counts those of modules that sent only 0 so far; they are fresh all the same. ``settling`` counts those of a
+            calmed driver that wait for their baselines; they are not among ``never_seen``.
         buses, patches: in the order of the structure; empty before the first snapshot and while the structure changes.
     """
 
@@ -107,6 +114,23 @@ class DriverReport:
             for name, count in counters.items():
                 sums[name] = sums.get(name, 0) + count
         return sums
+
+    @property
+    def state(self) -> str:
+        """Its state for people: nothing without a fresh sensor is called live."""
+        if self.age_ns is None:
+            return self.life
+        return state_shown(self.life, self.fresh, self.sensors, self.statuses.get("settling", 0))
+
+    def state_of(self, part: BusReport | PatchReport) -> str:
+        """Return the state of a bus or patch for people; ``was live`` where it is only the last one that is known."""
+        state = self.last(part.state)
+        return state if isinstance(part, BusReport) else state_shown(state, part.fresh, part.sensors, part.settling)
+
+    @property
+    def worst(self) -> int:
+        """How bad the worst state of the driver, its buses and its patches is."""
+        return max(map(badness, [self.state, *map(self.state_of, self.buses), *map(self.state_of, self.patches)]))
 
     @property
     def patch_states(self) -> dict[str, int]:
@@ -140,8 +164,10 @@ def report_of(
     if frame is None:
         return DriverReport(reader.name, life, rate_hz, None, reader.structure.n_sensors, {})
     status = status_now(life, frame) if status is None else status
-    structure, is_untouched = frame.structure, untouched(frame)
+    structure, is_untouched, is_settling = frame.structure, untouched(frame), settling(frame)
     statuses = count_statuses(status) | {"untouched": int(np.count_nonzero(is_untouched))}
+    statuses["settling"] = int(np.count_nonzero(is_settling))
+    statuses["never_seen"] -= statuses["settling"]
     report = DriverReport(reader.name, life, rate_hz, frame.age_ns, structure.n_sensors, statuses)
     if structure is not reader.structure and structure != reader.structure:
         return report
@@ -155,12 +181,13 @@ def report_of(
         )
         for bus, (load, counters) in enumerate(zip(frame.bus_load.tolist(), reader.bus_counters(frame), strict=True))
     )
-    sensors, fresh, dark = (
+    sensors, fresh, dark, waiting = (
         np.bincount(patches, minlength=structure.n_patches).tolist()
         for patches in (
             structure.sensor_patch,
             structure.sensor_patch[status == 0],
             structure.sensor_patch[is_untouched],
+            structure.sensor_patch[is_settling],
         )
     )
     rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
@@ -173,6 +200,7 @@ def report_of(
             sensors=sensors[patch],
             fresh=fresh[patch],
             untouched=dark[patch],
+            settling=waiting[patch],
             age_ns=ages_ns[patch],
             rate_hz=None if rates[patch] is None else rate_now_hz(life, rates[patch]),
             counters=counters,
@@ -224,6 +252,23 @@ def status_now(life: str, frame: DriverSnapshot, at_ns: int | None = None) -> np
 def untouched(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
     """Return (n_sensors,) bool: sensors of modules that sent only 0 so far; they are fresh all the same."""
     return frame.module_untouched[frame.structure.sensor_module]
+
+
+def count_reasons(why: npt.NDArray[np.uint8]) -> dict[str, int]:
+    """Return how many sensors there are for each reason, by its name in lower case; without reasons of none."""
+    counts = np.bincount(why, minlength=len(Why)).tolist()
+    return {reason.name.lower(): counts[reason] for reason in Why if counts[reason]}
+
+
+def settling(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
+    """Return (n_sensors,) bool: sensors of a calmed driver that were seen, and wait for their baselines."""
+    without: npt.NDArray[np.bool_] = (frame.why == Why.RELEARNING) & ((frame.status & np.uint8(Status.NEVER_SEEN)) != 0)
+    return without & (frame.sensor_time_ns > 0) if without.any() else without
+
+
+def badness(state: str) -> int:
+    """Return how bad the state of a driver, bus or patch is, from ``GOOD`` to ``GONE``."""
+    return OLD if state.startswith("was ") else _BAD.get(state, ODD)
 
 
 def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:

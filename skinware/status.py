@@ -77,6 +77,25 @@ class Status(enum.IntFlag):
     """The sensor has been stuck, noisy or dead for minutes, so its value is doubtful; skin-calm sets this bit."""
 
 
+class Why(enum.IntEnum):
+    """Why a taxel of a calmed driver is in its state."""
+
+    REST = 0
+    """It is at rest."""
+    HELD = 1
+    """It is touched; its offset is predicted, not measured."""
+    RELEARNING = 2
+    """Its offset is not known yet, or less well than its noise."""
+    COVERED = 3
+    """It is below its offset, which was learned under a load or before a cover sank nearby."""
+    DOUBTED = 4
+    """It falls and returns again and again where nothing touches: its polarity may be wrong."""
+    SATURATED = 5
+    """It is at the end of its range: it may bear more than it shows."""
+    NO_RESOLUTION = 6
+    """It has too few levels to show how strong a touch is."""
+
+
 class PatchState(enum.IntEnum):
     """State of a patch (microcontroller)."""
 

@@ -9,11 +9,13 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-from skinware.status import Status
+from skinware.status import Status, Why
 
 NO_VALUE = "-"
 NOT_FRESH = "not fresh"
 """Shown instead of ``live`` where frames arrive, but no sensor in them is fresh."""
+SETTLING = "settling"
+"""Shown instead of that where sensors wait for their baselines."""
 
 _BETWEEN = "  "
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -84,9 +86,15 @@ def status_text(status: int) -> str:
     return ", ".join(words(str(bit.name).lower()) for bit in Status if status & bit) or "fresh"
 
 
-def state_shown(state: str, fresh: int, sensors: int) -> str:
+def why_text(why: int) -> str:
+    """Return why a taxel of a calmed driver is in its state, in words; empty at rest."""
+    return words(Why(why).name.lower()) if 0 < why < len(Why) else ""
+
+
+def state_shown(state: str, fresh: int, sensors: int, settling: int = 0) -> str:
     """Return a state for people: nothing without a fresh sensor is called live."""
-    return NOT_FRESH if state == "live" and sensors and not fresh else state
+    without = SETTLING if settling else NOT_FRESH
+    return without if state == "live" and sensors and not fresh else state
 
 
 def counters_text(counters: dict[str, int], *, besides: Sequence[str] = ()) -> str:

@@ -19,7 +19,7 @@ from skinware.structure import Structure
 from skinware.views.scene import ModuleShape, rows_of, shape_of
 
 LEVELS = 16
-FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED = range(9)
+FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, SETTLING = range(10)
 FIRST_WITHOUT_VALUE = NO_ACK
 """From this mark on, the level means nothing and is not drawn."""
 BACKGROUND = 255
@@ -54,13 +54,17 @@ _MARK_BITS = (
     (OUT_OF_RANGE, Status.OUT_OF_RANGE),
 )
 """The marks of status bits; the first one wins where a sensor has several."""
+_MARK_OF = np.array([next((m for m, bit in _MARK_BITS if status & bit), FRESH) for status in range(256)], np.uint8)
 
 
-def marks_of(status: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return (n,) uint8, the mark of each sensor."""
-    marks = np.full(len(status), FRESH, np.uint8)
-    for mark, bit in reversed(_MARK_BITS):
-        marks[(status & np.uint8(bit)) != 0] = mark
+def marks_of(status: npt.NDArray[np.uint8], settling: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
+    """Return (n,) uint8, the mark of each sensor.
+
+    Args:
+        settling: (n,) bool: those never seen only as their baselines are not known yet.
+    """
+    marks: npt.NDArray[np.uint8] = _MARK_OF[status]
+    marks[settling & (marks == NEVER_SEEN)] = SETTLING
     return marks
 
 
@@ -160,7 +164,8 @@ def arrange(
 ) -> Arrangement:
     """Place the sensors of one type on some patches, module by module, as large as they fit.
 
-    A picture that does not fit at the smallest size is higher than ``height``, and is scrolled.
+    A picture that does not fit at the smallest size is higher than ``height``, and is scrolled; modules whose names are
+    words keep them then.
 
     Args:
         patches: to draw; several are drawn below each other with their names.
@@ -272,6 +277,7 @@ def _choose_grid(
     label_width = max(len(_short(label)) for label in labels)
     groups = _by_patch(blocks)
     longest = max(len(group) for group in groups)
+    named: _Grid | None = None
     sizes = [(zoom, head, False) for zoom, head in _SIZES if zoom >= smallest]
     for zoom, head, compact in [*sizes, (smallest, 0, True)]:
         shapes = {block.shape(compact) for block in blocks}
@@ -297,7 +303,9 @@ def _choose_grid(
             continue
         if fits and grid.lines(groups) <= height:
             return grid
-    return grid
+        if head and zoom == smallest and not all(_short(label).isdigit() for label in labels):
+            named = grid
+    return named or grid
 
 
 def _place(

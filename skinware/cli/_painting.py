@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TypeVar
@@ -15,14 +15,14 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 from textual import events
-from textual.geometry import Size
+from textual.geometry import Region, Size
 from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Arrangement, Label
-from skinware.text import figure_text, printable
+from skinware.text import SETTLING, figure_text, printable, words
 
 Colours = tuple[ColorTriplet, ...]
 _T = TypeVar("_T")
@@ -36,12 +36,14 @@ class Palette:
         ramp: one colour for each level.
         stale: the same for stale values: darker, or grey.
         no_value: colour of a sensor without a value.
+        settling: colour of a sensor whose baseline is not known yet.
         characters: one for each level where colours are not wanted, otherwise empty.
     """
 
     ramp: Colours
     stale: Colours
     no_value: ColorTriplet
+    settling: ColorTriplet
     characters: str = ""
 
 
@@ -117,21 +119,25 @@ TRUE_COLOURS = Palette(
     ramp=_VIRIDIS,
     stale=tuple(mixed(colour, _GROUND, 0.6) for colour in _VIRIDIS),
     no_value=ColorTriplet(74, 16, 16),
+    settling=ColorTriplet(40, 44, 52),
 )
 COLOURS_256 = Palette(
     ramp=_spread(_ansi((54, 24, 30, 36, 42, 149, 191, 227))),
     stale=_spread(_ansi((236, 238, 240, 242))),
     no_value=_ansi((52,))[0],
+    settling=_ansi((235,))[0],
 )
 COLOURS_16 = Palette(
     ramp=_spread([_BASIC[name] for name in ("blue", "bright blue", "cyan", "bright green", "bright yellow")]),
     stale=_spread([_BASIC["grey"], _BASIC["light grey"]]),
     no_value=_BASIC["red"],
+    settling=_BASIC["grey"],
 )
 CHARACTERS = Palette(
     ramp=TRUE_COLOURS.ramp,
     stale=TRUE_COLOURS.stale,
     no_value=TRUE_COLOURS.no_value,
+    settling=TRUE_COLOURS.settling,
     characters="".join(_spread("▁▂▃▄▅▆▇█")),
 )
 
@@ -146,6 +152,7 @@ MARK_CHARACTERS = {
     heat.MASKED: "-",
     heat.NEVER_SEEN: "·",
     heat.NOT_CONNECTED: "x",
+    heat.SETTLING: "~",
 }
 MARK_NAMES = {
     heat.STALE: "stale",
@@ -156,6 +163,7 @@ MARK_NAMES = {
     heat.MASKED: "switched off",
     heat.NEVER_SEEN: "never seen",
     heat.NOT_CONNECTED: "not connected",
+    heat.SETTLING: SETTLING,
 }
 
 
@@ -163,7 +171,7 @@ def colour_of(code: int, palette: Palette) -> ColorTriplet:
     """Return the colour of a sensor with this code where there is no room for its character."""
     mark, level = divmod(code, LEVELS)
     if mark >= heat.FIRST_WITHOUT_VALUE:
-        return palette.no_value
+        return palette.settling if mark == heat.SETTLING else palette.no_value
     return palette.stale[level] if mark == heat.STALE else palette.ramp[level]
 
 
@@ -184,20 +192,28 @@ def segments_of(
         lower: (columns,) uint8, codes of the pixels in the lower half.
     """
     pairs = upper.astype(np.uint16) << 8 | lower
-    edges = (np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist()
-    segments = []
-    for start, end in zip([0, *edges], [*edges, len(pairs)], strict=True):
-        character, style = _cell(int(pairs[start]), palette)
-        segments.append(Segment(character * (end - start), style))
+    segments: list[Segment] = []
+    text, style = "", _PLAIN
+    for pair in pairs.tolist():
+        character, own = _cell(pair, palette)
+        if own is not style and (character != " " or own.bgcolor != style.bgcolor):  # a blank has no ink
+            if text:
+                segments.append(Segment(text, style))
+            text, style = "", own
+        text += character
+    segments.append(Segment(text, style))
+    label_style, mark_style = (_PLAIN, _PLAIN_MARK) if palette.characters else (_LABEL, _MARK)
     for label in labels:
         end = label.column + len(label.text)
         before, _, after = Segment.divide(segments, [label.column, end, max(end, len(pairs))])
-        segments = [*before, Segment(printable(label.text), _MARK if label.is_mark else _LABEL), *after]
+        segments = [*before, Segment(printable(label.text), mark_style if label.is_mark else label_style), *after]
     return segments
 
 
-_LABEL = Style.parse("#8a8a8a")
+_GROUND_STYLE = Style.parse("on #121212")
+_LABEL = Style.parse("#8a8a8a on #121212")
 _MARK = Style.parse("bold #ffffff on #27548a")
+_PLAIN, _PLAIN_MARK = Style.null(), Style.parse("bold reverse")
 
 
 @cache
@@ -208,11 +224,11 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
         return _character(lower if upper == BACKGROUND else upper, palette), Style.null()
     if upper != lower and BACKGROUND in (upper, lower):
         code = upper if lower == BACKGROUND else lower
-        return "▀" if code == upper else "▄", Style(color=_colour(colour_of(code, palette)))
+        return "▀" if code == upper else "▄", _GROUND_STYLE + Style(color=_colour(colour_of(code, palette)))
     if upper != lower:
         return "▀", Style(color=_colour(colour_of(upper, palette)), bgcolor=_colour(colour_of(lower, palette)))
     if upper == BACKGROUND:
-        return " ", Style.null()
+        return " ", _GROUND_STYLE
     ground = colour_of(upper, palette)
     mark, level = divmod(upper, LEVELS)
     red, green, blue = ground
@@ -252,11 +268,12 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
     return text.append(f" {unit}".rstrip())
 
 
-def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
-    """Return how many sensors are fresh, and the other marks that are seen, with their meaning.
+def marks_text(marks: npt.NDArray[np.uint8], reasons: Mapping[str, int], palette: Palette) -> Text:
+    """Return how many sensors are fresh, the other marks that are seen, and the reasons of a calmed driver.
 
     Args:
         marks: (n,) uint8, marks of all sensors that are drawn.
+        reasons: how many of them have each; see :func:`skinware.state.count_reasons`.
     """
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
     text = Text(f"{counts[heat.FRESH]} fresh", no_wrap=True, overflow="ellipsis")
@@ -266,12 +283,60 @@ def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
             character, style = _cell((mark * LEVELS + level) * 0x101, palette)
             text.append("  ")
             text.append(character, style)
-            text.append(f" {counts[mark]} {name}")
+            text.append(f" {name}, {counts[mark]} left" if mark == heat.SETTLING else f" {counts[mark]} {name}")
+    for name, count in reasons.items():
+        text.append(f"  {count} {words(name)}")
     return text
 
 
-class HeatMap(ScrollView, can_focus=False):
-    """A picture, line by line in the colours of a palette; only lines that changed are drawn again."""
+class TextLines(ScrollView, can_focus=False):
+    """Lines of which only those that changed are made again.
+
+    They have all their colours: what Textual does for lines of any widget costs more than making them.
+    """
+
+    def __init__(self, *, id: str) -> None:  # noqa: A002 - Textual's name
+        super().__init__(id=id)
+        self._strips: dict[int, Strip] = {}
+        self._made_for = (0, 0)
+
+    def make_line(self, y: int) -> Strip:
+        """Return a line in which nothing is scrolled."""
+        raise NotImplementedError
+
+    def changed(self, lines: Iterable[int]) -> None:
+        """Make these lines again when they are seen."""
+        (width, height), top = self.size, self.scroll_offset.y
+        for line in (seen := list(lines)):
+            self._strips.pop(line, None)
+        regions = [Region(0, line - top, width, 1) for line in seen if top <= line < top + height]
+        if regions:
+            self.refresh(*regions)
+
+    def changed_all(self, columns: int, lines: int) -> None:
+        """Make all lines again, in another size."""
+        self._strips.clear()
+        self.virtual_size = Size(columns, lines)
+        self.refresh()
+
+    def render_lines(self, crop: Region) -> list[Strip]:
+        (left, top), width = self.scroll_offset, self.size.width
+        if self._made_for != (left, width):
+            self._made_for = left, width
+            self._strips.clear()
+        for line in range(crop.y + top, crop.bottom + top):
+            if line not in self._strips:
+                self._strips[line] = self.make_line(line).crop_extend(left, left + width, self.ground)
+        return [self._strips[line].crop(crop.x, crop.right) for line in range(crop.y + top, crop.bottom + top)]
+
+    @property
+    def ground(self) -> Style:
+        """The colours where nothing is drawn."""
+        return Style.null() if self.app.no_color else _GROUND_STYLE
+
+
+class HeatMap(TextLines):
+    """A picture in the colours of a palette."""
 
     class Pointed(Message):
         """The mouse points at a sensor (its position in a snapshot), or at none."""
@@ -286,7 +351,6 @@ class HeatMap(ScrollView, can_focus=False):
         self._arrangement: Arrangement | None = None
         self._pixels: npt.NDArray[np.uint8] | None = None
         self._marks: Mapping[int, Sequence[Label]] = {}
-        self._strips: dict[int, Strip] = {}
 
     def show(
         self,
@@ -303,30 +367,17 @@ class HeatMap(ScrollView, can_focus=False):
         moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}
         self._arrangement, self._pixels, self._marks = arrangement, pixels, marks
         if before is None:
-            self._strips.clear()
-            self.virtual_size = Size(arrangement.columns, arrangement.lines)
-            self.refresh()
-            return
-        top = self.scroll_offset.y
-        for line in moved.union(changed_lines(before, pixels)):
-            self._strips.pop(line, None)
-            if top <= line < top + self.size.height:
-                self.refresh_line(line)
+            self.changed_all(arrangement.columns, arrangement.lines)
+        else:
+            self.changed(moved.union(changed_lines(before, pixels)))
 
-    def render_line(self, y: int) -> Strip:
-        left, top = self.scroll_offset
-        strip = self._strips.get(y + top) or self._strip(y + top)
-        return strip.crop_extend(left, left + self.size.width, None).apply_style(self.rich_style)
-
-    def _strip(self, line: int) -> Strip:
+    def make_line(self, y: int) -> Strip:
         arrangement, pixels = self._arrangement, self._pixels
-        if arrangement is None or pixels is None or line >= arrangement.lines:
+        if arrangement is None or pixels is None or y >= arrangement.lines:
             return Strip.blank(0)
-        upper, lower = pixels[2 * line : 2 * line + 2]
-        labels = [*arrangement.labels.get(line, ()), *self._marks.get(line, ())]
-        segments = segments_of(upper, lower, labels, self._palette)
-        strip = self._strips[line] = Strip(segments, arrangement.columns)
-        return strip
+        upper, lower = pixels[2 * y : 2 * y + 2]
+        labels = [*arrangement.labels.get(y, ()), *self._marks.get(y, ())]
+        return Strip(segments_of(upper, lower, labels, self._palette), arrangement.columns)
 
     def on_mouse_move(self, event: events.MouseMove) -> None:
         if self._arrangement is not None:

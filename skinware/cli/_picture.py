@@ -14,12 +14,12 @@ from skinware.cli._top_rows import RowKey, patches_of, title_of
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.sensor_types import SensorType
 from skinware.skin_layout import SkinLayout
-from skinware.state import status_now
+from skinware.state import count_reasons, settling, status_now
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
-from skinware.text import figure_text, status_text
+from skinware.text import figure_text, status_text, why_text
 from skinware.views.history import Memory
-from skinware.views.quantities import physical_values
+from skinware.views.quantities import physical_values, types_of
 
 Levels = npt.NDArray[np.uint8]
 
@@ -27,6 +27,8 @@ CHANGE, RANGE, RAW = "change", "range", "raw"
 SCALES = (CHANGE, RANGE, RAW)
 """Names of the scales, in the order in which a person goes through them."""
 _EVERYTHING = (-math.inf, math.inf)
+_THREE_FROM_WIDTH = 76
+"""Columns from which the scale has the value of its middle, too."""
 
 
 def change_levels(
@@ -47,7 +49,7 @@ class Picture:
     """The sensors of one type in one row of the list, drawn into a given space.
 
     Args:
-        type_name: the type to draw where there is one of this name; otherwise each driver's first.
+        type_name: the type to draw where there is one of this name; otherwise each driver's first; see ``types_of``.
         scale_name: the first meaning of the colours, one of ``SCALES``.
         regions: that a person may choose from; None: there are none.
         region: draw only sensors in this one at first; None: all.
@@ -83,7 +85,7 @@ class Picture:
         self._made_for: tuple[object, ...] = ()
 
     def next_type(self, structure: Structure) -> None:
-        names = [t.name for t in structure.types]
+        names = [t.name for t in types_of(structure)]
         self._wanted = names[(names.index(self.type_in(structure).name) + 1) % len(names)]
 
     def next_scale(self) -> None:
@@ -121,14 +123,19 @@ class Picture:
             self._made_for, self._levels = made_for, None
         sensors = self.arrangement.sensors
         name, self._levels, values = self._scaled(memory, frame, physical, sensors, sensor_type)
-        marks = marks_of(status_now(life, frame)[sensors])
+        waiting = settling(frame)[sensors]
+        marks = marks_of(status_now(life, frame)[sensors], waiting)
         self.pixels = self.arrangement.draw(codes_of(self._levels, marks))
         unit = "" if name == RAW else sensor_type.unit
+        values = values if width >= _THREE_FROM_WIDTH else (values[0], values[-1])
         self.scale = Text(f"{name} ", no_wrap=True).append_text(scale_text(values, unit, self._palette))
-        self.marks = marks_text(marks, self._palette)
+        reasons = count_reasons(frame.why[sensors][~waiting])
+        reasons.pop("rest", None)
+        self.marks = marks_text(marks, reasons, self._palette)
 
     def type_in(self, structure: Structure) -> SensorType:
-        return next((t for t in structure.types if t.name == self._wanted), structure.types[0])
+        types = types_of(structure)
+        return next((t for t in types if t.name == self._wanted), types[0])
 
     def _in_regions(self, driver: str, structure: Structure, type_name: str) -> dict[str, npt.NDArray[np.bool_]]:
         """Return (n_sensors,) bool for each region: the sensors of a type in it."""
@@ -194,6 +201,6 @@ def describe_sensor(frame: DriverSnapshot, position: int) -> str:
     value = f"{figure_text(sensor_type.offset + sensor_type.scale * raw, 5)} {sensor_type.unit}".strip()
     return (
         f"{structure.sensor_name(position)}: {sensor_type.name} {value} (raw {raw:g}),"
-        f" {status_text(int(frame.status[position]))};"
+        f" {', '.join(filter(None, (status_text(int(frame.status[position])), why_text(int(frame.why[position])))))};"
         f" position {position}, uid {int(structure.sensor_uid[position]):#x}"
     )

@@ -31,8 +31,19 @@ MEANINGS = dict(
 )
 """The meaning of each column of the list."""
 
+REASONS = {
+    "held": "touched; the baseline is predicted, not measured",
+    "relearning": "the baseline is not known yet, or less well than the noise",
+    "covered": "below its baseline: covered, or touched when that was measured",
+    "doubted": "falls and returns untouched: its polarity may be wrong",
+    "saturated": "at the end of its range: it may bear more than it shows",
+    "no resolution": "too few levels to show how strong a touch is",
+}
+"""The meaning of each reason of a calmed driver, as :func:`skinware.text.why_text` writes them."""
+
 KEYS = {
     "up, down": "choose a row; the picture shows its sensors",
+    "o": "order: the worst states first, or as drivers name their parts",
     "t": "next sensor type",
     "s": "colours: change since the baseline, range, raw counts",
     "b": "take the present values as the baseline of the picture",
@@ -46,7 +57,7 @@ KEYS = {
 def text() -> str:
     """Return the explanations, in lines of at most 76 columns."""
     marks = {MARK_CHARACTERS[mark]: name for mark, name in MARK_NAMES.items()}
-    parts = {"Columns": MEANINGS, "Marks over sensors": marks, "Keys": KEYS}
+    parts = {"Columns": MEANINGS, "Marks over sensors": marks, "Reasons, beside skin-calm": REASONS, "Keys": KEYS}
     lines = []
     for title, meanings in parts.items():
         lines += ["", title, *(f"  {name:<18} {meaning}" for name, meaning in meanings.items())]

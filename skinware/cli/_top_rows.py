@@ -9,7 +9,7 @@ import numpy as np
 
 from skinware.cli._heat_map import Arrangement, Label
 from skinware.realtime import NS_PER_S
-from skinware.state import DEAD, LIVE, SILENT, STARTING, DriverReport
+from skinware.state import DEAD, LIVE, SILENT, STARTING, DriverReport, badness
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.text import (
@@ -20,7 +20,6 @@ from skinware.text import (
     figure_text,
     plural,
     rate_text,
-    state_shown,
     words,
 )
 from skinware.views.live import TouchedPlace
@@ -48,19 +47,24 @@ class ListRow(NamedTuple):
     key: RowKey
     cells: tuple[str, ...]
     """One text for each column."""
-    state: str
-    """Name of the state, which gives the row its colour."""
+    bad: int
+    """How bad its state is, which gives the row its colour; see :func:`skinware.state.badness`."""
+    is_fresh: bool
+    """All its sensors are fresh."""
     counters: dict[str, int]
     """Every counter that the driver publishes for this row, by name."""
 
 
-def rows_of(report: DriverReport) -> list[ListRow]:
-    """Return the row of a driver, then those of its buses, each followed by its patches."""
+def rows_of(report: DriverReport, *, worst_first: bool = True) -> list[ListRow]:
+    """Return the row of a driver, then those of its buses, each followed by its patches.
+
+    Args:
+        worst_first: put buses and patches with the worst states first; otherwise all are in the driver's order.
+    """
     name, counters = report.name, report.counters
-    state = report.life if report.age_ns is None else state_shown(report.life, report.fresh, report.sensors)
     cells = (
         name,
-        state,
+        report.state,
         rate_text(report.rate_hz),
         age_text(report.age_ns),
         f"{report.fresh}/{report.sensors}",
@@ -68,21 +72,19 @@ def rows_of(report: DriverReport) -> list[ListRow]:
         count_text(counters.get("orphans")),
         "",
     )
-    rows = [ListRow(RowKey(name, DRIVER, 0), cells, state, counters)]
+    driver = ListRow(RowKey(name, DRIVER, 0), cells, badness(report.state), report.fresh == report.sensors, counters)
+    branches = []
     for at, bus in enumerate(report.buses):
-        state, dropped = report.last(bus.state), count_text(bus.counters.get("dropped"))
+        state, dropped = report.state_of(bus), count_text(bus.counters.get("dropped"))
         reason = "" if bus.reason is None else bus.reason.replace("_", "-")
         others = f"{reason}  {counters_text(bus.counters, besides=_NOT_AMONG_OTHERS)}".strip()
-        rows.append(
-            ListRow(
-                RowKey(name, BUS, at), (f"  {bus.name}", state, "", "", "", dropped, "", others), state, bus.counters
-            )
-        )
+        cells = (f"  {bus.name}", state, "", "", "", dropped, "", others)
+        patches = []
         for number, patch in enumerate(report.patches):
             if patch.bus != at:
                 continue
-            state = state_shown(report.last(patch.state), patch.fresh, patch.sensors)
-            cells = (
+            state = report.state_of(patch)
+            patch_cells = (
                 f"    {patch.name}",
                 state,
                 "" if patch.rate_hz is None else rate_text(patch.rate_hz),
@@ -92,8 +94,18 @@ def rows_of(report: DriverReport) -> list[ListRow]:
                 count_text(patch.counters.get("orphans")),
                 counters_text(patch.counters, besides=_NOT_AMONG_OTHERS),
             )
-            rows.append(ListRow(RowKey(name, PATCH, number), cells, state, patch.counters))
-    return rows
+            is_fresh = patch.fresh == patch.sensors
+            patches.append(ListRow(RowKey(name, PATCH, number), patch_cells, badness(state), is_fresh, patch.counters))
+        are_fresh = all(patch.is_fresh for patch in patches)
+        row = ListRow(RowKey(name, BUS, at), cells, badness(report.state_of(bus)), are_fresh, bus.counters)
+        branches.append([row, *(sorted(patches, key=_bad) if worst_first else patches)])
+    if worst_first:
+        branches.sort(key=lambda rows: min(map(_bad, rows)))
+    return [driver, *(row for rows in branches for row in rows)]
+
+
+def _bad(row: ListRow) -> int:
+    return -row.bad
 
 
 def patches_of(key: RowKey, structure: Structure) -> list[int]:

@@ -65,7 +65,7 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
 )
 @click.argument("name")
 @cli.driver_option
-@cli.type_option("Sensors to paint.  [default: the driver's first type]")
+@cli.type_option("Sensors to paint.  [default: normal force or pressure, else another touch]")
 @cli.output_option("Write the region into this file, new or not.", name="file", default=cli.DEFAULT_REGIONS)
 @click.option("-f", "--force", is_flag=True, help="Replace a region of this name.")
 @cli.duration_option("Paint for SECONDS, not until Enter.")
@@ -110,9 +110,10 @@ class _Painter:
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         from skinware.views.history import DriverRest
+        from skinware.views.quantities import types_of
 
         self._reader, self._as_json = reader, as_json
-        self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
+        self.type_name: str = types_of(reader.structure)[0].name if type_name is None else type_name
         self._index = reader.structure.index(self.type_name)
         self._rest = DriverRest(reader.structure)
 

@@ -37,7 +37,7 @@ _NEEDED = "textual>=8"
     "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
 )
 @cli.duration_option()
-@cli.type_option("Sensors to draw first.  [default: the driver's first type]")
+@cli.type_option("Sensors to draw first.  [default: normal force or pressure, else another touch]")
 @click.option(
     "--scale",
     "scale_name",

@@ -31,7 +31,7 @@ _REPORT_EVERY_S = 1.0
     "skin-wipe left_hand -T 60 --json for programs",
 )
 @click.argument("name", required=False)
-@cli.type_option("Sensors to test.  [default: the driver's first type]")
+@cli.type_option("Sensors to test.  [default: normal force or pressure, else another touch]")
 @cli.duration_option()
 @cli.namespace_option
 @cli.json_option
@@ -68,10 +68,11 @@ class _Wipe:
         import numpy as np
 
         from skinware.views.history import DriverRest, WipeTest
+        from skinware.views.quantities import types_of
 
         self._reader, self._as_json = reader, as_json
         self._structure = reader.structure
-        self._type = self._structure.types[0] if type_name is None else self._structure.type(type_name)
+        self._type = types_of(self._structure)[0] if type_name is None else self._structure.type(type_name)
         self._rest, self._test = DriverRest(self._structure), WipeTest(self._structure)
         self._status = np.zeros(self._structure.n_sensors, np.uint8)
         self._is_redrawing = not as_json and sys.stdout.isatty()

@@ -5,7 +5,7 @@
 #include <float.h>
 #include <string.h>
 
-enum { REST, HELD, RELEARNING, COVERED, DOUBTED, SATURATED, NO_RESOLUTION }; /* skinware/tactile/rule.py: Why */
+enum { REST, HELD, RELEARNING, COVERED, DOUBTED, SATURATED, NO_RESOLUTION }; /* skinware/status.py: Why */
 
 enum { NO_VALUE = -1, NO_NOISE = -2 }; /* of a tare */
 

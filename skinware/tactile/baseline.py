@@ -74,7 +74,7 @@ class Calm:
         uncertainty: (n,) float32, standard deviation of the baseline, and so of ``value``, beside the noise; NaN before
             it is known.
         noise: (n,) float32, standard deviation from frame to frame; NaN before it is known.
-        why: (n,) uint8, why each is in its state: a :class:`.Why`.
+        why: (n,) uint8, why each is in its state: a :class:`skinware.status.Why`.
         forced: (n,) bool, the baseline was put where the value is, at once.
         usable: (n,) bool, value and baseline are of this frame; others show what was last known, or nothing yet.
     """

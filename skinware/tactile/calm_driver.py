@@ -85,7 +85,8 @@ SENSOR_COLUMNS = {"uncertainty": "<f4", "why": "u1"}
 class CalmedDriver:
     """Publishes a driver again, with the output of a chain, and how far that can be trusted.
 
-    ``uncertainty`` is in the unit in which values come to the baseline, NaN without one; ``why`` is a :class:`.Why`.
+    ``uncertainty`` is in the unit in which values come to the baseline, NaN without one;
+    ``why`` is a :class:`skinware.status.Why`.
 
     Args:
         name: name of the driver.

@@ -18,19 +18,16 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
 from skinware.service.messages import ACQUIRE
+from skinware.state import count_reasons
+from skinware.status import Why
 from skinware.tactile import contacts_service, health_service
-from skinware.tactile.baseline import Baseline, Calm
+from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_driver import CalmedDriver, DriverSource
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState
 from skinware.tactile.derived_services import CalmContacts, CalmHealth, WatchedRegions
-from skinware.tactile.rule import Why
 
 log: logging.Logger = logging.getLogger("skinware.calm")
-
-
-def _reasons(calm: Calm) -> dict[str, int]:
-    return {why.name.lower(): count for why in Why if (count := int(np.count_nonzero(calm.why == why)))}
 
 
 class CalmRequests:
@@ -239,7 +236,7 @@ class CalmService:
             "ready": {name: int(stage.baseline.ready.sum()) for name, stage in stages.items()},
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},
             "touched": {name: int(stage.touched.sum()) for name, stage in stages.items()},
-            "why": {name: _reasons(stage.calm) for name, stage in stages.items() if stage.calm is not None},
+            "why": {name: count_reasons(stage.calm.why) for name, stage in stages.items() if stage.calm is not None},
             "contacts": 0 if self.contacts is None else self.contacts.count,
             "faulty": 0 if self.health is None else self.health.faulty,
         }

@@ -1,4 +1,4 @@
-"""Define the settings of the rule of baselines, and why a taxel is in its state.
+"""Define the settings of the rule of baselines.
 
 ``skinware/native/baseline.h`` has the numbers behind them, docs/tactile/baselines.md the formulas.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import IntEnum
 from typing import Any, Self
 
 import msgspec
@@ -23,25 +22,6 @@ SIGNED_TYPES = ("shear_", "force_x", "force_y", "magnetic_field_", "acceleration
 
 FORGET_AFTER_S = 600.0
 """Seconds without data after which a baseline is measured again: a skin that warms up drifts farther than a touch."""
-
-
-class Why(IntEnum):
-    """Why a taxel is in its state."""
-
-    REST = 0
-    """It is at rest."""
-    HELD = 1
-    """It is touched; its offset is predicted, not measured."""
-    RELEARNING = 2
-    """Its offset is not known yet, or less well than its noise."""
-    COVERED = 3
-    """It is below its offset, which was learned under a load or before a cover sank nearby."""
-    DOUBTED = 4
-    """It falls and returns again and again where nothing touches: its polarity may be wrong."""
-    SATURATED = 5
-    """It is at the end of its range: it may bear more than it shows."""
-    NO_RESOLUTION = 6
-    """It has too few levels to show how strong a touch is."""
 
 
 def resolution_of(structure: Structure, type_name: str) -> float:

@@ -13,7 +13,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, status_now
+from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, settling, status_now
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsSample
@@ -27,7 +27,7 @@ from skinware.views.scene import Scene
 _JUDGE_EVERY_NS = NS_PER_S // 5
 _EARLY_NS = 5_000_000
 """A snapshot may be taken this much earlier than the pace asks for."""
-_UNHEALTHY = np.uint8(Status.UNHEALTHY)
+_UNHEALTHY, _NEVER_SEEN, _ALL_BITS = np.uint8(Status.UNHEALTHY), np.uint8(Status.NEVER_SEEN), np.uint8(0xFF)
 
 
 @dataclass(eq=False)
@@ -75,6 +75,25 @@ class Newest:
             ("calm", quantity.name), lambda: calm.physical(quantity.type.name)
         )
         return values
+
+    @property
+    def why(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8: a :class:`skinware.status.Why` for each, of the calmed driver."""
+        return (self.calm or self.frame).why
+
+    @property
+    def settling(self) -> npt.NDArray[np.bool_]:
+        """(n_sensors,) bool: those whose baselines the calmed driver does not know yet."""
+        waiting: npt.NDArray[np.bool_] = self.once("settling", lambda: settling(self.calm or self.frame))
+        return waiting
+
+    @property
+    def marked(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
+        marked: npt.NDArray[np.uint8] = self.once(
+            "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
+        )
+        return marked
 
     def totals(self, quantity: Quantity) -> npt.NDArray[np.float64] | None:
         """Return (n_modules,) the load on each module, in the quantity's unit.

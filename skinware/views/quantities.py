@@ -12,7 +12,16 @@ import numpy.typing as npt
 from skinware._columns import Index
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
-from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
+from skinware.sensor_types import (
+    ACCELERATION,
+    ANGULAR_RATE,
+    FORCE_Z,
+    PRESSURE,
+    SHEAR_X,
+    SHEAR_Y,
+    TEMPERATURE,
+    SensorType,
+)
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.neighbours import pitch_m
@@ -24,6 +33,7 @@ NO_VALUE = 255
 WITHOUT_VALUE = Status.NO_ACK | Status.MASKED | Status.NEVER_SEEN | Status.NOT_CONNECTED
 """A sensor with one of these bits has no value that means anything."""
 _NO_TOUCH = {t.id for t in (TEMPERATURE, *ACCELERATION, *ANGULAR_RATE)}
+_NORMAL = (FORCE_Z.id, PRESSURE.id)
 _LONGEST = 127
 _STEEPEST = float(np.finfo(np.float32).max)
 
@@ -65,9 +75,24 @@ class Quantity:
         return float(np.median(pitch)) if len(pitch) else float("nan")
 
 
+def types_of(structure: Structure) -> list[SensorType]:
+    """Return the types of a skin that have sensors, those first that people look at first.
+
+    These are normal force and pressure, the one with more sensors first; then other types of touch, then all others.
+    """
+    counts = {t: int(np.count_nonzero(structure.sensor_type == t.id)) for t in structure.types}
+
+    def rank(t: SensorType) -> tuple[int, ...]:
+        if t.id in _NORMAL:
+            return 0, -counts[t], _NORMAL.index(t.id)
+        return (1 + (t.id in _NO_TOUCH),)
+
+    return sorted((t for t, count in counts.items() if count), key=rank)  # stable
+
+
 def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
-    """Return all quantities of a skin in the order of its types; at least one."""
-    types = {t.name: t for t in structure.types if (structure.sensor_type == t.id).any()}
+    """Return all quantities of a skin in the order of :func:`types_of`; at least one."""
+    types = {t.name: t for t in types_of(structure)}
     names: dict[str, str] = {}
     axes: dict[str, tuple[str, str]] = {}
     for name in types:

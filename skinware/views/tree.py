@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,12 @@ from skinware.state import (
     STARTING,
     WITHOUT_NEWS,
     DriverReport,
+    badness,
 )
-from skinware.status import Status
+from skinware.status import Status, Why
 from skinware.structure import Structure
-from skinware.text import age_text, count_text, plural, words
-from skinware.views.following import ShownDriver
+from skinware.text import SETTLING, age_text, count_text, plural, words
+from skinware.views.following import Newest, ShownDriver
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 _SEVERITIES = (ERROR, WARNING, NOTE)
@@ -39,6 +41,13 @@ _STATUSES = {
     Status.NOT_CONNECTED: (NOTE, "not connected"),
     Status.MASKED: (NOTE, "switched off"),
 }
+_REASONS = {
+    Why.COVERED: (NOTE, "below their baselines: covered, or touched when these were measured"),
+    Why.DOUBTED: (WARNING, "fall and return where nothing touches: their polarity may be wrong"),
+    Why.SATURATED: (NOTE, "at the end of their range: they may bear more"),
+    Why.NO_RESOLUTION: (WARNING, "too coarse to show how strong a touch is"),
+}
+"""Reasons of a calmed driver that are problems; touched taxels are none."""
 
 
 def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
@@ -49,6 +58,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "name": driver.name,
         "namespace": driver.origin.title,
         "state": report.life,
+        "shown": report.state,
+        "bad": badness(report.state),
         "rate_hz": _rounded(report.rate_hz),
         "age_ms": _milliseconds(report.age_ns),
         "sensors": driver.structure.n_sensors,
@@ -58,7 +69,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "buses": [
             {
                 "name": bus.name,
-                "state": report.last(bus.state),
+                "state": report.state_of(bus),
+                "bad": badness(report.state_of(bus)),
                 "reason": bus.reason,
                 "load": bus.load,
             }
@@ -68,7 +80,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
             {
                 "name": patch.name,
                 "bus": report.buses[patch.bus].name,
-                "state": report.last(patch.state),
+                "state": report.state_of(patch),
+                "bad": badness(report.state_of(patch)),
                 "age_ms": _milliseconds(patch.age_ns),
                 "sensors": patch.sensors,
                 "fresh": patch.fresh,
@@ -108,15 +121,28 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
             age = "" if patch.age_ns is None else f", its newest data is {age_text(patch.age_ns)} old"
             on = report.buses[patch.bus].name
             add(patch.state, WARNING, f"{patch.name} is {patch.state}{age}", bus=on, patch=patch.name)
-    for bit, (severity, text) in _STATUSES.items():
-        sensors = np.flatnonzero(driver.status & np.uint8(bit))
-        if len(sensors) and driver.frame is not None:
+    if driver.newest is not None:
+        for sensors, severity, text in _marked(driver.newest):
+            if not len(sensors):
+                continue
             shares = f"{count_text(len(sensors))} of {plural(driver.structure.n_sensors, 'sensor')}"
             add(text, severity, f"{shares} {text}", **_common_patch(driver.structure, sensors))
+        waiting = driver.newest.settling
+        if waiting.any():
+            add(SETTLING, NOTE, f"{SETTLING}, {count_text(int(np.count_nonzero(waiting)))} left")
     dropped = _dropped(report)
     if dropped:
         add("dropped", NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
     return found
+
+
+def _marked(newest: Newest) -> Iterator[tuple[npt.NDArray[np.intp], str, str]]:
+    """Yield the (k,) sensors of each problem that sensors have, its severity, and what they are or do."""
+    for bit, (severity, text) in _STATUSES.items():
+        marked = (newest.status & np.uint8(bit)) != 0
+        yield np.flatnonzero(marked & ~newest.settling if bit == Status.NEVER_SEEN else marked), severity, text
+    for why, (severity, text) in _REASONS.items():
+        yield np.flatnonzero(newest.why == why), severity, text
 
 
 def problem_of_all(text: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.motion_service import MotionSample
+from skinware.text import why_text
 from skinware.views import looks
 from skinware.views.following import Newest, ShownDriver
 from skinware.views.live import places_of
@@ -217,7 +218,7 @@ class Viewer:
         totals = None if self.look.mode == "wipe" else newest.totals(quantity)
         if totals is not None:
             shown["totals"] = blobs.add(totals, "<f4")
-        status, key = newest.status[quantity.where], (driver.number, quantity.name)
+        status, key = newest.marked[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):
             self._status[key] = status
@@ -255,9 +256,9 @@ class Viewer:
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:
         """Return the exact value of a sensor; None for one that does not exist (any more)."""
         driver = self._follower.get(number)
-        if driver is None or driver.frame is None or position >= driver.structure.n_sensors:
+        if driver is None or driver.newest is None or position >= driver.structure.n_sensors:
             return None
-        frame, structure = driver.frame, driver.structure
+        frame, structure = driver.newest.frame, driver.structure
         of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
         raw = frame.values[position].item()
         time_ns = int(frame.group_time_ns[structure.sensor_group[position]])
@@ -268,7 +269,8 @@ class Viewer:
             "raw": raw,
             "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
             "noise": abs(of_type.scale) * float(driver.past.noise([position])[0]),
-            "status": int(driver.status[position]),
+            "status": int(driver.newest.marked[position]),
+            "why": why_text(int(driver.newest.why[position])),
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
 

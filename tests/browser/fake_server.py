@@ -20,6 +20,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
 import skinware
+from skinware.state import GOOD, OLD, badness
 
 PAGE = Path(skinware.__file__).parent / "views" / "page"
 MONOTONIC_NS = 1_000_000_000_000
@@ -165,6 +166,7 @@ class FakeDriver:
                 {
                     "name": f"board {8 + i}",
                     "state": state,
+                    "bad": badness(state),
                     "age_ms": 840.0 if is_stale else 4.2,
                     "fresh": int((of == 0).sum()) if alive else 0,
                     "sensors": len(of),
@@ -174,6 +176,8 @@ class FakeDriver:
         return {
             "id": self.number,
             "state": self.state,
+            "shown": self.state,
+            "bad": badness(self.state),
             "rate_hz": 50.0 if alive else 0.0,
             "age_ms": 4.2 if alive else 1840.0,
             "fresh": fresh,
@@ -181,7 +185,14 @@ class FakeDriver:
             "dropped": 0,
             "load": 0.31,
             "buses": [
-                {"name": "can0", "state": "live" if alive else "was live", "reason": "", "load": 0.31, "dropped": 0}
+                {
+                    "name": "can0",
+                    "state": "live" if alive else "was live",
+                    "bad": GOOD if alive else OLD,
+                    "reason": "",
+                    "load": 0.31,
+                    "dropped": 0,
+                }
             ],
             "patches": patches,
         }

@@ -23,6 +23,7 @@ from skinware import BusState, DriverReader, DriverWriter, Namespace, PatchState
 from skinware.errors import ServiceError
 from skinware.samples import SAMPLE, SAMPLES
 from skinware.sensor_types import PRESSURE, TEMPERATURE
+from skinware.tactile.calm_driver import SENSOR_COLUMNS
 from skinware_drivers.testing.waiting import wait_until
 
 BUS_COUNTERS = ("frames", "dropped", "errors", "unknown")
@@ -62,6 +63,7 @@ class FakeSkin:
         namespace: default: the one of the environment.
         slots: of its ring.
         driver_type: that it tells.
+        why: (n_sensors,) reasons of its sensors, as a calmed driver has them; None: it is none.
     """
 
     def __init__(
@@ -71,7 +73,9 @@ class FakeSkin:
         namespace: Namespace | None = None,
         slots: int = 64,
         driver_type: str = "fake",
+        why: npt.ArrayLike | None = None,
     ) -> None:
+        self.why = why
         self.structure = structure or fake_structure()
         self.is_hung = False
         self.values: npt.NDArray[Any] | None = None
@@ -94,6 +98,7 @@ class FakeSkin:
             driver_type=driver_type,
             bus_counters=BUS_COUNTERS,
             patch_counters=PATCH_COUNTERS,
+            sensor_columns={} if why is None else SENSOR_COLUMNS,
             namespace=namespace,
             slots=slots,
         )
@@ -104,6 +109,8 @@ class FakeSkin:
             columns = self.writer.begin()
             columns["values"][:] = self._touched() if self.values is None else self.values
             columns["status"][:] = self.status
+            if self.why is not None:
+                columns["why"][:] = self.why
             columns["module_time_ns"][:] = time.monotonic_ns()
             columns["module_untouched"][:] = 0 if self.untouched is None else self.untouched
             columns["patch_state"][:] = self.patch_state

@@ -10,15 +10,22 @@ from skinware import DriverReader, Structure
 from skinware import state as state_module
 from skinware.memory.ring import Sample
 from skinware.state import (
+    GONE,
+    GOOD,
+    ODD,
+    OLD,
+    badness,
+    count_reasons,
     count_statuses,
     life_of,
     patch_ages_ns,
     rate_now_hz,
     report_of,
+    settling,
     state_name,
     status_now,
 )
-from skinware.status import BusState, PatchState, Status
+from skinware.status import BusState, PatchState, Status, Why
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 SECOND = 1_000_000_000
@@ -107,6 +114,29 @@ def test_a_driver_in_a_few_figures() -> None:
     assert report.statuses["fresh"] == 48 - 7
     assert report.patch_states == {"live": 1, "stale": 1}
     assert report.counters == {"frames": 5156, "dropped": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
+
+
+def test_a_calmed_driver_settles() -> None:
+    why = np.full(24, int(Why.RELEARNING), np.uint8)
+    why[20:] = Why.REST, Why.HELD, Why.HELD, Why.DOUBTED
+    with FakeSkin("a", fake_structure(1, 2), why=why) as skin, DriverReader("a") as reader:
+        skin.status[:20] = Status.NEVER_SEEN
+        skin.publish()
+        frame = reader.read()
+        report = report_of(reader, frame, 20.0)
+        assert settling(frame).tolist() == [True] * 20 + [False] * 4
+        assert count_reasons(frame.why) == {"rest": 1, "held": 2, "relearning": 20, "doubted": 1}
+        assert (report.statuses["settling"], report.statuses["never_seen"]) == (20, 0)
+        assert (report.state, report.state_of(report.patches[0]), report.worst) == ("live", "live", GOOD)
+        skin.status[20:] = Status.NOT_CONNECTED
+        skin.publish()
+        report = report_of(reader, reader.read(newer_than=frame), 20.0)
+        assert (report.state, report.state_of(report.patches[0]), report.worst) == ("settling", "settling", ODD)
+
+
+def test_the_worst_states_are_known() -> None:
+    states = ["live", "starting", "settling", "stale", "was live", "was gone", "not fresh", "silent", "down", "dead"]
+    assert [badness(state) for state in states] == [GOOD, ODD, ODD, OLD, OLD, OLD, OLD, OLD, GONE, GONE]
 
 
 def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:

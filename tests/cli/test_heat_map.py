@@ -56,7 +56,9 @@ def test_the_worst_that_is_known_of_a_sensor_is_shown() -> None:
         ],
         np.uint8,
     )
-    assert marks_of(status).tolist() == [
+    settling = (status & np.uint8(Status.NEVER_SEEN)) != 0
+    assert marks_of(status, settling).tolist()[7:9] == [heat.SETTLING, heat.NOT_CONNECTED]
+    assert marks_of(status, np.zeros(len(status), bool)).tolist() == [
         heat.FRESH,
         heat.STALE,
         heat.OUT_OF_RANGE,

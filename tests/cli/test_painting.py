@@ -27,6 +27,9 @@ def line(upper: list[int], lower: list[int], *labels: Label) -> list[Segment]:
     return segments_of(np.array(upper, np.uint8), np.array(lower, np.uint8), labels, TRUE_COLOURS)
 
 
+GROUND = ColorTriplet(18, 18, 18)
+
+
 def text(segments: list[Segment]) -> str:
     return "".join(segment.text for segment in segments)
 
@@ -49,10 +52,9 @@ def test_two_sensors_share_a_cell() -> None:
 
 
 def test_a_sensor_at_the_edge_leaves_the_other_half_alone() -> None:
-    upper, lower, nothing = line([3, BACKGROUND, BACKGROUND], [BACKGROUND, 5, BACKGROUND])
-    assert (upper.text, colours(upper)) == ("▀", (RAMP[3], None))
-    assert (lower.text, colours(lower)) == ("▄", (RAMP[5], None))
-    assert (nothing.text, colours(nothing)) == (" ", (None, None))
+    upper, lower = line([3, BACKGROUND, BACKGROUND], [BACKGROUND, 5, BACKGROUND])
+    assert (upper.text, colours(upper)) == ("▀", (RAMP[3], GROUND))
+    assert (lower.text, colours(lower)) == ("▄ ", (RAMP[5], GROUND))  # a blank needs no colour of its own
 
 
 @pytest.mark.parametrize(("mark", "character"), MARK_CHARACTERS.items())
@@ -97,6 +99,9 @@ def test_the_scale_has_values_and_a_unit() -> None:
 
 def test_only_marks_that_are_there_are_explained() -> None:
     marks = np.array([heat.FRESH] * 5 + [heat.STALE] * 2 + [heat.NOT_CONNECTED], np.uint8)
-    assert marks_text(marks, TRUE_COLOURS).plain == "5 fresh  ░ 2 stale  x 1 not connected"
-    assert marks_text(np.zeros(0, np.uint8), TRUE_COLOURS).plain == "0 fresh"
-    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(9))
+    assert marks_text(marks, {}, TRUE_COLOURS).plain == "5 fresh  ░ 2 stale  x 1 not connected"
+    assert marks_text(np.zeros(0, np.uint8), {}, TRUE_COLOURS).plain == "0 fresh"
+    waiting = np.array([heat.FRESH] * 5 + [heat.SETTLING] * 82, np.uint8)
+    reasons = {"held": 2, "no_resolution": 1}
+    assert marks_text(waiting, reasons, TRUE_COLOURS).plain == "5 fresh  ~ settling, 82 left  2 held  1 no resolution"
+    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(10))

@@ -12,13 +12,14 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from rich.text import Text
 
 import skinware
 import skinware_drivers
 from skinware import DriverWriter, Structure
 from skinware.cli._command import exit_status
 from skinware.cli._terminal import Formatter, echo, json_text, overwrite, shown, style
-from skinware.cli._top_app import _cell, _printable
+from skinware.cli._top_app import _printable
 from skinware.cli.top import show_lines
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
@@ -106,8 +107,7 @@ def test_the_lines_of_top_have_none(namespace: Namespace, capsys: pytest.Capture
 
 
 def test_cells_and_lines_of_the_live_view_have_none() -> None:
-    assert _cell(HOSTILE, 0).plain == printable(HOSTILE)
-    line = _printable(_cell(HOSTILE, 0))
+    line = _printable(Text(HOSTILE))
     assert not isinstance(line, str)
     assert not bad(line.plain)
     assert not bad(str(_printable(HOSTILE)))

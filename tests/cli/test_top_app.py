@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import DataTable, Static
+from textual.widgets import Static
 
 from skinware import DriverReader, Namespace, Status
 from skinware import state as health
@@ -27,8 +27,10 @@ from skinware.cli._painting import (
 from skinware.cli._picture import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.cli._top_help import KEYS, Help
+from skinware.cli._top_list import DriverList, room_for
 from skinware.cli._top_rows import COLUMNS
 from skinware.realtime import now_ns
+from skinware.status import Why
 from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 
@@ -64,20 +66,20 @@ def line(app: SkinTop, name: str) -> str:
 
 def listed(app: SkinTop) -> list[str]:
     """Names and states in the list."""
-    table = app.query_one(DataTable)
-    return [" ".join(str(cell).strip() for cell in table.get_row_at(n)[:2]) for n in range(table.row_count)]
+    return [" ".join(cell.strip() for cell in row.cells[:2]) for row in app.query_one(DriverList).rows]
 
 
 def chosen(app: SkinTop) -> str:
     """Name in the row under the cursor."""
-    table = app.query_one(DataTable)
-    return str(table.get_row_at(table.cursor_row)[0]).strip()
+    row = app.query_one(DriverList).chosen
+    assert row is not None
+    return row.cells[0].strip()
 
 
 def picture(app: SkinTop) -> list[str]:
     """The heat map as characters."""
     heat_map = app.query_one(HeatMap)
-    return [heat_map.render_line(y).text for y in range(heat_map.size.height)]
+    return [strip.text for strip in heat_map.render_lines(heat_map.size.region)]
 
 
 def go(scene: Callable[[], Awaitable[None]]) -> None:
@@ -120,10 +122,10 @@ def test_it_fits_every_terminal(size: tuple[int, int]) -> None:
             async with shown(size) as (app, pilot):
                 await until(pilot, lambda: "pressure sensors" in line(app, "title"))
                 await pilot.press("down", "down", "t", "s", "pagedown", "pageup")
-                await until(pilot, lambda: line(app, "title").startswith("board 7: "))
+                await until(pilot, lambda: line(app, "title").startswith("board 10: "))
                 heat_map = app.query_one(HeatMap)
                 assert all(len(text) == heat_map.size.width for text in picture(app))
-                for widget in (app.query_one(DataTable), heat_map, app.query_one("#head")):
+                for widget in (app.query_one(DriverList), heat_map, app.query_one("#head")):
                     assert app.screen.region.contains_region(widget.region)
 
     go(scene)
@@ -140,10 +142,10 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
                 assert listed(app) == [
                     "torso live",
                     "can0 live",
+                    "board 10 stale",
                     "board 7 live",
                     "board 8 live",
                     "board 9 live",
-                    "board 10 stale",
                 ]
                 assert line(app, "head").startswith("skin-top   namespace ")
                 assert line(app, "title") == "torso: 4 patches, 640 pressure sensors"
@@ -152,6 +154,8 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
                 drawn = picture(app)
                 assert len(drawn) == 12  # all of it, unscrolled
                 assert [text[:8].strip() for text in drawn[::3]] == ["board 7", "board 8", "board 9", "board 10"]
+                await pilot.press("o")
+                assert listed(app)[2:] == ["board 7 live", "board 8 live", "board 9 live", "board 10 stale"]
                 await pilot.press("down", "down")
                 await until(pilot, lambda: line(app, "title").startswith("board 7: "))
                 assert line(app, "title") == "board 7: 16 triangles, 160 pressure sensors"
@@ -170,7 +174,7 @@ def test_what_does_not_fit_is_told_of() -> None:
     async def scene() -> None:
         with publishing(FakeSkin("torso", fake_structure(20, 16))):
             async with shown() as (app, pilot):
-                table = app.query_one(DataTable)
+                table = app.query_one(DriverList)
                 await until(pilot, lambda: len(listed(app)) == 22)
                 await until(pilot, lambda: f"↓ {22 - (table.size.height - 1)} more" in line(app, "head"))
                 assert "↑" not in line(app, "head")
@@ -225,9 +229,34 @@ def test_the_chosen_row_is_chosen_again_when_its_driver_comes_back() -> None:
                     skin.publish()
                     await until(pilot, lambda: len(listed(app)) == 7)
                     assert chosen(app) == "can0"
-                    assert app.query_one(DataTable).cursor_row == 5
+                    assert app.query_one(DriverList).cursor == 5
 
     go(scene)
+
+
+def test_settling_and_reasons_are_shown_beside_fresh_taxels() -> None:
+    why = np.array([Why.RELEARNING] * 8 + [Why.HELD, Why.REST] + [Why.REST] * 2, np.uint8)
+
+    async def scene() -> None:
+        skin = FakeSkin("a", fake_structure(1, 1), why=why)
+        skin.status[:8] = Status.NEVER_SEEN
+        with publishing(skin):
+            async with shown((60, 15)) as (app, pilot):
+                await until(pilot, lambda: line(app, "marks") == "2 fresh  ~ settling, 8 left  1 held")
+                heat_map, strips = app.query_one(HeatMap), picture(app)
+                row = next(number for number, text in enumerate(strips) if "~" in text)
+                await pilot.hover(heat_map, offset=(strips[row].index("~"), row))
+                await until(pilot, lambda: "never seen, relearning; position" in line(app, "detail"))
+
+    go(scene)
+
+
+@pytest.mark.parametrize("width", [20, 60, 80, 120, 200])
+def test_columns_have_room(width: int) -> None:
+    room = room_for(width)
+    assert sum(room.values()) + 2 * (len(room) - 1) <= max(width, 16)
+    assert (4 in room) == (width >= 60)  # fresh
+    assert (7 in room) == (width >= 120)
 
 
 def test_a_silent_driver_is_shown_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,7 +317,7 @@ def test_the_mouse_chooses_and_points() -> None:
         with publishing(skin):
             async with shown() as (app, pilot):
                 await until(pilot, lambda: len(listed(app)) == 4)
-                await pilot.click(DataTable, offset=(5, 3))
+                await pilot.click(DriverList, offset=(5, 3))
                 await until(pilot, lambda: chosen(app) == "board 7")
                 await until(pilot, lambda: line(app, "title").startswith("board 7: "))
                 heat_map = app.query_one(HeatMap)
@@ -323,7 +352,7 @@ def test_a_picture_that_does_not_fit_is_scrolled() -> None:
 
 def test_nothing_is_drawn_again_that_has_not_changed(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[int] = []
-    monkeypatch.setattr(HeatMap, "refresh_line", lambda _, line: drawn.append(line))
+    monkeypatch.setattr(HeatMap, "refresh", lambda _, *regions, **more: drawn.extend(region.y for region in regions))
 
     async def scene() -> None:
         with FakeSkin("a", fake_structure(4, 16)) as skin:

@@ -17,12 +17,12 @@ from skinware.cli._top_rows import (
     plain_line,
     rows_of,
 )
-from skinware.state import BusReport, DriverReport, PatchReport, report_of
+from skinware.state import GOOD, OLD, BusReport, DriverReport, PatchReport, report_of
 from skinware.text import counters_text
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 BUS_REPORT = BusReport("can0", "live", None, None, {"frames": 5156, "dropped": 0})
-PATCH_REPORT = PatchReport("board 7", 0, "live", 192, 192, 0, 12_000_000, None, {"orphans": 0})
+PATCH_REPORT = PatchReport("board 7", 0, "live", 192, 192, 0, 0, 12_000_000, None, {"orphans": 0})
 STALE, UNCOUNTED = replace(PATCH_REPORT, state="stale"), replace(PATCH_REPORT, counters={})
 REPORT = DriverReport(
     name="roboskin",
@@ -88,7 +88,8 @@ def test_a_row_per_driver_bus_and_patch() -> None:
         skin.break_some()
         skin.publish()
         frame = reader.read()
-        rows = rows_of(report_of(reader, frame, 19.96))
+        report = report_of(reader, frame, 19.96)
+        rows = rows_of(report, worst_first=False)
     assert [(row.key.kind, row.key.number, row.cells[0]) for row in rows] == [
         (DRIVER, 0, "torso"),
         (BUS, 0, "  can0"),
@@ -105,7 +106,9 @@ def test_a_row_per_driver_bus_and_patch() -> None:
     assert cells[2][1:3] + cells[2][4:] == ("live", "", "20/24", "", "3", "updates 640")
     assert re.fullmatch(r"[\d.]+ ms", cells[2][3])
     assert cells[6][1:3] + cells[6][4:] == ("stale", "", "0/24", "", "0", "")
-    assert rows[6].state == "stale"
+    assert [(row.bad, row.is_fresh) for row in rows[4:]] == [(GOOD, False), (GOOD, True), (OLD, False)]
+    worst = [(row.key.kind, row.key.number) for row in rows_of(report)]
+    assert worst == [(DRIVER, 0), (BUS, 1), (PATCH, 3), (PATCH, 2), (BUS, 0), (PATCH, 0), (PATCH, 1)]
     assert rows[1].counters == {"frames": 5156, "dropped": 2, "errors": 0, "unknown": 7}
     assert [patches_of(row.key, frame.structure) for row in rows] == [[0, 1, 2, 3], [0, 1], [0], [1], [2, 3], [2], [3]]
     assert patches_of(RowKey("torso", PATCH, 9), frame.structure) == []

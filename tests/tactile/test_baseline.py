@@ -16,8 +16,9 @@ from hypothesis.extra import numpy as hnp
 from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
 from skinware.realtime import NS_PER_S
+from skinware.status import Why
 from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.rule import BaselineSettings, Why
+from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import World, grid
 from tests.cli.fake_skin import FakeSkin
 

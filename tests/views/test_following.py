@@ -7,9 +7,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from skinware import DriverReader, Namespace
+from skinware import DriverReader, Namespace, Status
 from skinware.errors import ServiceNotFound
+from skinware.status import Why
 from skinware.views.following import Follower, Origin
+from skinware.views.tree import problems_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
@@ -34,6 +36,20 @@ def test_each_frame_is_taken_once(namespace: Namespace) -> None:
         skin.publish(3)
         assert names(follower) == ["b"]
         assert follower.drivers[1].changes == before + 1
+
+
+def test_a_calmed_driver_settles_and_its_reasons_are_problems(namespace: Namespace) -> None:
+    why = np.full(24, int(Why.RELEARNING), np.uint8)
+    why[20:] = Why.REST, Why.HELD, Why.DOUBTED, Why.DOUBTED
+    with FakeSkin("a", fake_structure(1, 2), why=why) as skin, closing(Follower(Origin(namespace))) as follower:
+        skin.status[:19] = Status.NEVER_SEEN
+        skin.publish()
+        (driver,) = follower.take(0)
+        assert driver.newest is not None
+        assert driver.newest.marked.tolist() == [0xFF] * 19 + [0] * 5
+        problems = {(problem["severity"], problem["text"]) for problem in problems_of(driver, driver.report())}
+    doubted = "2 of 24 sensors fall and return where nothing touches: their polarity may be wrong"
+    assert problems == {("note", "settling, 19 left"), ("warning", doubted)}
 
 
 def test_no_more_often_than_asked_for(namespace: Namespace) -> None:

@@ -12,9 +12,20 @@ from hypothesis import strategies as st
 
 from skinware import Structure
 from skinware.geometry import Geometry
-from skinware.sensor_types import FORCE, MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
-from skinware.views.quantities import quantities_of
+from skinware.sensor_types import (
+    FORCE,
+    FORCE_Z,
+    MAGNETIC_FIELD,
+    PRESSURE,
+    PROXIMITY,
+    SHEAR_X,
+    SHEAR_Y,
+    TEMPERATURE,
+    SensorType,
+)
+from skinware.views.quantities import quantities_of, types_of
 from skinware.views.scene import ASPECT, FLAT_PITCH_M, Scene
+from skinware_drivers.description import Module, Patch, Sensor, assemble, taxels
 from skinware_drivers.hand import FINGERS, FRAME, Grid, Hand
 from tests.cli.fake_skin import fake_structure
 from tests.tactile.skins import triangles
@@ -198,4 +209,22 @@ def test_shear_belongs_to_pressure() -> None:
     assert pressure.axes == ("shear_x", "shear_y")
     assert pressure.shear.tolist() == [[0, 1], [3, 4]]
     incomplete = structure_of([(0, "", 2)], (SHEAR_X, PRESSURE))
-    assert [quantity.name for quantity in quantities_of(incomplete)] == ["shear_x", "pressure"]
+    assert [quantity.name for quantity in quantities_of(incomplete)] == ["pressure", "shear_x"]
+
+
+@pytest.mark.parametrize(
+    ("types", "names"),
+    [
+        ((TEMPERATURE, PROXIMITY, PRESSURE), ["pressure", "proximity", "temperature"]),
+        ((PRESSURE, FORCE_Z), ["force_z", "pressure"]),
+        (FORCE, ["force_z", "force_x", "force_y"]),
+    ],
+)
+def test_the_type_that_people_look_at_comes_first(types: tuple[SensorType, ...], names: list[str]) -> None:
+    assert [t.name for t in types_of(structure_of([(0, "", 4)], types))] == names
+
+
+def test_taxels_come_before_a_few_sums() -> None:
+    modules = [Module(taxels(6), 0, "2x3"), Module([Sensor(FORCE_Z.name, 100)], 1)]
+    structure = assemble([("bus", [Patch("finger", modules)])], (FORCE_Z, PRESSURE), np.uint16).structure
+    assert [t.name for t in types_of(structure)] == ["pressure", "force_z"]

@@ -2,7 +2,7 @@
 
 import { h, setChildren, setText } from "./dom.js";
 import { age, count, percent, rate } from "./format.js";
-import { badness } from "./tree.js";
+import { OLD } from "./tree.js";
 
 export class Bar {
   #chips = new Map();
@@ -18,10 +18,11 @@ export class Bar {
       if (!this.#chips.has(id)) this.#chips.set(id, h("span", { class: "figure" }, h("b"), h("span")));
       const figures = states.get(id) ?? {};
       const chip = this.#chips.get(id);
-      chip.dataset.bad = badness(driver.isCut ? "stale" : figures.state);
+      const bad = driver.isCut ? OLD : (figures.bad ?? 0);
+      chip.dataset.bad = bad;
       chip.dataset.driver = driver.key;
       setText(chip.firstChild, driver.name);
-      const state = driver.isCut ? "no connection" : badness(figures.state) ? figures.state : null;
+      const state = driver.isCut ? "no connection" : bad ? figures.shown : null;
       const fresh = figures.fresh === undefined ? null : `${count(figures.fresh)}/${count(figures.sensors)} fresh`;
       const parts = [state, rate(figures.rate_hz), age(figures.age_ms), fresh, `dropped ${count(figures.dropped)}`];
       if (figures.load !== undefined && figures.load !== null) parts.push(`load ${percent(figures.load)}`);

@@ -56,7 +56,7 @@ class Card {
     setText(this.value, `${past ? "≈ " : ""}${measure(value, sheet.unit)}`);
     const isOld = sheet.driver.isOld && !past;
     const text = isOld && status === 0 ? "stale: driver silent" : statusText(status);
-    setText(this.status, shown?.untouched ? `${text}; only 0 so far` : text);
+    setText(this.status, [text, shown?.untouched && "only 0 so far", shown?.why].filter(Boolean).join("; "));
     this.status.dataset.fresh = String(status === 0 && !isOld);
     setText(this.cells.raw, figure(past ? null : shown?.raw));
     setText(this.cells.age, age(past ? null : shown?.age_ms));

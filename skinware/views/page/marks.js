@@ -11,6 +11,8 @@ export const NEVER_SEEN = 7;
 export const NOT_CONNECTED = 8;
 export const UNTOUCHED = 9;
 const WITHOUT_VALUE = 10;
+const SETTLING = 11;
+const ALL_BITS = 0xff; // of a status: the baseline is not known yet
 
 export const DIMMED = 0x80; // beside the mark: not part of what is selected
 
@@ -26,6 +28,7 @@ export const MARKS = [
   { name: "not connected", sign: "crossed" },
   { name: "not touched", sign: "a bold rim" },
   { name: "no value", sign: "hollow" },
+  { name: "settling", sign: "hollow, until its baseline is known" },
 ];
 
 const BITS = [
@@ -40,6 +43,7 @@ const BITS = [
 ];
 
 const MARK_OF = Uint8Array.from({ length: 256 }, (_, status) => {
+  if (status === ALL_BITS) return SETTLING;
   const found = BITS.find(([, bit]) => status & bit);
   return found ? found[0] : FRESH;
 });
@@ -52,6 +56,7 @@ export const isCurrent = (mark) => (mark & ~DIMMED) !== STALE && (mark & ~DIMMED
 
 /** The names of a status' bits; "fresh" if there are none. */
 export function statusText(status) {
+  if (status === ALL_BITS) return MARKS[SETTLING].name;
   const names = BITS.filter(([, bit]) => status & bit).map(([mark]) => MARKS[mark].name);
   return names.length ? names.join(", ") : MARKS[FRESH].name;
 }

@@ -4,16 +4,7 @@ import { h, setChildren, setText } from "./dom.js";
 import { age, isKnown, percent, rate } from "./format.js";
 
 const COLLAPSED_FROM = 40; // patches of a driver: more are folded, but for those with problems
-const GOOD = new Set(["live", ""]);
-const WORST = 3;
-
-/** How bad a state is; the worst first in the tree. */
-export function badness(state) {
-  if (state === undefined || GOOD.has(state)) return 0;
-  if (/dead|gone|down|failed/.test(state)) return WORST;
-  if (/stale|silent|was /.test(state)) return 2;
-  return 1;
-}
+export const [OLD, GONE] = [2, 3]; // how bad a state is, as in skinware/state.py
 
 const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: distinguishable without colour
 
@@ -25,7 +16,7 @@ const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: distinguishable witho
 export function rowsOf(drivers, states) {
   const worst = (rows) => rows.toSorted((one, other) => other.bad - one.bad); // stable
   const rowOf = (level, key, name, report, more) => {
-    return { level, key, name, report: report ?? {}, bad: badness(report?.state), ...more };
+    return { level, key, name, report: report ?? {}, bad: report?.bad ?? 0, ...more };
   };
   const branches = [...drivers].map((driver) => {
     const state = states.get(driver.id);
@@ -39,7 +30,7 @@ export function rowsOf(drivers, states) {
       const row = rowOf(2, `${driver.key}/${bus}`, bus, state?.buses?.[b], { driver, bus: b });
       return { ...row, children: worst(patches), bad: Math.max(row.bad, ...patches.map(({ bad }) => bad)) };
     });
-    const row = rowOf(1, driver.key, driver.name, state ?? { state: driver.state }, { driver });
+    const row = rowOf(1, driver.key, driver.name, state, { driver });
     return { ...row, children: worst(buses), bad: Math.max(row.bad, ...buses.map(({ bad }) => bad)) };
   });
   return worst(branches);
@@ -101,7 +92,7 @@ export class Tree {
 
   #isFolded(row) {
     if (this.#folded.has(row.key)) return this.#folded.get(row.key);
-    if (row.level === 1) return badness(row.report.state) === WORST;
+    if (row.level === 1) return row.report.bad === GONE;
     return row.level === 2 && row.children.length > COLLAPSED_FROM;
   }
 
@@ -119,14 +110,14 @@ export class Tree {
       this.equip(element, () => this.find(element.dataset.key));
     }
     const [fold, sign, name, state, figures] = element.children;
-    const own = badness(row.report.state);
+    const own = row.report.bad ?? 0;
     setText(fold, row.children?.length ? (this.#isFolded(row) ? "▸" : "▾") : "");
     if (row.children?.length) element.setAttribute("aria-expanded", String(!this.#isFolded(row)));
     setText(sign, SIGNS[own]);
     element.dataset.bad = own;
     element.dataset.fresh = String(isFresh(row));
     setText(name, row.name);
-    setText(state, own ? [row.report.state, row.report.reason].filter(Boolean).join(": ") : "");
+    setText(state, own ? [row.report.shown ?? row.report.state, row.report.reason].filter(Boolean).join(": ") : "");
     const texts = figuresOf(row);
     while (figures.children.length < texts.length) figures.append(h("span"));
     texts.forEach((text, i) => setText(figures.children[i], text));

@@ -25,8 +25,9 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
+from skinware.status import Why
 from skinware.tactile.baseline import Calm
-from skinware.tactile.rule import BaselineSettings, Why
+from skinware.tactile.rule import BaselineSettings
 from tests.specification.baseline.numbers import (
     ALIKE,
     EPSILON,

@@ -24,9 +24,9 @@ SIZE = (1200, 700)
 EYE = "eye=0.02,-0.27,0.18,0.112,0.01,-0.004"
 BELOW = "eye=0.02,-0.27,-0.18,0.112,0.01,-0.004"
 """Of an emulated arm: from above, and from below, where its boards 9 and 10 are."""
-BOTH = "eye=0.16,-0.34,0.34,0.19,0.01,0"
+BOTH = "eye=0.2,-0.06,0.66,0.2,0.02,0"
 """Of the arm and the hand beside it."""
-MOVING = (960, 600)
+MOVING = (1100, 640)
 FRAMES, FRAME_MS = 40, 200
 """Of the moving picture; ``]`` goes so far on in a recording."""
 MOST_BYTES = 1_500_000

@@ -22,7 +22,7 @@ from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.stages import Signal, Taxels
 from skinware.tactile.testing import Response, World, arm, grid, triangles
-from skinware.tactile.thermal import ThermalSettings
+from skinware.tactile.thermal import ThermalStage
 from skinware.tactile.vectors import FieldSettings, VectorSettings
 
 ArrayF = npt.NDArray[np.float64]
@@ -126,8 +126,10 @@ def thermal_picture() -> str:
     module, of_pad, patch = np.arange(n) // 10, np.arange(pads) // 2, np.zeros(n, np.int64)
     pressure, temperature = (of.measured(unit="counts", minimum=0.0, maximum=255.0) for of in (PRESSURE, TEMPERATURE))
     uid = np.arange(n, dtype=np.uint64)
-    stage = ThermalSettings().stage(
-        Taxels(pressure, uid, module, patch, 1.0), Taxels(temperature, uid[:pads] + n, of_pad, patch[:pads], 1.0)
+    stage = ThermalStage(
+        Taxels(pressure, uid, module, patch, 1.0),
+        Taxels(temperature, uid[:pads] + n, of_pad, patch[:pads], 1.0),
+        spread=1.0,
     )
     with_stage, without = Baseline(module, patch), Baseline(module, patch)
     time_s = np.arange(900 * rate_hz) / rate_hz

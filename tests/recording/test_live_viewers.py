@@ -3,66 +3,40 @@
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import foxglove
 import numpy as np
-import rerun
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import RrdReader
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
-from skinware import Namespace
-from skinware.conversion.live import FoxgloveSink, RerunSink, Sink, stream
 from skinware.sensor_types import PRESSURE
+from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
+from tests.commands import PATIENCE_S, running
 from tests.views.test_scene import a_hand
 
-PROTOCOL, MESSAGE, HEAD = "foxglove.sdk.v1", 1, 13
+PROTOCOL, MESSAGE, HEAD = Subprotocol("foxglove.sdk.v1"), 1, 13
 """Its web sockets: the protocol, the code of a message, the bytes before its data."""
 
 
-@contextmanager
-def streamed(namespace: Namespace, sink: Sink) -> Iterator[FakeSkin]:
-    """A driver of which all pressures are 40, and that is shown."""
-    skin, stop = FakeSkin("torso", a_hand()), threading.Event()
+def torso() -> FakeSkin:
+    """A driver of which all pressures are 40."""
+    skin = FakeSkin("torso", a_hand())
     skin.values = np.full(skin.structure.n_sensors, 40)
-    thread = threading.Thread(target=stream, args=(namespace, (), sink, 50.0, stop))
-    with publishing(skin):
-        thread.start()
-        try:
-            yield skin
-        finally:
-            stop.set()
-            thread.join()
+    return skin
 
 
-def test_rerun_has_places_values_and_states(namespace: Namespace, tmp_path: Path) -> None:
-    recording, seen = rerun.RecordingStream("test"), threading.Event()
-    recording.save(tmp_path / "skin.rrd")
-    sink = RerunSink(recording)
-    show = sink.show
-
-    def shown(*arguments: Any) -> None:
-        show(*arguments)
-        seen.set()
-
-    sink.show = shown  # type: ignore[method-assign]
-    with streamed(namespace, sink) as skin:
-        assert seen.wait(60)
-    recording.flush()
-    recording.disconnect()
-    found: dict[str, list[Any]] = {}
-    for chunk in RrdReader(tmp_path / "skin.rrd").stream():
-        if chunk.entity_path == "/skin/torso/pressure":
-            batch = chunk.to_record_batch()
-            for name in set(batch.schema.names) - {"time", "log_time", "log_tick"}:
-                found.setdefault(name, []).extend(batch.column(name).to_pylist())
+def test_rerun_has_places_values_and_states(tmp_path: Path) -> None:
+    file = tmp_path / "skin.rrd"
+    with publishing(torso()) as skin, running("skin-bridge", "rerun", "-o", str(file)) as bridge:
+        bridge.wait_for("ready")
+        wait_until(lambda: file.exists() and file.stat().st_size > 30_000)  # some snapshots
+        bridge.stop()
+    found = _columns(file)
     structure = skin.structure
     assert structure.geometry is not None
     np.testing.assert_allclose(found["Points3D:positions"][0], structure.geometry.position_m, atol=1e-6)
@@ -74,25 +48,33 @@ def test_rerun_has_places_values_and_states(namespace: Namespace, tmp_path: Path
     assert len({tuple(row) for row in found["Points3D:colors"]}) == 1
 
 
-def test_foxglove_reads_points_and_states(namespace: Namespace) -> None:
-    context = foxglove.Context()
-    server = foxglove.start_server(name="skinware", port=0, context=context)
-    try:
-        with streamed(namespace, FoxgloveSink(context)) as skin, _client(server.port) as client:
-            channels: dict[str, Any] = {}
+def _columns(file: Path) -> dict[str, list[Any]]:
+    """The rows of each column of the driver's pressure."""
+    found: dict[str, list[Any]] = {}
+    for chunk in RrdReader(file).stream():
+        if chunk.entity_path == "/skin/torso/pressure":
+            batch = chunk.to_record_batch()
+            for name in set(batch.schema.names) - {"time", "log_time", "log_tick"}:
+                found.setdefault(name, []).extend(batch.column(name).to_pylist())
+    return found
+
+
+def test_foxglove_reads_points_and_states() -> None:
+    channels: dict[str, Any] = {}
+    messages: dict[str, bytes] = {}
+    with publishing(torso()) as skin, running("skin-bridge", "foxglove", "--port", "0") as bridge:
+        with connect(bridge.wait_for("ready")["to"], subprotocols=[PROTOCOL], max_size=None) as client:
             while "/skin/torso/state" not in channels:
-                told = json.loads(client.recv(60))
+                told = json.loads(client.recv(PATIENCE_S))
                 channels |= {each["topic"]: each for each in told.get("channels", [])}
-            ids = dict(enumerate(channels.values()))
-            wanted = [{"id": number, "channelId": channel["id"]} for number, channel in ids.items()]
+            topics = dict(enumerate(channels))
+            wanted = [{"id": number, "channelId": channels[topic]["id"]} for number, topic in topics.items()]
             client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-            messages: dict[str, bytes] = {}
             while len(messages) < len(channels):
-                data = client.recv(60)
+                data = client.recv(PATIENCE_S)
                 if isinstance(data, bytes) and data[0] == MESSAGE:
-                    messages[ids[int.from_bytes(data[1:5], "little")]["topic"]] = data[HEAD:]
-    finally:
-        server.stop()
+                    messages[topics[int.from_bytes(data[1:5], "little")]] = data[HEAD:]
+        bridge.stop()
     points = channels["/skin/torso/points/pressure"]
     schema = Schema(1, points["schema"].encode(), points["schemaEncoding"], points["schemaName"])
     decode = DecoderFactory().decoder_for(points["encoding"], schema)
@@ -103,7 +85,3 @@ def test_foxglove_reads_points_and_states(namespace: Namespace) -> None:
     expected = skin.structure.physical(np.full(skin.structure.n_sensors, 40), PRESSURE.name)
     np.testing.assert_allclose(np.ascontiguousarray(rows[:, at : at + 4]).view("<f4")[:, 0], expected)
     assert json.loads(messages["/skin/torso/state"])["driver"] == "torso"
-
-
-def _client(port: int) -> Any:
-    return connect(f"ws://127.0.0.1:{port}", subprotocols=[PROTOCOL], max_size=None)  # type: ignore[list-item]

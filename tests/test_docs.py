@@ -228,6 +228,7 @@ def as_it_can_run_here(name: str, words: list[str]) -> list[str] | None:
         bus = CAN_OF_EMULATORS if words[at].startswith(("vcan", "udp_multicast")) else words[at].partition("://")[0]
         bus = {"modbus:tcp": "pty", "udp": "udp://127.0.0.1:9", "tcp": "tcp://127.0.0.1:0"}.get(bus, bus)
         bus = {"websocket:ws": "websocket:ws://127.0.0.1:0", "yarp": words[at].replace("10000", "0")}.get(bus, bus)
+        bus = "dds://0" if bus == "dds" else bus
         return [*words[:at], "pty" if bus.startswith("pty:") else bus, *words[at + 1 :], "-T", "0"]
     is_short = name == "skin-info" or (name == "skin-dump" and "-n" in words and "--raw" not in words)
     return words if is_short and "--watch" not in words else None

@@ -1,4 +1,4 @@
-"""A node of a ROS 2 graph over DDS, for peers with rmw_cyclonedds or rmw_fastrtps. Only this module knows Cyclone DDS.
+"""A node of a ROS 2 graph over DDS, for peers with rmw_cyclonedds or rmw_fastrtps.
 
 Cyclone DDS gets messages as bytes: its own way, from Python objects, takes a hundred times as long for a point cloud.
 No thread of DDS calls back: it would wait for the interpreter.
@@ -6,16 +6,13 @@ No thread of DDS calls back: it would wait for the interpreter.
 
 from __future__ import annotations
 
-import os
-import re
 import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
-from skinware.errors import BridgeError, ConfigurationError, MissingExtra
+from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2 import messages
 from skinware.ros2.messages import DISCOVERY_TOPIC, PARTICIPANT_DATA, endpoint_data, entities
 from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
@@ -32,8 +29,8 @@ from cyclonedds.core import (
     ViewState,
     WaitSet,
 )
-from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import types as idl
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy
@@ -42,41 +39,15 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-_write_bytes: Callable[[int, bytes | bytearray], int] | None
-try:
-    from cyclonedds import _clayer
+from skinware.ros2.cyclone import join, reason, struct_type, write_bytes
 
-    _write_bytes = _clayer.ddspy_write
-except (ImportError, AttributeError):  # it is not public
-    _write_bytes = None
-
+_write_bytes = write_bytes
 _SERVICE_QOS = Qos(depth=10)
 _REQUESTS_AT_ONCE = 16
 _ENCAPSULATION = 4
 _REQUEST_ID = {"guid": idl.uint64, "sequence": idl.int64}
 _REQUEST_ID_SIZE = 16
 """Size of the header that rmw_cyclonedds writes before requests and responses."""
-_FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
-_ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
-_PLAIN = {
-    "bool": bool,
-    "byte": idl.uint8,
-    "float64": idl.float64,
-    "int32": idl.int32,
-    "int64": idl.int64,
-    "string": str,
-    "uint8": idl.uint8,
-    "uint32": idl.uint32,
-    "uint64": idl.uint64,
-}
-
-_LOOPBACK = (
-    "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
-    "<AllowMulticast>false</AllowMulticast></General><Discovery>"
-    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
-    "<Peers><Peer address='127.0.0.1'/></Peers></Discovery></Domain></CycloneDDS>"
-)
-_NETWORK = "<CycloneDDS><Domain id='any'><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>"
 
 
 class DdsNode:
@@ -93,15 +64,7 @@ class DdsNode:
 
     def __init__(self, identity: NodeIdentity, interfaces: Sequence[str] = ()) -> None:
         self._identity = identity
-        configuration = _configuration(interfaces)
-        try:
-            self._domain = Domain(identity.domain, configuration)
-            self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(PARTICIPANT_DATA)))
-        except DDSException as error:
-            raise BridgeError(
-                f"domain {identity.domain} of DDS cannot be joined ({_reason(error)}); is a network interface up,"
-                " and is CYCLONEDDS_URI in order?"
-            ) from None
+        self._domain, self._participant = join(identity.domain, interfaces, DdsQos(Policy.Userdata(PARTICIPANT_DATA)))
         self._lock = threading.RLock()
         self._writers: list[_DdsWriter] = []
         self._services: list[_DdsService] = []
@@ -180,7 +143,7 @@ class DdsNode:
         try:
             return kind(self._participant, Topic(self._participant, topic, _type(message_type, with_id)), policies)
         except DDSException as error:
-            raise BridgeError(f"{topic}: {_reason(error)}") from None
+            raise BridgeError(f"{topic}: {reason(error)}") from None
 
     def _closed(self, writer: _DdsWriter) -> None:
         with self._lock:
@@ -303,34 +266,4 @@ class _RequestThread:
 
 @cache
 def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
-    """Return a type for Cyclone DDS, which checks incoming messages by it."""
-    fields: dict[str, Any] = dict(_REQUEST_ID) if with_id else {}
-    for field in _FIELD.finditer(messages.definition(message_type)):
-        kind: Any = _PLAIN.get(field["type"]) or _type(MessageType(field["type"].replace("/", "/msg/"), ""))
-        if field["bound"]:
-            kind = idl.bounded_str[int(field["bound"])]
-        if field["length"]:
-            kind = idl.array[kind, int(field["length"])]
-        elif field["length"] is not None:
-            kind = idl.sequence[kind]
-        fields[field["name"]] = kind
-    plain = message_type.name.rpartition("/")[2]
-    made: type[IdlStruct] = make_idl_struct(plain, message_type.dds_name.replace("::", "."), fields)
-    return made
-
-
-def _configuration(interfaces: Sequence[str]) -> str:
-    """Return the configuration of Cyclone DDS; only one part of it may name interfaces, since it adds them up."""
-    given = os.environ.get("CYCLONEDDS_URI", "")
-    if given and interfaces:
-        raise ConfigurationError("--interface and CYCLONEDDS_URI both choose networks: give one of them")
-    if not interfaces:
-        return given or _LOOPBACK
-    named = (
-        f"<NetworkInterface {'address' if _ADDRESS.search(each) else 'name'}={quoteattr(each)}/>" for each in interfaces
-    )
-    return _NETWORK.format("".join(named))
-
-
-def _reason(error: DDSException) -> str:
-    return str(error).partition("] ")[2].partition(".")[0] or str(error)
+    return struct_type(message_type.name, messages.TEXTS, _REQUEST_ID if with_id else {})

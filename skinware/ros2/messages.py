@@ -86,10 +86,6 @@ OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
 """Types of point clouds and images, by the names of their definitions."""
 
 
-def definition(message_type: MessageType) -> str:
-    return TEXTS[message_type.name.replace("/msg/", "/")]
-
-
 DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""
 PARTICIPANT_DATA = b"enclave=/;"

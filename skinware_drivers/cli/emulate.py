@@ -89,7 +89,7 @@ def command(
     from skinware_drivers.cli.emulation import Emulation, PressingService, SignalWatch, report_to
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
-    from skinware_drivers.registry import make_bus
+    from skinware_drivers.registry import load_driver, make_bus
     from skinware_drivers.virtual.events import JsonLinesLog
     from skinware_drivers.virtual.hardware import load_emulator, medium_of
 
@@ -108,6 +108,8 @@ def command(
         raise ConfigurationError(
             f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"
         )
+    if hasattr(bus, "topics"):
+        bus.topics = getattr(load_driver(driver), "topics", ())
     with contextlib.ExitStack() as open_things:
         log = open_things.enter_context(contextlib.closing(JsonLinesLog(log_path))) if log_path else None
         hardware = emulator(options, log=log)

@@ -23,6 +23,7 @@ _DETECTION_S = 10.0
     "skin-find",
     "skin-find                     CAN interfaces, adapters, serial ports",
     "skin-find can0 --probe        ask which devices are on can0",
+    "skin-find dds://0             topics of DDS, and which driver reads them",
     "skin-find --udev              fixed names for the serial ports",
     "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
 )
@@ -87,7 +88,7 @@ async def look(
     from skinware_drivers.bus_names import BusName
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import Detection, can_interfaces, detect_adapters
-    from skinware_drivers.finding.looking import listen
+    from skinware_drivers.finding.looking import listen, topics_on
     from skinware_drivers.finding.running import running_drivers
     from skinware_drivers.registry import make_bus
 
@@ -103,6 +104,11 @@ async def look(
     async def search() -> Any:
         return Detection() if buses else await asyncio.to_thread(detect_adapters, _DETECTION_S)
 
+    topics = {
+        name: await asyncio.to_thread(topics_on, name, listen_s, known_drivers("serial", driver_names))
+        for name in networks
+        if BusName.of(name).interface == "dds"
+    }
     detection: Detection
     detection, *listened = await asyncio.gather(search(), *(listen(name, listen_s, drivers) for name in buses_to_hear))
     heard: dict[str, HeardOnBus] = {one.bus: one for one in listened}
@@ -112,7 +118,10 @@ async def look(
     answers = await _ask(heard, ports, networks, running, force, driver_names) if probe else {}
     return {
         "can": _can_data(interfaces, heard, answers, running, whole=not buses),
-        "buses": [_heard_data(name, heard, answers, running) for name in others],
+        "buses": [
+            _heard_data(name, heard, answers, running) | ({"topics": topics[name]} if name in topics else {})
+            for name in others
+        ],
         "adapters": detection.found,
         "adapters_problem": detection.problem,
         "ports": [_port_data(port, answers, running) for port in ports],

@@ -65,8 +65,19 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
     lines = []
     if bus["used_by"] is not None:
         lines += _wrapped(f"{bus['used_by']} runs on it")
-    heard, probe = bus["heard"], bus["probe"]
-    if heard is None and probe is None and bus["used_by"] is None and BusName.of(bus["bus"]).is_only_asked:
+    heard, probe, topics = bus["heard"], bus["probe"], bus.get("topics")
+    for one in topics or ():
+        readers = f"; read by {', '.join(one.drivers)}" if one.drivers else ""
+        lines += _wrapped(f"{one.topic}: {one.type_name}, {plural(one.publishers, 'publisher')}{readers}")
+    if topics == []:
+        lines += _wrapped("no topic is published in this domain; a robot's network is named as ?interface=eth0")
+    if (
+        topics is None
+        and heard is None
+        and probe is None
+        and bus["used_by"] is None
+        and BusName.of(bus["bus"]).is_only_asked
+    ):
         lines += _wrapped(
             f"not opened, because a connection may change what a device does; to ask which device is on it:"
             f" skin-find {bus['bus']} --probe"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from skinware.errors import BusError, BusNotAvailable, ConfigurationError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
@@ -16,6 +16,7 @@ from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, gues
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.registry import make_bus
 from skinware_drivers.running.news import reason_text, share_of_time
+from skinware_drivers.streams.dds import HeardTopic
 
 _CAN_PAYLOAD = 64
 _IDENTIFY_S = 5.0
@@ -161,6 +162,33 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
         problems.update(answer.problems)
     none = "no installed driver has a harmless question for serial devices"
     return ProbeAnswer(path, asked, answers, problems, "" if asked or problems else none)
+
+
+def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> list[HeardTopic]:
+    """Return the topics of a domain of DDS, and which drivers can read each; nothing is asked or published.
+
+    Args:
+        bus_name: as ``dds://0``; a bus of this name can be made.
+
+    Raises:
+        BusNotAvailable: the domain cannot be joined.
+    """
+    from skinware_drivers.streams.dds_ends import heard_topics
+
+    name = BusName.of(bus_name)
+    return [
+        replace(
+            heard,
+            drivers=tuple(
+                driver
+                for driver, kind in drivers.items()
+                if any(
+                    (one.name, one.dds_type) == (heard.topic, heard.type_name) for one in getattr(kind, "topics", ())
+                )
+            ),
+        )
+        for heard in heard_topics(name.channel, name.options, duration_s)
+    ]
 
 
 def can_ask(driver: type[AnyAdapter]) -> bool:

@@ -167,11 +167,13 @@ class ServerBus(SerialBus):
         ConfigurationError: an option is unknown or has a bad value.
     """
 
+    options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
+
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(ServerOptions, options or {})
+        self._options: Any = options_from_strings(self.options_class, options or {})
         self._heard_ns = 0
 
     @property

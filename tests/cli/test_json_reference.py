@@ -248,6 +248,7 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--listen", "1")
     no_interface = printing(find, "--listen", "0.1")
     # what is heard on an interface of the kernel, and who has it, is told as it is for other buses
+    heard[0]["buses"][0]["topics"] = [{"topic": "a", "type_name": "b", "publishers": 1, "drivers": ["dex3"]}]
     owner = {"name": "a", "namespace": "b", "driver_type": "c", "pid": 1, "buses": ["can0"]}
     machine[0]["can"]["interfaces"][0] |= {**heard[0]["buses"][0], "used_by": owner}
     machine[0]["ports"][0]["used_by"] = owner

@@ -34,6 +34,7 @@ from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
+from skinware_drivers.streams.dex3 import Dex3Driver
 from skinware_drivers.streams.icub_eth import IcubEthDriver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
@@ -49,6 +50,7 @@ from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.dex3 import EmulatedDex3
 from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
@@ -495,3 +497,8 @@ def test_every_driver_that_ships_is_here() -> None:
     suites = [suite for suite in globals().values() if isinstance(suite, type) and issubclass(suite, DriverConformance)]
     tested = [suite.driver for suite in suites if suite is not DriverConformance]
     assert names <= {f"{driver.__module__}:{driver.__qualname__}" for driver in tested}
+
+
+class TestDex3(DriverConformance):
+    driver = Dex3Driver
+    emulator = EmulatedDex3

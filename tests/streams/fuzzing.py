@@ -16,10 +16,12 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _Matrix
+from skinware_drivers.streams.dex3 import Dex3Driver, Dex3Options
 from skinware_drivers.streams.icub_eth import rops
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
+from skinware_drivers.virtual.devices.dex3 import EmulatedDex3, EmulatedDex3Options
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
@@ -52,6 +54,10 @@ def _icub() -> tuple[Framing, list[bytes]]:
     return rops(1), Spoken(EmulatedIcubEth(EmulatedIcubEthOptions(boards=(1, 7)))).answers(b"", 500)
 
 
+def _dex3() -> tuple[Framing, list[bytes]]:
+    return Dex3Driver(Dex3Options()).framing, Spoken(EmulatedDex3(EmulatedDex3Options())).answers(b"", 100)
+
+
 def _dsa() -> tuple[Framing, list[bytes]]:
     driver = WeissDsaDriver(WeissDsaOptions(rle_offset=5))
     driver._cells = (_Matrix(6, 14, 3.4, 3.4), _Matrix(6, 13, 3.4, 3.4))
@@ -65,6 +71,7 @@ DEVICES: dict[str, Callable[[], tuple[Framing, list[bytes]]]] = {
     "xela_server": _xela,
     "yarp": _yarp,
     "icub_eth": _icub,
+    "dex3": _dex3,
     "weiss_dsa": _dsa,
 }
 

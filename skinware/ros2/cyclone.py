@@ -1,0 +1,119 @@
+"""Cyclone DDS: join a domain, make types of their definitions, and write bytes."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import types as idl
+from cyclonedds.qos import Qos
+
+from skinware.errors import BridgeError, ConfigurationError
+
+write_bytes: Callable[[int, bytes | bytearray], int] | None
+"""Publish a message, encapsulation and all, of whole words, by the reference of a writer; negative: not published."""
+try:
+    from cyclonedds import _clayer
+
+    write_bytes = _clayer.ddspy_write
+except (ImportError, AttributeError):  # it is not public
+    write_bytes = None
+
+_FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
+_ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
+_PLAIN = {
+    "bool": bool,
+    "byte": idl.uint8,
+    "float32": idl.float32,
+    "float64": idl.float64,
+    "int16": idl.int16,
+    "int32": idl.int32,
+    "int64": idl.int64,
+    "string": str,
+    "uint8": idl.uint8,
+    "uint32": idl.uint32,
+    "uint64": idl.uint64,
+}
+
+_LOOPBACK = (
+    "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General><Discovery>"
+    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<Peers><Peer address='127.0.0.1'/></Peers></Discovery></Domain></CycloneDDS>"
+)
+_NETWORK = "<CycloneDDS><Domain id='any'><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>"
+
+
+def join(number: int, interfaces: Sequence[str], qos: Qos | None = None) -> tuple[Domain | None, DomainParticipant]:
+    """Join a domain as one participant; return what must be kept for as long, the second to be dropped first.
+
+    Args:
+        interfaces: networks to use, by the name or address of an interface of this machine; empty: as
+            ``CYCLONEDDS_URI`` says, or loopback alone if that is not set.
+        qos: of the participant.
+
+    Raises:
+        ConfigurationError: ``interfaces`` are given and ``CYCLONEDDS_URI`` is set.
+        BridgeError: the domain cannot be joined; the message says why.
+    """
+    configuration = _configuration(interfaces)
+    domain = None
+    try:
+        try:
+            domain = Domain(number, configuration)
+        except DDSException as error:
+            if error.code != DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:  # else this process is in it already
+                raise
+        return domain, DomainParticipant(number, qos)
+    except DDSException as error:
+        raise BridgeError(
+            f"domain {number} of DDS cannot be joined ({reason(error)}); is a network interface up,"
+            " and is CYCLONEDDS_URI in order?"
+        ) from None
+
+
+def struct_type(name: str, texts: Mapping[str, str], before: Mapping[str, Any] | None = None) -> type[IdlStruct]:
+    """Return a type for Cyclone DDS, which checks incoming messages by it.
+
+    Args:
+        name: in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``.
+        texts: definitions as in a ``.msg`` file, by type; names of messages are without ``msg``.
+        before: fields that come first.
+    """
+    fields: dict[str, Any] = dict(before or {})
+    for field in _FIELD.finditer(texts[name.replace("/msg/", "/")]):
+        kind: Any = _PLAIN.get(field["type"]) or struct_type(field["type"].replace("/", "/msg/"), texts)
+        if field["bound"]:
+            kind = idl.bounded_str[int(field["bound"])]
+        if field["length"]:
+            kind = idl.array[kind, int(field["length"])]
+        elif field["length"] is not None:
+            kind = idl.sequence[kind]
+        fields[field["name"]] = kind
+    package, kind, plain = name.split("/")
+    made: type[IdlStruct] = make_idl_struct(plain, f"{package}.{kind}.dds_.{plain}_", fields)
+    return made
+
+
+def reason(error: DDSException) -> str:
+    """Return the meaning of an error in a few words."""
+    return str(error).partition("] ")[2].partition(".")[0] or str(error)
+
+
+def _configuration(interfaces: Sequence[str]) -> str:
+    """Return the configuration of Cyclone DDS; only one part of it may name interfaces, since it adds them up."""
+    given = os.environ.get("CYCLONEDDS_URI", "")
+    if given and interfaces:
+        raise ConfigurationError("--interface and CYCLONEDDS_URI both choose networks: give one of them")
+    if not interfaces:
+        return given or _LOOPBACK
+    named = (
+        f"<NetworkInterface {'address' if _ADDRESS.search(each) else 'name'}={quoteattr(each)}/>" for each in interfaces
+    )
+    return _NETWORK.format("".join(named))

@@ -1,0 +1,225 @@
+"""Read topics of a DDS domain as a bus, each sample as the bytes that came (CDR): without ROS, and without publishing.
+
+A sample becomes a record of a stream: ``DD 5A``, length of the record u32, number of the topic u8, 0; the source's time
+in 10 us u32; the sample with its encapsulation; CRC-32 of everything before it. All numbers are little-endian.
+:func:`samples` is the framing of such streams, which captures keep.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import ConfigurationError
+from skinware.realtime import now_ns
+from skinware_drivers.bus import Bus
+from skinware_drivers.fields import DeviceTime
+from skinware_drivers.options import OptionsT
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.checksums import CRC32
+from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.serial.stream import CHUNK
+from skinware_drivers.streams.bus import ServerBus
+
+if TYPE_CHECKING:
+    from skinware_drivers.streams.dds_ends import DdsPort
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+HIGHEST_DOMAIN = 232
+ENCAPSULATION = 4
+_SYNC = b"\xdd\x5a"
+_HEAD = struct.Struct("<2sIBBI")
+_STAMP_NS = 10_000
+SOURCE_TIME = DeviceTime(0, "<u4", _STAMP_NS / 1e9)
+"""The time at which the publisher wrote a sample, in the body of its record."""
+
+
+@dataclass(frozen=True)
+class DdsTopic:
+    """A topic that a driver reads.
+
+    Attributes:
+        name: in DDS, which ROS 2 begins with ``rt/``.
+        type_name: as in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``.
+        texts: definitions as in ``.msg`` files, by type without ``msg``. Publishers whose type is another are not read;
+            a topic can be declared once for each edition of its type.
+        number: identifier of its samples, 0 to 255.
+    """
+
+    name: str
+    type_name: str
+    texts: Mapping[str, str] = field(hash=False)
+    number: int = 0
+
+    @property
+    def dds_type(self) -> str:
+        """The name of its type in DDS."""
+        package, kind, plain = self.type_name.split("/")
+        return f"{package}::{kind}::dds_::{plain}_"
+
+
+@dataclass(frozen=True)
+class HeardTopic:
+    """A topic of a domain.
+
+    Attributes:
+        type_name: in DDS; several topics of one name can differ in it.
+        publishers: number of them.
+        drivers: that can read it.
+    """
+
+    topic: str
+    type_name: str
+    publishers: int
+    drivers: tuple[str, ...] = ()
+
+
+def samples(longest: int) -> Packet:
+    """Return the framing of records.
+
+    Args:
+        longest: bytes of the longest sample, with its encapsulation.
+    """
+    return Packet(
+        sync=_SYNC,
+        length=Length(Field(2, 4), more=0),
+        maximum=_HEAD.size + longest + CRC32.size,
+        checksum=CRC32,
+        identifier=Field(6),
+        header=_HEAD.size - SOURCE_TIME.end,
+    )
+
+
+def record(number: int, source_ns: int, sample: bytes) -> bytes:
+    """Return the record of a sample that was written at a time, ns of any clock."""
+    head = _HEAD.pack(_SYNC, _HEAD.size + len(sample) + CRC32.size, number, 0, source_ns // _STAMP_NS & 0xFFFF_FFFF)
+    return head + sample + CRC32.to_bytes(head + sample)
+
+
+class DdsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    interface: Annotated[
+        tuple[str, ...],
+        Meta(description="networks, by name or address of an interface; default: CYCLONEDDS_URI, or loopback alone"),
+    ] = ()
+    qos: Annotated[
+        Literal["best_effort", "reliable"],
+        Meta(description="reliable: ask publishers for lost samples again; only of those that offer it"),
+    ] = "best_effort"
+    depth: Annotated[
+        int, Meta(ge=1, le=65536, description="samples of a topic that wait to be read; further ones are dropped")
+    ] = 1024
+
+
+def _need_package(name: str) -> None:
+    if find_spec("cyclonedds") is None:
+        raise ConfigurationError(f"{name}: needs the package cyclonedds: pip install 'skinware[ros2]'")
+
+
+def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
+    _need_package(f"bus dds://{channel}")
+    from skinware_drivers.streams.dds_ends import DdsDeviceBus
+
+    return DdsDeviceBus(channel, options, **more)
+
+
+class DdsBus(ServerBus):
+    """Topics of a domain. Its name is ``dds://DOMAIN?key=value``, with the number of the domain.
+
+    It joins the domain as one participant, which publishes no topic, and never asks a publisher to send more.
+    If several programs publish a topic, the first is read until it is gone or silent for 2 s; the samples of the others
+    are counted as refused, and those that waited too long as dropped. The log reports publishers that come and go,
+    that are doubled, or that cannot be read because their type or QoS is another.
+
+    Raises:
+        ConfigurationError: no such domain, an option is unknown or has a bad value, or the package cyclonedds is
+            missing.
+
+    Attributes:
+        topics: to read; :class:`DdsAdapter` sets them.
+    """
+
+    options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
+    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self.topics: Sequence[DdsTopic] = ()
+        self.domain: int = parse_domain(channel)
+        _need_package(self.name)
+        self._joined: DdsPort | None = None
+
+    @property
+    def name(self) -> str:
+        return f"bus dds://{self.channel}"
+
+    def check(self) -> None:
+        """Report publishers that cannot be read; that none sends is no reason to join the domain again."""
+        SerialBus.check(self)
+        self._report()
+
+    def _open_port(self) -> Port:
+        from skinware_drivers.streams.dds_ends import DdsPort
+
+        if not self.topics:
+            raise ConfigurationError(f"{self.name}: this driver reads no topics")
+        self._joined = DdsPort(self.name, self.domain, self._options, self.topics)
+        return self._joined
+
+    def _read(self, port: Port) -> None:
+        if records := port.read(CHUNK):
+            time_ns = now_ns()
+            for start in range(0, len(records), CHUNK):
+                self._hear(records[start : start + CHUNK], time_ns)
+        self._report()
+
+    def _report(self) -> None:
+        if self._joined is None or self._port is None:
+            return
+        self.counters.dropped += self._joined.take_dropped()
+        self.counters.refused += self._joined.take_refused()
+        for level, text in self._joined.take_news(now_ns()):
+            log.log(level, "%s: %s", self.name, text)
+
+
+def parse_domain(channel: str) -> int:
+    """Return the number of a domain.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    if not (channel.isascii() and channel.isdecimal() and int(channel[:9]) <= HIGHEST_DOMAIN):
+        raise ConfigurationError(f"bus dds://{channel}: write dds://DOMAIN with a number up to 232, as dds://0")
+    return int(channel)
+
+
+class DdsAdapter(SerialAdapter[OptionsT]):
+    """A driver that reads topics of DDS; its framing finds the records of :func:`samples`.
+
+    Attributes:
+        topics: that it reads, with numbers by which its layout knows them.
+    """
+
+    topics: Sequence[DdsTopic] = ()
+
+    def fit(self, bus: Bus) -> None:
+        """Give the bus framing and topics.
+
+        Raises:
+            ConfigurationError: it is another kind of bus.
+        """
+        super().fit(bus)
+        if isinstance(bus, DdsBus):
+            bus.topics = self.topics

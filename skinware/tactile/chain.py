@@ -56,7 +56,7 @@ from skinware.tactile.stages import (
     Taxels,
 )
 from skinware.tactile.thermal import ThermalSettings
-from skinware.tactile.vectors import FieldSettings, VectorSettings, vectors_of
+from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
@@ -343,6 +343,11 @@ class Chain:
     def curve_stages(self) -> dict[str, CurveStage]:
         """By type, the last stage of each that is a curve."""
         return {name: s for name, stages in self.stages.items() for s in stages if isinstance(s, CurveStage)}
+
+    @property
+    def vectors(self) -> list[tuple[str, ...]]:
+        """The types that are axes of vectors, for each stage that shows vectors."""
+        return [names for stage, names in self._steps if isinstance(stage, VectorStage)]
 
     @property
     def baselines(self) -> dict[str, Baseline]:

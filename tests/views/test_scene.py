@@ -246,16 +246,15 @@ def test_a_module_across_fingers_is_a_pad_on_each() -> None:
     assert pads.is_on_hand.all()
     assert (pressure.total, pressure.has_loads) == ("highest", True)
     (plain,) = quantities_of(structure)  # without places
-    assert (plain.pads.names, plain.pads.is_on_hand.any()) == (["hand"], False)
+    assert plain.pads.names == ["hand"]
+    assert not plain.pads.is_on_hand.any()
 
 
 def test_two_hands_of_one_driver_lie_beside_each_other_with_their_outlines() -> None:
-    structure = structure_of([(0, "10x4", 40)] * 2)
-    grid, uids = Grid(10, 4), structure.sensor_uid.reshape(2, -1).tolist()
-    parts = [
-        grid.at(Hand(side).down("index", [grid])[0], ["pressure"], uid)
-        for side, uid in zip(("right", "left"), uids, strict=True)
-    ]
+    structure, grid = structure_of([(0, "10x4", 40)] * 2), Grid(10, 4)
+    first, second = structure.sensor_uid.reshape(2, -1).tolist()
+    places_of = [Hand("right").down("index", [grid])[0], Hand("left").down("index", [grid])[0]]
+    parts = [grid.at(place, ["pressure"], uid) for place, uid in zip(places_of, (first, second), strict=True)]
     scene = scene_of(both=structure.placed(Geometry.joined(parts)))
     places = scene.of("both", "pressure").position
     right, left = places[:40], places[40:]

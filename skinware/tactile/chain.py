@@ -25,12 +25,13 @@ The file is TOML; every key of a stage except ``stage`` is optional::
     stage = "amplifier"         # gain * value ** exponent + offset
     exponent = 0.5
 
-``field`` before a baseline and ``vector`` behind it are for taxels with three axes: see skinware.tactile.vectors.
+``thermal`` before a baseline takes off what temperature does: see skinware.tactile.thermal. ``field`` before a baseline
+and ``vector`` behind it are for taxels with three axes: see skinware.tactile.vectors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -54,7 +55,8 @@ from skinware.tactile.stages import (
     Stage,
     Taxels,
 )
-from skinware.tactile.vectors import FieldSettings, VectorSettings, vectors_of
+from skinware.tactile.thermal import ThermalSettings
+from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
@@ -144,6 +146,7 @@ AnySettings = (
     | AmplifierSettings
     | FieldSettings
     | VectorSettings
+    | ThermalSettings
 )
 
 
@@ -208,9 +211,7 @@ class ChainSettings:
                     raise ConfigurationError(
                         f"{self._place(number)}: no sensor type {name!r}; there are: {', '.join(taxels)}"
                     )
-            groups: list[tuple[str, ...]] = [(name,) for name in wanted]
-            if isinstance(settings, FieldSettings | VectorSettings):
-                groups = [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
+            groups = _groups(settings, taxels, wanted)
             for names in groups:
                 try:
                     stage = settings.stage(*(taxels[name] for name in names))
@@ -222,9 +223,25 @@ class ChainSettings:
                     steps.append((stage, names))
                     taxels |= zip(names, stage.axes, strict=True)
             if len(refused) == len(groups):
-                why = "; ".join(refused) or f"{tag}: no three types in one unit are the axes of the same taxels"
+                why = "; ".join(refused) or f"{tag}: {_WHY_NO_GROUPS[type(settings)]}"
                 raise ConfigurationError(f"{self._place(number)}: {why}")
         return Chain(structure, steps, taxels)
+
+
+_WHY_NO_GROUPS: dict[type, str] = {
+    ThermalSettings: f"it needs sensors of type {TEMPERATURE}, and others that have a rest",
+    FieldSettings: "no three types in one unit are the axes of the same taxels",
+    VectorSettings: "no three types in one unit are the axes of the same taxels",
+}
+
+
+def _groups(settings: AnySettings, taxels: Mapping[str, Taxels], wanted: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return the types that a stage changes together, for each time that it is made."""
+    if isinstance(settings, FieldSettings | VectorSettings):
+        return [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
+    if isinstance(settings, ThermalSettings):
+        return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(_RESTLESS)]
+    return [(name,) for name in wanted]
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,6 +343,11 @@ class Chain:
     def curve_stages(self) -> dict[str, CurveStage]:
         """By type, the last stage of each that is a curve."""
         return {name: s for name, stages in self.stages.items() for s in stages if isinstance(s, CurveStage)}
+
+    @property
+    def vectors(self) -> list[tuple[str, ...]]:
+        """The types that are axes of vectors, for each stage that shows vectors."""
+        return [names for stage, names in self._steps if isinstance(stage, VectorStage)]
 
     @property
     def baselines(self) -> dict[str, Baseline]:

@@ -19,15 +19,15 @@ from skinware.errors import ConfigurationError, NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.tactile.chain import BaselineStage, Chain, ChainState
+from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.contacts import ContactSet
-from skinware.tactile.contacts_service import ContactsWriter, More
+from skinware.tactile.contacts_service import ContactsWriter
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
+from skinware.tactile.loads import Loads
 from skinware.tactile.motion_service import NAME, MotionWriter
 from skinware.tactile.neighbours import Table, neighbours, posed
-from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
-from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
+from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.source_service import ServiceOptions, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -102,7 +102,9 @@ class DerivedService(ABC, Generic[WriterT]):
 
 
 class CalmContacts(DerivedService[ContactsWriter]):
-    """The contacts of one calmed driver, found in its pressure sensors, or else in others that a touch only raises.
+    """The contacts of one calmed driver.
+
+    They are found in pressures, or else in another type that a touch only raises, or else in the lengths of vectors.
 
     Args:
         name, driver, into, group: as for :class:`DerivedService`.
@@ -131,10 +133,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         self.motion: CalmMotion | None = None
         if watched is not None:
             self.motion = CalmMotion(watched.name, driver, into, group, watched.regions)
-        self._type_name = ""
-        self._chain: Chain | None = None
-        self._stage: BaselineStage | None = None
-        self._onsets = Onsets(0)
+        self._loads: Loads | None = None
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         """See :class:`DerivedService`."""
@@ -143,13 +142,14 @@ class CalmContacts(DerivedService[ContactsWriter]):
             self.motion.contacts, self.motion.type_name = self._writer, self._type_name
             self.motion.follow(chain, rate_hz)
 
+    @property
+    def _type_name(self) -> str:
+        return "" if self._loads is None else self._loads.type_name
+
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
-        stages = {name: stage for name, stage in chain.baseline_stages.items() if not name.startswith(SIGNED_TYPES)}
-        before, type_name = self._type_name, "pressure" if "pressure" in stages else next(iter(stages), "")
-        self._chain, self._stage, self._type_name, self.count = chain, stages.get(type_name), type_name, 0
-        if self._stage is not None:
-            self._onsets = Onsets(len(self._stage.before), self._stage.before.resolution)
-        beside = self._neighbours(chain)
+        before = self._type_name
+        self._loads, self.count = Loads.of(chain), 0
+        type_name, beside = self._type_name, self._neighbours(chain)
         if self._writer is not None and type_name == before:
             self._writer.restructure(chain.structure, neighbours=beside)
             return
@@ -177,36 +177,23 @@ class CalmContacts(DerivedService[ContactsWriter]):
             status: (n_sensors,) output of the chain; sensors without a value of this frame touch nothing.
             acquired_ns: of the frame.
         """
-        if self._writer is None or self._chain is None or self._stage is None:
+        if self._writer is None or self._loads is None:
             return
-        index = self._chain.structure.index(self._type_name)
-        usable = (status[index] & UNUSABLE) == 0
+        usable, loads = self._loads.usable(status), self._loads.values(values)
+        more = self._loads.more(usable, self._writer.source.unit)
         try:
-            found = self._writer.publish(
-                values[index], self._stage.touched & usable, acquired_ns, **self._more(self._stage, usable)
-            )
+            found = self._writer.publish(loads, self._loads.touched & usable, acquired_ns, **more)
         except NameInUse as error:
             self._give_up(error)
             return
         self.count = len(found)
         if self.motion is not None:
-            self.motion.publish(found, values[index], acquired_ns)
-
-    def _more(self, stage: BaselineStage, usable: npt.NDArray[np.bool_]) -> More:
-        """Return onsets, clipped taxels and uncertainties, as far as they are known."""
-        calm = stage.calm
-        if calm is None:
-            return {}
-        doubt = np.hypot(calm.noise, calm.uncertainty)
-        onset = self._onsets.update(stage.given - calm.baseline, doubt, usable & calm.usable)
-        same_unit = self._writer is not None and self._writer.source.unit == stage.before.type.unit
-        clipped = stage.given >= stage.before.type.maximum
-        return {"onset": onset, "clipped": clipped, "uncertainty": doubt if same_unit else None}
+            self.motion.publish(found, loads, acquired_ns)
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""
-        if self._chain is not None:
-            n = self._chain.structure.n_sensors
+        if self._loads is not None:
+            n = self._loads.n_sensors
             self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
 
     def close(self) -> None:

@@ -95,19 +95,29 @@ class Newest:
         )
         return marked
 
-    def totals(self, quantity: Quantity) -> npt.NDArray[np.float64] | None:
-        """Return (n_modules,) the load on each module, in the quantity's unit.
+    def totals(self, quantity: Quantity, rest: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float64] | None:
+        """Return (n_pads,) the load on each pad, the sum or the highest of its values, in the quantity's unit.
 
-        None where values are no loads: they are counts, and no calmed driver has their baselines.
+        Args:
+            rest: (n_sensors,) values at rest that are taken off; None: none are.
+
+        Returns:
+            None where values are no loads: counts, but on a hand or beside a calmed driver, and other quantities.
         """
         loads = self.above_baseline(quantity)
-        if loads is None and not quantity.type.unit.endswith("N"):
-            return None
-        loads = self.physical(quantity) if loads is None else loads
+        if loads is None:
+            if not quantity.has_loads:
+                return None
+            loads = self.physical(quantity)
+            loads = loads if rest is None else loads - rest[quantity.where]
         loads = np.where((self.status[quantity.where] & WITHOUT_VALUE) == 0, np.nan_to_num(loads), 0)
-        structure = self.frame.structure
-        module = structure.sensor_module[quantity.where]
-        return np.bincount(module, loads, structure.n_modules).astype(np.float64)
+        pads = quantity.pads
+        pad = pads.of_sensor[quantity.where]
+        if quantity.total != "highest":
+            return np.bincount(pad, loads, len(pads.names)).astype(np.float64)
+        highest = np.zeros(len(pads.names))
+        np.maximum.at(highest, pad, loads)
+        return highest
 
 
 class Origin:

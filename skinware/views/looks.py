@@ -130,6 +130,8 @@ class QuantityPicture(NamedTuple):
     """(n, 2) int8; None where there is no shear."""
     longest_shear: float
     """The shear that 127 means."""
+    totals: npt.NDArray[np.float64] | None
+    """(n_pads,) see :meth:`skinware.views.following.Newest.totals`."""
 
 
 class Look:
@@ -211,7 +213,9 @@ class Look:
         if self.mode == "wipe":  # only sensors that moved further have the highest level, whatever rounding does
             levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
         shear, longest = _shear(newest, quantity, memory)
-        return QuantityPicture(quantity, levels, scale, shear, longest)
+        rest = None if self.mode == "raw" else memory.rest.baseline
+        totals = None if self.mode == "wipe" else newest.totals(quantity, rest)
+        return QuantityPicture(quantity, levels, scale, shear, longest, totals)
 
     def _memory_of(self, driver: ShownDriver) -> Memory:
         memory = self._memories.get(driver.number)
@@ -227,6 +231,9 @@ class Look:
         if self.mode == "raw":
             values = newest.physical(quantity)
             known = (quantity.type.minimum, quantity.type.maximum)
+            if known[0] == 0 and quantity.type.unit.endswith("N"):  # few forces come near the end of their range
+                span = memory.span((name, self.mode), values[fresh], memory.rest.noise(name), newest.frame.published_ns)
+                return values, (0.0, min(span, known[1]))
             counting = values if np.isfinite(known).all() else values[fresh]
             return values, memory.limits((name, self.mode), counting, known)
         noise = memory.rest.noise(name)

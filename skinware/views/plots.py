@@ -74,7 +74,7 @@ class _Feed:
             ids = [line.contact for line in lines.values()]
             self._values = lambda sample: _loads(sample, ids)
         else:
-            self._values = _sums(driver.structure, [_sensors_of(driver, line) for line in lines.values()])
+            self._values = _totals(driver, list(lines.values()))
 
     def take(self) -> bool:
         """Take the newer samples, and return whether some wait; raise what the reader raises."""
@@ -204,7 +204,7 @@ def _sensors_of(driver: ShownDriver, line: Line) -> Sensors:
         return np.array([line.position] if line.position < structure.n_sensors else [], np.int64)
     if quantity is None:
         return np.zeros(0, np.int64)
-    return quantity.index[np.isin(structure.sensor_module[quantity.index], line.modules)]
+    return quantity.index[np.isin(quantity.pads.of_sensor[quantity.index], line.modules)]
 
 
 def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
@@ -214,27 +214,30 @@ def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
     return units[:, 0], units[:, 1]
 
 
-def _sums(structure: Structure, lines: list[Sensors]) -> Callable[[DriverSnapshot], Values]:
-    """Return a function of a snapshot: the (m,) sums of the values of each line's sensors."""
-    some = [sensors for sensors in lines if len(sensors)]
+def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot], Values]:
+    """Return a function of a snapshot: (m,) the sums of the values of each line's sensors; the highest of pressures."""
+    of_lines = [_sensors_of(driver, line) for line in lines]
+    has_sensors = np.array([len(sensors) > 0 for sensors in of_lines], bool)
+    some = [sensors for sensors in of_lines if len(sensors)]
     at = np.concatenate([np.zeros(0, np.int64), *some])
-    scale, offset = _units_of(structure, at)
+    scale, offset = _units_of(driver.structure, at)
     starts = np.cumsum([0, *map(len, some)])[:-1]
-    has_sensors = np.array([len(sensors) > 0 for sensors in lines], bool)
+    quantities = [driver.quantity(line.type) for line in lines]
+    highest = np.array([one is not None and one.total == "highest" for one in quantities], bool)[has_sensors]
 
-    def sums(frame: DriverSnapshot) -> Values:
+    def totals(frame: DriverSnapshot) -> Values:
         found = np.full(len(lines), np.nan)
         if not some:
             return found
         values = frame.values[at] * scale + offset
         unknown = np.isnan(values) | ((frame.status[at] & _NO_VALUE) != 0)
         values[unknown] = 0
-        of_lines = np.add.reduceat(values, starts)
+        of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))
         of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan
         found[has_sensors] = of_lines
         return found
 
-    return sums
+    return totals
 
 
 def _loads(sample: ContactsSample, ids: list[int | None]) -> Values:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from skinware._columns import Index
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
+from skinware.nominal_hand import PARTS, parts_at, side_of
 from skinware.sensor_types import (
     ACCELERATION,
     ANGULAR_RATE,
@@ -38,6 +39,21 @@ _LONGEST = 127
 _STEEPEST = float(np.finfo(np.float32).max)
 
 
+class Pads(NamedTuple):
+    """The modules of a driver; one with sensors on several fingers of a nominal hand is a pad on each.
+
+    Attributes:
+        of_sensor: (n_sensors,) int64.
+        names, module: of each pad.
+        is_on_hand: (n_sensors,) bool.
+    """
+
+    of_sensor: npt.NDArray[np.int64]
+    names: list[str]
+    module: list[int]
+    is_on_hand: npt.NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class Quantity:
     """A picture of a skin: n taxels with a value each, and a vector where sensors of three axes lie together.
@@ -49,6 +65,7 @@ class Quantity:
         where: the same, as a slice if it is one.
         axes: names of the types of the two axes within the skin; empty where the skin has no such sensors.
         shear: (n, 2) int64, positions of the sensors of these axes, -1 without one.
+        pads: of all sensors of the driver.
     """
 
     name: str
@@ -58,6 +75,7 @@ class Quantity:
     geometry: Geometry
     axes: tuple[str, ...]
     shear: npt.NDArray[np.int64]
+    pads: Pads
 
     def __len__(self) -> int:
         return len(self.index)
@@ -66,6 +84,19 @@ class Quantity:
     def is_touch(self) -> bool:
         """Whether a touch changes its values."""
         return self.type.id not in _NO_TOUCH
+
+    @property
+    def total(self) -> Literal["sum", "highest"] | None:
+        """How loads of several taxels add up: forces to their sum, pressures to the highest; None: not at all."""
+        if self.type.unit.endswith("Pa"):
+            return "highest"
+        return "sum" if self.type.unit.endswith("N") or self.type.id in _NORMAL else None
+
+    @cached_property
+    def has_loads(self) -> bool:
+        """Whether ``total`` of its values is a load: of counts only on a hand, where untouched taxels have none."""
+        is_count = not self.type.unit.endswith(("N", "Pa"))
+        return self.total is not None and (not is_count or bool(self.pads.is_on_hand[self.where].all()))
 
     @cached_property
     def pitch_m(self) -> float:
@@ -101,7 +132,7 @@ def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
         if (prefix != name or name == PRESSURE.name) and types.keys() >= set(pair):
             names[name], axes[name] = prefix, pair
     shown = [name for name in types if not any(name in pair for pair in axes.values())]
-    positions = np.arange(structure.n_sensors)
+    positions, pads = np.arange(structure.n_sensors), pads_of(structure)
     found = []
     for name in shown:
         where = structure.index(name)
@@ -116,6 +147,7 @@ def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
                 Geometry.unknown([name] * len(uid), uid) if geometry is None else geometry[where],
                 axes.get(name, ()),
                 _with_uids(structure, uid.tolist(), axes.get(name, ())),
+                pads,
             )
         )
     return tuple(found)
@@ -129,6 +161,26 @@ def _with_uids(structure: Structure, uids: list[int], types: tuple[str, ...]) ->
         known = dict(zip(structure.sensor_uid[positions].tolist(), positions, strict=True))
         columns.append([known.get(uid, -1) for uid in uids])
     return np.array(columns, np.int64).reshape(len(types), len(uids)).T
+
+
+def pads_of(structure: Structure) -> Pads:
+    """Return the pads of a driver in the order of its modules."""
+    part = np.full(structure.n_sensors, -1)
+    geometry = structure.geometry
+    for frame in () if geometry is None else set(geometry.frame[geometry.known].tolist()):
+        side = side_of(frame)
+        if geometry is not None and side is not None:
+            here = geometry.known & (geometry.frame == frame)
+            part[here] = parts_at(geometry.position_m[here], side)
+    module = structure.sensor_module.astype(np.int64)
+    least, most = np.full(structure.n_modules, len(PARTS)), np.full(structure.n_modules, -1)
+    np.minimum.at(least, module[part >= 0], part[part >= 0])
+    np.maximum.at(most, module, part)
+    own = np.where((least < most)[module], part + 1, 0)
+    keys, of_sensor = np.unique(module * (len(PARTS) + 1) + own, return_inverse=True)
+    modules, parts = np.divmod(keys, len(PARTS) + 1)
+    names = np.where(parts > 0, np.array(["", *PARTS])[parts], np.array(structure.module_names)[modules])
+    return Pads(of_sensor.astype(np.int64), names.tolist(), modules.tolist(), part >= 0)
 
 
 def physical_values(frame: DriverSnapshot) -> npt.NDArray[np.float32]:

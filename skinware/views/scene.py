@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.matrices import filled_by
+from skinware.nominal_hand import PARTS, outline, parts_at, side_of
 from skinware.structure import Structure
 from skinware.views.quantities import Quantity
 
@@ -89,7 +90,9 @@ _ROWS_OF_TRIANGLES = 3**0.5 / 2
 _BETWEEN_ISLANDS = 0.15
 """Gap between bodies, as a part of the width of the right one; at least some pitches."""
 _NOMINAL = "_nominal"
-"""End of the name of a coordinate frame that each driver has for itself, such as ``hand_nominal``."""
+"""In the name of a coordinate frame that each driver has for itself, such as ``right_hand_nominal``."""
+_BEHIND_M = 0.0015
+"""Distance of outlines behind the taxels."""
 _SAME_PLACE_M = 1e-4
 
 
@@ -133,6 +136,7 @@ class Scene:
         self._low, self._high = 0.0, 0.0  # its y
         self._placed: dict[tuple[str, str], Placed] = {}
         self._pose_of: dict[tuple[str, str], Pose] = {}  # by driver and frame
+        self._outlines: dict[tuple[str, str], list[npt.NDArray[np.float64]]] = {}
         self._arrange_bodies(_bodies({name: s.geometry for name, (s, _) in drivers.items() if s.geometry is not None}))
         flat = {
             name: [laid_out(structure, quantity.index[~quantity.geometry.known]) for quantity in quantities]
@@ -149,10 +153,23 @@ class Scene:
         """Return (4, 4), the place of a driver's coordinate frame; the identity for a frame without its taxels."""
         return self._pose_of.get((driver, frame), np.eye(4))
 
+    def outlines(self, driver: str) -> list[Places]:
+        """Return (k, 3) m: the corners of the fingers and palms of a driver's nominal hands, behind its taxels."""
+        found = []
+        for (name, frame), outlines in self._outlines.items():
+            if name == driver:
+                pose = self.pose(driver, frame)
+                behind = [(at - [0, 0, _BEHIND_M]) @ pose[:3, :3].T + pose[:3, 3] for at in outlines]
+                found += [at.astype(np.float32) for at in behind]
+        return found
+
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
         for body in sorted(bodies, key=lambda body: (not self._is_placed(body), body.drivers[0], body.frame)):
             pose = self._poses.get(body.frame, np.eye(4)).copy()
-            corners = np.array(np.meshgrid(*zip(body.at.min(axis=0), body.at.max(axis=0), strict=True))).reshape(3, -1)
+            outlines = _hand_around(body)
+            self._outlines |= {(driver, body.frame): outlines for driver in body.drivers if outlines}
+            places = np.concatenate([body.at, *outlines])
+            corners = np.array(np.meshgrid(*zip(places.min(axis=0), places.max(axis=0), strict=True))).reshape(3, -1)
             at = pose[:3, :3] @ corners + pose[:3, 3:]
             if not self._is_placed(body):
                 gap = max(_BETWEEN_ISLANDS * np.ptp(at[0]), 2 * _BETWEEN_PATCHES * FLAT_PITCH_M)
@@ -209,6 +226,15 @@ class _Body:
     at: npt.NDArray[np.float64]
 
 
+def _hand_around(body: _Body) -> list[npt.NDArray[np.float64]]:
+    """Return the outlines of the parts of a nominal hand on which a body's taxels are, and of the palm."""
+    side = side_of(body.frame)
+    if side is None:
+        return []
+    parts = {*parts_at(body.at, side).tolist(), len(PARTS) - 1}
+    return [outline(name, side) for number, name in enumerate(PARTS) if number in parts]
+
+
 def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
     """Return all bodies; the drivers of each are in the order of their names."""
     found: dict[str, list[_Body]] = {}
@@ -216,7 +242,7 @@ def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
         for frame in _frames(geometry):
             bodies = found.setdefault(frame, [])
             at = geometry.position_m[geometry.known & (geometry.frame == frame)]
-            shared = [] if frame.endswith(_NOMINAL) else [body for body in bodies if not _is_same(body.at, at)]
+            shared = [] if _NOMINAL in frame else [body for body in bodies if not _is_same(body.at, at)]
             if shared:
                 shared[0].drivers.append(driver)
                 shared[0].at = np.concatenate([shared[0].at, at])

@@ -215,9 +215,8 @@ class Viewer:
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
-        totals = None if self.look.mode == "wipe" else newest.totals(quantity)
-        if totals is not None:
-            shown["totals"] = blobs.add(totals, "<f4")
+        if picture.totals is not None:
+            shown["totals"] = blobs.add(picture.totals, "<f4")
         status, key = newest.marked[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):
@@ -312,7 +311,7 @@ def _seen(driver: ShownDriver) -> tuple[int, int]:
 
 
 def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
-    structure = driver.structure
+    structure, pads = driver.structure, driver.quantities[0].pads
     types = []
     for quantity in driver.quantities:
         placed, index = scene.of(driver.name, quantity.name), quantity.index
@@ -321,11 +320,12 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "name": quantity.name,
                 "unit": quantity.type.unit,
                 "touch": quantity.is_touch,
+                "total": quantity.total,
                 "n": len(quantity),
                 "index": blobs.add(index, "<u4"),
                 "uid": blobs.add(structure.sensor_uid[index], "<u8"),
                 "patch": blobs.add(structure.sensor_patch[index], "<u2"),
-                "module": blobs.add(structure.sensor_module[index], "<u2"),
+                "module": blobs.add(pads.of_sensor[index], "<u2"),
                 "names": "lazy",
                 "position": blobs.add(placed.position, "<f4"),
                 "normal": blobs.add(placed.normal, "<f4"),
@@ -335,7 +335,8 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
             }
             | ({"axes": ["x", "y", "z"]} if quantity.axes else {})
         )
-    kinds = [kind.decode() for kind in structure.module_kind.tolist()]
+    patches = structure.module_patch[pads.module].tolist()
+    kinds = [kind.decode() for kind in structure.module_kind[pads.module].tolist()]
     return {
         "id": driver.number,
         "name": driver.name,
@@ -350,6 +351,7 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
         ],
         "modules": [
             {"name": name, "patch": patch, "kind": kind}
-            for name, patch, kind in zip(structure.module_names, structure.module_patch.tolist(), kinds, strict=True)
+            for name, patch, kind in zip(pads.names, patches, kinds, strict=True)
         ],
+        "bodies": [blobs.add(outline, "<f4") for outline in scene.outlines(driver.name)],
     }

@@ -31,11 +31,12 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware_drivers import Identifier, Link, Match, Options, Patch, Poll, operation
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, TouchQuestion, every_layout, parts_heard
-from skinware_drivers.hand import FINGERS, Hand
+from skinware_drivers.hand import Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
 

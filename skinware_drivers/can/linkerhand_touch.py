@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers import Match, Module, Sensor, taxels
 from skinware_drivers.fields import Bits, Byte, Condition, Identifier, Sentinel
-from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
+from skinware_drivers.hand import PITCH_M, Grid, Hand
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
 
 PARTS = (*FINGERS, "palm")

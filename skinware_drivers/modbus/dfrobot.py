@@ -26,7 +26,7 @@ from skinware.status import Status
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.fields import Above, AnyFlag, Flag, Sentinel
-from skinware_drivers.hand import Grid
+from skinware_drivers.hand import Grid, Place
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
 from skinware_drivers.modbus.registers import Registers
@@ -166,4 +166,4 @@ def _patch(unit: int, shape: Shape) -> Patch:
 
 def _places(unit: int, grid: Grid) -> Geometry:
     """Return nominal places: no pitch is published, and how two arrays lie to each other is not known."""
-    return grid.at((0.0, 0.0, 0.0), ["pressure"], _uids(unit, grid), f"unit_{unit}_nominal")
+    return grid.at(Place(f"unit_{unit}_nominal"), ["pressure"], _uids(unit, grid))

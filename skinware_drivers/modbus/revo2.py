@@ -25,12 +25,13 @@ from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, taxels
 from skinware_drivers.fields import AnyFlag, Flag, Sentinel
-from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException

@@ -24,11 +24,12 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import Sentinel
-from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException

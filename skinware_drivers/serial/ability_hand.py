@@ -34,10 +34,11 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
 _FINGERS = ("index", "middle", "ring", "little", "thumb")
-_SITES_M = ((0.0, 0.0), (0.0, 0.006), (-0.004, 0.006), (-0.004, 0.020), (0.004, 0.006), (0.004, 0.020))
-"""Across and down the finger, from its outermost sensor: upper and lower tip, upper and lower left, and right. Source:
-the maker's ``fsrlocs_to_xml.py``, fingers of the large hand; it does not say which side is the left one."""
-_N = len(_SITES_M)
+_SITES = Grid(21, 9, 0.001)
+_CELLS = [down * _SITES.columns + 4 + across for down, across in ((0, 0), (6, 0), (6, -4), (20, -4), (6, 4), (20, 4))]
+"""Down and across the finger, mm, from its outermost sensor: upper and lower tip, upper and lower left, and right.
+Source: the maker's ``fsrlocs_to_xml.py``, fingers of the large hand; it does not say which side is the left one."""
+_N = len(_CELLS)
 _TOUCH_AT, _FINGER_BYTES, _BODY = 24, 9, 70
 _MOST = 4095
 _FINGER = 0x100
@@ -120,9 +121,8 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
 def _places(hand: Hand, type_name: str) -> Geometry:
     found = []
     for number, finger in enumerate(_FINGERS):
-        [(x, y, z)] = hand.down(finger, [Grid(1, 1)])
-        for site, (across, down) in enumerate(_SITES_M, _N * number):
-            found.append(Grid(1, 1).at((x + across, y - down, z), [type_name], [site]))
+        [place] = hand.down(finger, [_SITES])
+        found.append(_SITES.at(place, [type_name], range(_N * number, _N * (number + 1)), _CELLS))
     return Geometry.joined(found)
 
 

@@ -28,7 +28,7 @@ from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, taxels
 from skinware_drivers.fields import Byte, Identifier, Sentinel
-from skinware_drivers.hand import Grid
+from skinware_drivers.hand import Grid, Place
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
@@ -121,7 +121,7 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         self.layout = Layout([Frame("matrix", [Identifier(0), *of_size], [cells.end], cells, flags=flags)])
         self._read_on()
         pitch_m, uid = self.options.pitch_mm / 1e3, range(rows * columns)
-        self.geometry = Grid(rows, columns, pitch_m).at((0.0, 0.0, 0.0), ["pressure"], uid, _FRAME)
+        self.geometry = Grid(rows, columns, pitch_m).at(Place(_FRAME), ["pressure"], uid)
         return (Patch("pad", (Module(taxels(len(uid)), kind=f"{rows}x{columns}", name="matrix"),)),)
 
     @classmethod

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE_X, FORCE_Y, FORCE_Z, SensorType
 from skinware.status import Status
 from skinware_drivers import Layout, Link, Module, Notice, Patch, Poll, Sentinel, Values, taxels
-from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.hand import PITCH_M, Grid, Hand
 from skinware_drivers.serial.framing import Framing
 
 TAXEL = 3
@@ -68,6 +70,9 @@ _MODELS: Mapping[int, str] = {
 """Models by their number of taxels, which differs for all models."""
 
 _UID_OF_MODULE = 16
+_WIDEST_MM = 18
+_IN_A_ROW = 4
+_PALM = Grid(8, 4 * _IN_A_ROW, 0.0034)
 _PLACES = ("near", "middle", "tip", "nail")
 _FROM_THE_END = ("nail", "tip", "middle", "near")
 
@@ -136,6 +141,9 @@ class Slot:
             return _PLACES[self.number % len(_PLACES)]
         return str(self.number - len(FINGERS) * len(_PLACES) + 1)
 
+    def uid(self, point: int) -> int:
+        return (self.number << _UID_OF_MODULE) + point
+
     @property
     def name(self) -> str:
         """For people: ``index tip``, ``palm 3``."""
@@ -143,23 +151,34 @@ class Slot:
 
 
 def nominal_places(slots: Sequence[Slot], hand: Hand) -> Geometry | None:
-    """Return nominal places of the modules of a hand, the taxels of each in a compact block; None: no taxels.
+    """Return nominal places of the modules of a hand, the taxels of each in a block; None: no taxels.
 
-    No map of the taxels of all models is public: a block shows on which module a taxel is, not where on it.
+    No map of the taxels of all models is public: a block shows on which module a taxel is, not where on it. The palm's
+    modules are in rows of four.
     """
-    found = []
-    for part in (*FINGERS, "palm"):
+    found, names = [], [t.name for t in _TAXEL_TYPES]
+    for part in FINGERS:
         here = [slot for slot in slots if slot.part == part and slot.points]
-        here.sort(key=lambda slot: _FROM_THE_END.index(slot.place) if slot.is_on_finger else slot.number)
-        blocks = []
-        for slot in here:
-            columns = math.isqrt(slot.points - 1) + 1
-            blocks.append(Grid(-(-slot.points // columns), columns))
-        for slot, block, centre in zip(here, blocks, hand.down(part, blocks), strict=True):
-            first_uid = slot.number << _UID_OF_MODULE
-            uid = range(first_uid, first_uid + slot.points)
-            found.append(block.at(centre, [t.name for t in _TAXEL_TYPES], uid))
+        here.sort(key=lambda slot: _FROM_THE_END.index(slot.place))
+        blocks = [_block(slot.points) for slot in here]
+        for slot, block, place in zip(here, blocks, hand.down(part, blocks), strict=True):
+            found.append(block.at(place, names, [slot.uid(point) for point in range(slot.points)]))
+    [place] = hand.down("palm", [_PALM])
+    for slot in slots:
+        if not slot.is_on_finger and slot.points:
+            row, column = divmod(int(slot.place) - 1, _IN_A_ROW)
+            points = [divmod(point, 3) for point in range(slot.points)]
+            cells = [(4 * row + down) * _PALM.columns + 4 * column + across for down, across in points]
+            found.append(_PALM.at(place, names, [slot.uid(point) for point in range(slot.points)], cells))
     return Geometry.joined(found) if found else None
+
+
+def _block(points: int) -> Grid:
+    """Return a grid of the size in the model's name, if its digits are mm, but no wider than a finger."""
+    digits = re.search(r"(\d\d)(\d\d)", _MODELS.get(points, ""))
+    length, width = map(int, digits.groups()) if digits else (1, 1)
+    columns = max(1, round(math.sqrt(points * width / length)))
+    return Grid(-(-points // columns), columns, min(width, _WIDEST_MM) / columns / 1e3 if digits else PITCH_M)
 
 
 class PaxiniBoard(ABC):

@@ -26,11 +26,12 @@ from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Module, Options, Patch, operation, taxels
 from skinware_drivers.fields import Above, AnyFlag, DeviceTime, Identifier, Sentinel
-from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
+from skinware_drivers.hand import PITCH_M, Grid, Hand
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split

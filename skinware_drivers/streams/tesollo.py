@@ -27,11 +27,12 @@ from msgspec import Meta
 
 from skinware.errors import BusError
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.fields import Identifier, Match, Sentinel
-from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
@@ -81,6 +82,10 @@ _MODELS = {
 }
 
 
+_PITCH_M = 0.0035
+"""Distance of cells that fill a fingertip: the maker publishes none."""
+
+
 class _Tip(NamedTuple):
     """A fingertip: cells in a grid or, without a grid, axes of a force sensor."""
 
@@ -97,9 +102,9 @@ class _Tip(NamedTuple):
 _TIPS = {
     1: _Tip("six axes", ">i2", 6),
     2: _Tip("three axes", ">i2", 6),
-    3: _Tip("TACTILE_M", "u1", 15, Grid(3, 5)),
+    3: _Tip("TACTILE_M", "u1", 15, Grid(3, 5, _PITCH_M)),
     4: _Tip("four axes", ">i2", 6),
-    5: _Tip("TACTILE_S", ">u2", 18, Grid(3, 6)),
+    5: _Tip("TACTILE_S", ">u2", 18, Grid(3, 6, _PITCH_M)),
 }
 _FORCES = ["force_x", "force_y", "force_z"]
 _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}

@@ -29,7 +29,7 @@ from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import DeviceTime, Identifier, Match, Reply, Sentinel
-from skinware_drivers.hand import Grid
+from skinware_drivers.hand import Grid, Place
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import Options
@@ -276,7 +276,7 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
                 )
             )
             if grid:
-                places.append(grid.at((_APART_M * position, 0.0, 0.0), names, uids))
+                places.append(grid.at(Place("sensors_nominal", (_APART_M * position, 0.0, 0.0)), names, uids))
         self.layout = Layout(frames)
         self.geometry = Geometry.joined(places) if places else None
         return patches

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page
 
 from skinware_drivers.testing.waiting import wait_until
-from tests.browser.browsing import PHONE, Troubles, look, tell, until
+from tests.browser.browsing import DRIVER, PHONE, Troubles, look, tell, until
 from tests.browser.fake_server import FakeDriver, FakeServer
 
 OpenPage = Callable[..., Page]
@@ -206,7 +206,7 @@ def test_a_wipe_test_lists_what_was_not_touched(page: Page, server: FakeServer, 
     driver.levels[[3, 141]] = [249, 0]
     server.look["mode"] = "wipe"
     page.locator(role("mode", "[data-mode=wipe]")).click()
-    until(page, "skin.untouched.join() === '0,3,0,141'")
+    until(page, f"skin.untouched.join() === '0,3,0,141' && skin.stateOf({DRIVER}, 3).name")
     with page.expect_download() as download:
         page.keyboard.press("l")
     lines = download.value.path().read_text().splitlines()

@@ -62,8 +62,8 @@ HAND = """(() => {
     Object.assign(sheet, { normal: Array(10).fill([0, 0, 1]).flat(), patch: Array(10).fill(0) });
     sheet.module = Array.from({ length: 10 }, (_, i) => i >> 1);
     sheet.shown.totals = a[1];
-    const stage = { pixels: 100, camera: { position: { toArray: () => [2, 3, a[2]] } } };
-    stage.project = (x, y, z) => [a[0] * 100 * x, -a[0] * 100 * y, 1 / a[0]];
+    const stage = { pixels: 100, width: 2000, camera: { position: { toArray: () => [2, 3, a[2]] } } };
+    stage.project = (x, y, z) => [a[0] * 100 * x + 500, 1500 - a[0] * 100 * y, 1 / a[0]];
     const found = new m.Names();
     found.arrange([sheet]);
     return found.place(stage);

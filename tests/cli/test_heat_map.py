@@ -11,9 +11,9 @@ from skinware import Status, Structure
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, arrange, codes_of, levels_of, marks_of
 from skinware.errors import StructureError
+from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.hand import FINGERS
 from tests.cli.fake_skin import fake_structure
 
 FINGERTIPS = [

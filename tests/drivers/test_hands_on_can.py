@@ -13,6 +13,7 @@ import pytest
 
 from skinware import Status
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.nominal_hand import FINGERS
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5Options, AllegroV5UdpDriver
@@ -20,7 +21,6 @@ from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.fields import Match
-from skinware_drivers.hand import FINGERS
 from skinware_drivers.link import Link
 from skinware_drivers.registry import NamedBus, load_driver
 from skinware_drivers.virtual.bus import VirtualCanBus

@@ -15,7 +15,6 @@ from skinware import DriverReader, DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.description import assemble
-from skinware_drivers.hand import FRAME
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.registers import Wanted
@@ -150,7 +149,7 @@ def test_all_taxels_have_nominal_places(side: str) -> None:
     structure = assemble([("bus", driver.patches)], driver.types, driver.dtype).structure
     mine = places.of(structure, "pressure")
     assert mine.known.all()
-    assert set(mine.frame) == {FRAME}
+    assert set(mine.frame) == {f"{side}_hand_nominal"}
     apart = np.linalg.norm(mine.position_m[:, None] - mine.position_m[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     assert apart.min() > 0.0019

@@ -6,22 +6,23 @@ import numpy as np
 import pytest
 
 from skinware.geometry import Geometry
-from skinware_drivers.hand import FINGERS, FRAME, Grid, Hand
+from skinware.nominal_hand import FINGERS
+from skinware_drivers.hand import Grid, Hand, Place
 
 
 def test_a_grid_lies_as_a_person_sees_it() -> None:
-    places = Grid(2, 3, pitch_m=0.01).at((1.0, 2.0, 3.0), ["pressure"], range(10, 16))
+    places = Grid(2, 3, pitch_m=0.01).at(Place("here", (1.0, 2.0, 3.0)), ["pressure"], range(10, 16))
     assert places.uid.tolist() == list(range(10, 16))
     assert places.known.all()
     assert np.allclose(places.position_m[0], [0.99, 2.005, 3.0])  # the upper left one
     assert np.allclose(places.position_m[2], [1.01, 2.005, 3.0])
     assert np.allclose(places.position_m[5], [1.01, 1.995, 3.0])
     assert (places.normal == [0, 0, 1]).all()
-    assert set(places.frame) == {FRAME}
+    assert set(places.frame) == {"here"}
 
 
 def test_all_axes_of_a_taxel_are_at_its_place() -> None:
-    places = Grid(1, 2).at((0, 0, 0), ["force_x", "force_y", "force_z"], [7, 9])
+    places = Grid(1, 2).at(Place("here"), ["force_x", "force_y", "force_z"], [7, 9])
     of_z = places.at(["force_z"], np.array([9], np.uint64))
     of_x = places.at(["force_x"], np.array([9], np.uint64))
     assert len(places) == 6
@@ -30,9 +31,9 @@ def test_all_axes_of_a_taxel_are_at_its_place() -> None:
 
 
 def test_the_last_taxels_of_a_grid_may_be_missing_and_none_are_too_many() -> None:
-    assert len(Grid(2, 3).at((0, 0, 0), ["pressure"], range(5))) == 5
+    assert len(Grid(2, 3).at(Place("here"), ["pressure"], range(5))) == 5
     with pytest.raises(ValueError, match="7 taxels have no place in a grid of 2 x 3"):
-        Grid(2, 3).at((0, 0, 0), ["pressure"], range(7))
+        Grid(2, 3).at(Place("here"), ["pressure"], range(7))
 
 
 def test_grids_of_a_finger_follow_each_other_and_no_two_taxels_are_at_one_place() -> None:
@@ -54,8 +55,10 @@ def test_grids_of_a_finger_follow_each_other_and_no_two_taxels_are_at_one_place(
 
 def test_the_thumb_of_a_right_hand_is_right_and_a_left_hand_is_mirrored() -> None:
     right, left = (Hand(side).down("thumb", [Grid(1, 1)])[0] for side in ("right", "left"))
-    assert right[0] > Hand("right").down("index", [Grid(1, 1)])[0][0] > 0
-    assert (left[0], left[1]) == (-right[0], right[1])
+    assert right.centre_m[0] > Hand("right").down("index", [Grid(1, 1)])[0].centre_m[0] > 0
+    assert (left.centre_m[0], left.centre_m[1]) == (-right.centre_m[0], right.centre_m[1])
+    assert (right.frame, left.frame) == ("right_hand_nominal", "left_hand_nominal")
+    assert left.turned_rad == -right.turned_rad > 0  # its tip points away from the fingers
 
 
 def test_a_part_that_no_hand_has_is_refused() -> None:

@@ -13,6 +13,7 @@ from skinware import DriverSnapshot, Status, Structure
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import MAGNETIC_FIELD
 from skinware.tactile.chain import ChainSettings
+from skinware.tactile.loads import Loads
 from skinware.tactile.stages import Taxels
 from skinware.tactile.vectors import ArrayField, FieldSettings, vectors_of
 from tests.cli.fake_skin import fake_structure
@@ -108,6 +109,16 @@ def test_a_chain_takes_the_axes_of_a_driver_together(tmp_path: Path) -> None:
     assert values.reshape(8, 3)[0] == pytest.approx([3, 0, 40], abs=2)
     assert not values[3:].any()
     assert not (status & Status.NEVER_SEEN).any()
+    loads = Loads.of(chain)
+    assert loads is not None
+    assert loads.type_name == "magnetic_field_z"
+    assert loads.values(values)[0] == pytest.approx(40.1, abs=2)
+    assert np.flatnonzero(loads.touched).tolist() == [0]
+    status[1] = Status.STALE
+    assert np.flatnonzero(~loads.usable(status)).tolist() == [0]
+    more = loads.more(loads.usable(status), "uT")
+    assert more["uncertainty"] is not None
+    assert not np.any(more["clipped"])
 
 
 def test_a_driver_without_vectors_or_with_few_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import Bits, Byte, Identifier, Match, SequenceNumber
-from skinware_drivers.hand import Grid
+from skinware_drivers.hand import Grid, Place
 from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
@@ -256,7 +256,7 @@ class NoMatrix(Fingertips):
     patches = tuple(
         Patch(f"finger {node}", [Module(taxels(6, first_uid=node << 8), kind="2x3")], key=node) for node in NODES
     )
-    geometry = Grid(3, 2).at((0.0, 0.0, 0.0), ["pressure"], [NODES[0] << 8 | taxel for taxel in range(6)])
+    geometry = Grid(3, 2).at(Place("pad"), ["pressure"], [NODES[0] << 8 | taxel for taxel in range(6)])
 
 
 class ChangesItsMind(Fingertips):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from skinware import Structure
 from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS, frame_of
 from skinware.sensor_types import (
     FORCE,
     FORCE_Z,
@@ -26,7 +28,7 @@ from skinware.sensor_types import (
 from skinware.views.quantities import quantities_of, types_of
 from skinware.views.scene import ASPECT, FLAT_PITCH_M, Scene
 from skinware_drivers.description import Module, Patch, Sensor, assemble, taxels
-from skinware_drivers.hand import FINGERS, FRAME, Grid, Hand
+from skinware_drivers.hand import Grid, Hand
 from tests.cli.fake_skin import fake_structure
 from tests.tactile.skins import triangles
 
@@ -143,22 +145,23 @@ def test_frames_lie_beside_each_other_or_where_they_are_said_to_be() -> None:
 
 def a_hand(
     side: Literal["right", "left"] = "right",
-    frame: str = FRAME,
+    frame: str | None = None,
     fingers: tuple[str, ...] = ("thumb", "middle"),
     rows: int = 10,
 ) -> Structure:
     """Fingers of ``rows`` x 4 taxels with their places."""
     structure = structure_of([(0, f"{rows}x4", 4 * rows)] * len(fingers))
     grid, uids = Grid(rows, 4), structure.sensor_uid.reshape(len(fingers), -1).tolist()
-    centres = [Hand(side).down(finger, [grid])[0] for finger in fingers]
-    parts = [grid.at(centre, ["pressure"], uid, frame) for centre, uid in zip(centres, uids, strict=True)]
+    places = [Hand(side).down(finger, [grid])[0] for finger in fingers]
+    places = [replace(place, frame=frame or place.frame) for place in places]
+    parts = [grid.at(place, ["pressure"], uid) for place, uid in zip(places, uids, strict=True)]
     return structure.placed(Geometry.joined(parts))
 
 
-@pytest.mark.parametrize("frame", [FRAME, "palm"], ids=["nominal", "measured"])
-def test_two_hands_lie_beside_each_other_in_any_order_of_start(frame: str) -> None:
+@pytest.mark.parametrize("frame", [None, "palm"], ids=["nominal", "measured"])
+def test_two_hands_lie_beside_each_other_in_any_order_of_start(frame: str | None) -> None:
     """In the nominal frame a right and a left one; in another frame two of one model, which have the same places."""
-    hands = {"right": a_hand("right", frame), "left": a_hand("left" if frame == FRAME else "right", frame)}
+    hands = {"right": a_hand("right", frame), "left": a_hand("right" if frame else "left", frame)}
     scene = scene_of(**hands)
     left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
     assert right[:, 0].min() - left[:, 0].max() > 0.1 * np.ptp(left[:, 0])
@@ -168,9 +171,9 @@ def test_two_hands_lie_beside_each_other_in_any_order_of_start(frame: str) -> No
         assert np.array_equal(other_way.of(name, "pressure").position, scene.of(name, "pressure").position)
     geometry = hands["right"].geometry
     assert geometry is not None
-    moved = geometry.position_m + scene.pose("right", frame)[:3, 3]  # as contacts are
+    moved = geometry.position_m + scene.pose("right", frame or "right_hand_nominal")[:3, 3]  # as contacts are
     assert np.allclose(right, moved)
-    assert np.array_equal(scene.pose("left", frame), np.eye(4))
+    assert np.array_equal(scene.pose("left", frame or "left_hand_nominal"), np.eye(4))
 
 
 def test_hands_of_two_models_lie_beside_each_other() -> None:
@@ -182,9 +185,9 @@ def test_hands_of_two_models_lie_beside_each_other() -> None:
 def test_a_second_driver_of_a_frame_with_a_pose_is_turned_alike_and_beside() -> None:
     pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], float)
     hands = {name: (hand, quantities_of(hand)) for name in ("left", "right") for hand in [a_hand()]}
-    scene = Scene(hands, {FRAME: pose})
+    scene = Scene(hands, {frame_of("right"): pose})
     left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
-    assert np.array_equal(scene.pose("left", FRAME), pose)
+    assert np.array_equal(scene.pose("left", frame_of("right")), pose)
     assert right[:, 0].min() > left[:, 0].max()
     assert np.allclose((right - left)[:, 1:], 0)
 

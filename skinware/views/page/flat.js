@@ -2,22 +2,25 @@
 
 import { Matrix4 } from "./vendor/three.min.js";
 import * as marks from "./marks.js";
+import { BODY, GROUND } from "./palette.js";
 import { CLEAR, DIM, INSIDE, inksOf, signOf } from "./signs.js";
+import { outlinesOf } from "./skin.js";
 
 const PLACE = 5; // numbers of a taxel's place: x, y, radius (negative: from inside), slopes of its disc
 
 export class Flat {
   constructor(host, theme) {
     this.canvas = document.createElement("canvas");
-    this.context = this.canvas.getContext("2d", { alpha: false });
+    this.context = this.canvas.getContext("2d", { alpha: false, willReadFrequently: true });
     host.prepend(this.canvas);
     this.setTheme(theme);
     this.setSheets([]);
   }
 
   setTheme(theme) {
+    this.theme = theme;
     this.inks = inksOf(theme);
-    this.ground = this.inks[0].ground;
+    this.seenFrom = "";
   }
 
   setSheets(sheets) {
@@ -54,7 +57,7 @@ export class Flat {
   render(camera) {
     if (!this.image) return;
     this.#place(camera);
-    this.pixels.fill(this.ground);
+    this.pixels.set(this.ground);
     for (const at of this.order) this.#paint(at);
     this.context.putImageData(this.image, 0, 0);
   }
@@ -69,6 +72,10 @@ export class Flat {
     this.seenFrom = from;
     const pixels = height / (2 * Math.tan((camera.fov * Math.PI) / 360));
     const row = (m, r, x, y, z, w) => m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r] * w;
+    this.#drawGround((x, y, z) => {
+      const depth = row(all, 3, x, y, z, 1);
+      return [(0.5 + row(all, 0, x, y, z, 1) / (2 * depth)) * width, (0.5 - row(all, 1, x, y, z, 1) / (2 * depth)) * height];
+    });
     let at = 0;
     for (const { n, position, normal, radius } of this.sheets) {
       for (let i = 0; i < n; i++, at++) {
@@ -96,6 +103,20 @@ export class Flat {
     }
     this.order.forEach((_, i, order) => (order[i] = i));
     this.order.sort((one, other) => this.depths[other] - this.depths[one]);
+  }
+
+  /** What is behind all taxels: the fingers and palms of nominal hands. */
+  #drawGround(project) {
+    const { context, canvas, theme } = this;
+    context.fillStyle = `rgb(${GROUND[theme]})`;
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    context.fillStyle = `rgb(${BODY[theme]})`;
+    for (const { n, position } of outlinesOf(this.sheets)) {
+      context.beginPath();
+      for (let i = 0; i < n; i++) context.lineTo(...project(...position.subarray(3 * i, 3 * i + 3)));
+      context.fill();
+    }
+    this.ground = new Uint32Array(context.getImageData(0, 0, canvas.width, canvas.height).data.buffer);
   }
 
   #paint(at) {

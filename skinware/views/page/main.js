@@ -14,7 +14,7 @@ import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
 import { Moving } from "./moving.js";
-import { Names, partAt } from "./names.js";
+import { Grip, labelAt, Names } from "./names.js";
 import { Overlay } from "./overlay.js";
 import { pick } from "./picking.js";
 import { Plotting } from "./plotting.js";
@@ -95,12 +95,14 @@ const cards = new Cards(byId("tip"), byId("pins"), plotting, (probe) => pin(prob
 const tree = new Tree(byId("tree"), choose, (row, find) => plotting.draggable(row, () => plotting.row(find())));
 const bar = new Bar(byId("bar"));
 const list = new Problems(byId("problems"), (key) => choose(tree.find(key) ?? null));
-const touches = new Touches(byId("contacts"), byId("regions"), (row, contactOf) => {
-  const lineOf = () => plotting.contact(contactOf().of, contactOf());
-  plotting.draggable(row, lineOf);
-  row.addEventListener("click", () => plotting.strips.add(lineOf()));
-  row.addEventListener("keydown", (event) => event.key === "Enter" && plotting.strips.add(lineOf()));
-});
+const touches = new Touches(
+  Object.fromEntries(["loads", "contacts", "regions"].map((id) => [id, byId(id)])),
+  (row, lineOf) => plotting.plottable(row, lineOf),
+  { contact: (contact) => plotting.contact(contact.of, contact), part: (part) => plotting.part(part) },
+  () => names.release(),
+);
+const grip = new Grip(byId("grip"));
+plotting.plottable(byId("grip"), () => plotting.part(grip.part));
 const legend = new Legend((scale) => {
   view.scale = scale;
   look();
@@ -170,6 +172,7 @@ function turn(message) {
   if (!rewind.isPaused) {
     remember(header.pictures);
     if (header.pictures || header.state || header.skin) show();
+    if (header.pictures) names.hold();
   }
   if (performance.now() - now.figures_ms > FIGURES_EVERY_MS) showFigures();
   afterFrame(() => link.next());
@@ -251,7 +254,7 @@ function showFigures() {
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
   bar.update(skin, states, stage);
   const row = selected();
-  touches.update(contacts(), stage.sheets.flatMap(({ shown }) => shown.regions ?? []));
+  touches.update(names.listed, contacts(), stage.sheets.flatMap(({ shown }) => shown.regions ?? []));
   if (view.mode === "wipe") wipe.update(progressOf(stage.sheets, taxelsOf(row) ?? (() => true)), row?.name ?? "");
   legend.update(stage.sheets, row ? stage.sheets.filter(({ driver }) => driver === row.driver) : stage.sheets, view.scale);
   setHidden(byId("legend"), !stage.sheets.length);
@@ -282,7 +285,7 @@ function sheetsChanged() {
 function frameAll(isFirst = false) {
   const isIn = selection();
   const isShown = isIn ?? (() => true);
-  stage.frame(isShown, isFirst || isIn ? directionOf(stage.sheets, isShown, stage.picture) : null);
+  stage.frame(isShown, isFirst || isIn ? directionOf(stage.sheets, isShown, stage.picture) : null, !isIn);
 }
 
 /** The row that is selected; null without one. */
@@ -455,18 +458,22 @@ function keep() {
 
 onPointer(byId("stage"), {
   over: (x, y) => {
+    if (x !== null) grip.show(view.names && labelAt(names.place(stage), x, y));
     hover(x === null ? null : pick(stage, stage.sheets, x, y));
     cards.place(x, y, stage.width, stage.height);
   },
   click: (x, y) => {
-    const part = view.names && partAt(names.place(stage), x, y);
-    if (part) return plotting.strips.add(plotting.part(part));
+    const label = view.names && labelAt(names.place(stage), x, y);
+    if (label) return plotting.strips.add(plotting.part(label.part));
     const found = pick(stage, stage.sheets, x, y);
     if (found) pin(found);
   },
 });
 const clicks = {
-  tare: () => send({ op: "tare" }),
+  tare: () => {
+    send({ op: "tare" });
+    names.release();
+  },
   record: () => send({ op: "record", action: now.recording ? "stop" : "start" }),
   picture: () => picture("png"),
   theme: () => setTheme(view.theme === "dark" ? "light" : "dark", true),

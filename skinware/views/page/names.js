@@ -1,12 +1,13 @@
 // Name hands, fingers, pads and boards above their taxels, each while it is large enough in the picture.
 
+import { setHidden } from "./dom.js";
 import { measure } from "./format.js";
 
 export const FONT = "600 11px system-ui, sans-serif";
 const LINE = 14; // pixels
 const [FADED, WHOLE] = [0.8, 1.3]; // size of a part, in widths of its name, at which that is not seen yet, and is seen whole
 const NUMBERED = 3; // times that size for one of many, "triangle 4", whose neighbours its name would cover
-const MOST_LINES = 4; // that a name may stand higher to be free
+const LINES = [0, 1, 2, 3, 4, -1, -2]; // that a name may stand higher to be free, or lower
 const CORNERS = Array.from({ length: 8 }, (_, k) => [k & 1, (k >> 1) & 1, k >> 2]);
 const ruler = document.createElement("canvas").getContext("2d");
 const widths = new Map();
@@ -30,10 +31,21 @@ class Part {
     this.diameter = Math.hypot(...this.low.map((low, c) => this.high[c] - low));
   }
 
-  /** Sum of its loads; 0 also where they are not known. */
+  /** Sum or highest of its loads; null where they are not known. */
   get total() {
-    const { totals } = this.sheet.shown;
-    return totals ? this.modules.reduce((sum, module) => sum + totals[module], 0) : 0;
+    const { shown, total } = this.sheet;
+    const totals = shown.totals && this.modules.map((module) => shown.totals[module]);
+    if (!totals) return null;
+    return total === "highest" ? Math.max(...totals) : totals.reduce((sum, load) => sum + load, 0);
+  }
+
+  /** The load that its name has: now, or in the mode of peaks the most so far. */
+  get load() {
+    return this.sheet.shown.mode === "peak" ? this.peak : this.total;
+  }
+
+  hold() {
+    if (this.total !== null) this.peak = Math.max(this.peak ?? -Infinity, this.total);
   }
 
   isAway(eye) {
@@ -49,6 +61,24 @@ export class Names {
     this.#parts = sheets.flatMap((sheet) => partsOf(sheet, areSeveral)).sort((a, b) => a.size - b.size);
   }
 
+  /** Those with a load, for a list: hands, fingers, pads that have a name of their own, and boards, as they follow each other. */
+  get listed() {
+    const listed = this.#parts.filter((part) => part.total !== null && (part.size || !isNumbered(part.name)));
+    const firstOf = ({ sheet, modules }) => 1e6 * sheet.driver.id + Math.min(...modules);
+    return listed.sort((a, b) => firstOf(a) - firstOf(b) || b.size - a.size);
+  }
+
+  /** Keep the most of each part. */
+  hold() {
+    for (const part of this.#parts) part.hold();
+  }
+
+  /** Begin again with what is now the most. */
+  release() {
+    for (const part of this.#parts) part.peak = null;
+    this.hold();
+  }
+
   /** The names of a picture, none over another: [{text, x, y, alpha}], x and y of its middle, CSS pixels. */
   place(stage) {
     const eye = stage.camera.position.toArray();
@@ -58,16 +88,17 @@ export class Names {
       const pixels = depth > 0 ? (part.diameter * stage.pixels) / depth : 0;
       const times = isNumbered(part.name) && !part.size ? NUMBERED : 1;
       if (pixels <= FADED * times * widthOf(part.name) || part.isAway(eye)) continue; // most, where there are many
-      const text = part.total ? `${part.name}  ${measure(part.total, part.sheet.unit)}` : part.name;
-      const label = { part, text, width: widthOf(text), alpha: 0 };
-      const share = pixels / (times * label.width);
-      if (share <= FADED) continue;
       const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
-      label.x = seen.reduce((sum, at) => sum + at[0], 0) / 8;
-      label.y = Math.min(...seen.map((at) => at[1])) - LINE / 2;
-      label.alpha = Math.min(1, (share - FADED) / (WHOLE - FADED));
-      for (let line = 0; line <= (part.size ? MOST_LINES : 0); line++, label.y -= LINE) {
-        if (placed.some((other) => areOver(label, other))) continue;
+      const middle = seen.reduce((sum, at) => sum + at[0], 0) / 8;
+      const top = Math.max(Math.min(...seen.map((at) => at[1])) - LINE / 2, LINE / 2 + 2);
+      const alpha = Math.min(1, (pixels / (times * widthOf(part.name)) - FADED) / (WHOLE - FADED));
+      const whole = part.load && (part.size || alpha === 1) ? [`${part.name}  ${measure(part.load, part.sheet.unit)}`] : [];
+      const lines = part.size ? LINES : [0];
+      for (const [text, line] of [...whole, part.name].flatMap((text) => lines.map((line) => [text, line]))) {
+        const width = widthOf(text);
+        const x = Math.max(width / 2 + 4, Math.min(middle, stage.width - width / 2 - 4));
+        const label = { part, text, width, alpha, x, y: top - LINE * line };
+        if (label.y < LINE / 2 || placed.some((other) => areOver(label, other))) continue;
         placed.push(label);
         break;
       }
@@ -76,9 +107,26 @@ export class Names {
   }
 }
 
-/** The part whose name is at a place of the picture; undefined if there is none. */
-export function partAt(labels, x, y) {
-  return labels.find((label) => Math.abs(y - label.y) <= LINE / 2 && Math.abs(x - label.x) <= label.width / 2)?.part;
+/** The name at a place of the picture; undefined if there is none. */
+export function labelAt(labels, x, y) {
+  return labels.find((label) => Math.abs(y - label.y) <= LINE / 2 && Math.abs(x - label.x) <= label.width / 2);
+}
+
+/** Names are drawn; so that they can be dragged and clicked, an element lies on the one that is pointed at. */
+export class Grip {
+  constructor(element) {
+    this.element = element;
+    element.addEventListener("pointerleave", ({ buttons }) => setHidden(element, !buttons)); // a drag may leave it fast
+  }
+
+  /** @param {?object} label that is pointed at; */
+  show(label) {
+    setHidden(this.element, !label);
+    if (!label) return;
+    this.part = label.part;
+    const { x, y, width } = label;
+    Object.assign(this.element.style, { left: `${x - width / 2}px`, top: `${y - LINE / 2}px`, width: `${width}px`, height: `${LINE}px` });
+  }
 }
 
 function partsOf(sheet, areSeveral) {

@@ -35,4 +35,6 @@ export function gradient(theme, direction = "to right") {
 
 /** The ground on which taxels lie, and the ink for rims and signs, as RGB 0 to 255. */
 export const GROUND = { dark: [16, 18, 22], light: [247, 248, 250] };
+/** What is behind taxels: the fingers of a nominal hand. */
+export const BODY = { dark: [32, 36, 44], light: [236, 239, 243] };
 export const INK = { dark: [233, 237, 243], light: [24, 30, 40] };

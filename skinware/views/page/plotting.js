@@ -94,6 +94,13 @@ export class Plotting {
     return element;
   }
 
+  /** Let an element be dragged into a strip, or clicked, or chosen with Enter. */
+  plottable(element, lineOf) {
+    this.draggable(element, lineOf);
+    element.addEventListener("click", () => this.strips.add(lineOf()));
+    element.addEventListener("keydown", (event) => event.key === "Enter" && this.strips.add(lineOf()));
+  }
+
   /** A button that plots. */
   button(lineOf) {
     const add = () => this.strips.add(lineOf());

@@ -18,6 +18,7 @@ class Sheet {
     this.n = table.n;
     this.hasShear = Boolean(table.axes);
     this.isTouch = table.touch ?? true;
+    this.total = table.total ?? null; // of several taxels: "sum" or "highest"
     this.index = blob(table.index, Uint32Array); // positions in a frame
     this.uid = table.uid ? blob(table.uid, BigUint64Array) : null;
     this.patch = blob(table.patch, Uint16Array);
@@ -113,7 +114,21 @@ class Driver {
     this.modules = table.modules ?? [];
     this.state = "live";
     this.isCut = false; // the connection to the server is lost
+    this.arrange(table, blob);
     this.sheets = new Map(table.types.map((type) => [type.name, new Sheet(this, type, blob)]));
+  }
+
+  /** The fingers and palms of its nominal hands; they may move while the driver stays the same. */
+  arrange(table, blob) {
+    this.sceneOutlines = (table.bodies ?? []).map((outline) => blob(outline, Float32Array));
+  }
+
+  /** The corners of each, as places of something that has no size. */
+  get outlines() {
+    return this.sceneOutlines.map((outline) => {
+      const position = outline.map((x, i) => x + this.shift[i % 3]);
+      return { n: position.length / 3, position, radius: new Float32Array(position.length / 3) };
+    });
   }
 
   move(by) {
@@ -169,6 +184,7 @@ export class Skin {
     const driver = this.drivers.get(table.id);
     if (driver?.generation !== table.generation || driver.key !== keyOf(table)) return new Driver(table, blob, this.shifts[keyOf(table)]);
     for (const type of table.types) driver.sheets.get(type.name).arrange(type, blob);
+    driver.arrange(table, blob);
     return driver;
   }
 
@@ -210,6 +226,9 @@ export class Skin {
     for (const sheet of this.sheets()) sheet.fill();
   }
 }
+
+/** The outlines of all drivers of sheets. */
+export const outlinesOf = (sheets) => [...new Set(sheets.map(({ driver }) => driver))].flatMap(({ outlines }) => outlines);
 
 const keyOf = ({ namespace, name }) => `${namespace}/${name}`;
 

@@ -1,6 +1,8 @@
 // The view by WebGL 2: discs in space, and the meshes of links.
 
 import {
+  BufferAttribute,
+  BufferGeometry,
   Color,
   DataTexture,
   DirectionalLight,
@@ -12,7 +14,8 @@ import {
   WebGLRenderer,
 } from "./vendor/three.min.js";
 import { Cloud, discs } from "./cloud.js";
-import { GROUND, INK, ramp } from "./palette.js";
+import { BODY, GROUND, INK, ramp } from "./palette.js";
+import { outlinesOf } from "./skin.js";
 
 export class Solid {
   #clouds = [];
@@ -31,6 +34,9 @@ export class Solid {
     this.ramp = new DataTexture(ramp(theme), 256, 1);
     this.material = discs(this.ramp);
     this.linkMaterial = new MeshLambertMaterial({ flatShading: true });
+    this.bodyMaterial = new MeshLambertMaterial({ color: 0 }); // in one colour, whatever the light
+    this.body = new Mesh(new BufferGeometry(), this.bodyMaterial);
+    this.scene.add(this.body);
     this.setTheme(theme);
   }
 
@@ -41,6 +47,7 @@ export class Solid {
     this.material.uniforms.ground.value = unit(GROUND[theme]);
     this.material.uniforms.ink.value = unit(INK[theme]);
     this.renderer.setClearColor(cssColour(GROUND[theme]));
+    this.bodyMaterial.emissive = cssColour(BODY[theme]);
     this.linkMaterial.color = cssColour(GROUND[theme].map((x, c) => x + 0.22 * (INK[theme][c] - x)));
   }
 
@@ -51,6 +58,10 @@ export class Solid {
     }
     this.#clouds = sheets.map((sheet) => new Cloud(sheet, this.material));
     for (const cloud of this.#clouds) this.scene.add(cloud.points);
+    this.body.geometry.dispose();
+    this.body.geometry = new BufferGeometry();
+    this.body.geometry.setAttribute("position", new BufferAttribute(trianglesOf(outlinesOf(sheets)), 3));
+    this.body.geometry.computeVertexNormals();
   }
 
   /** @param {{geometry: object, pose: number[]}[]} meshes `pose`: 4 x 4, row by row. */
@@ -86,6 +97,15 @@ export class Solid {
     this.renderer.dispose();
     this.canvas.remove();
   }
+}
+
+/** The triangles between the first corner of each outline and the others. */
+function trianglesOf(outlines) {
+  const corners = [];
+  for (const { n, position } of outlines) {
+    for (let k = 1; k + 1 < n; k++) for (const i of [0, k, k + 1]) corners.push(...position.subarray(3 * i, 3 * i + 3));
+  }
+  return Float32Array.from(corners);
 }
 
 function cssColour(rgb) {

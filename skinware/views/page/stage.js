@@ -3,11 +3,13 @@
 import { Matrix4, OrbitControls, PerspectiveCamera, Spherical, Vector3 } from "./vendor/three.min.js";
 import { Flat } from "./flat.js";
 import { eyeOf } from "./framing.js";
+import { outlinesOf } from "./skin.js";
 import { Solid } from "./solid.js";
 
 const VIEW_ANGLE = 35; // degrees, from the bottom of the picture to its top
 const FILLED = 0.95; // part of the picture that the taxels fill
 const BELOW = 44; // CSS pixels, of the scale
+const ABOVE = 26; // of names
 const SLOW_MS = 55;
 const QUICK_MS = 24;
 const RATIOS = [0.75, 1, 1.5, 2];
@@ -176,10 +178,12 @@ export class Stage {
    * Have some taxels fill the picture.
    * @param {(sheet, i) => boolean} isIn which.
    * @param {?number[]} from direction from them to the eye; null: as it is.
+   * @param {boolean} isAll the hands around them are to be seen, too.
    */
-  frame(isIn, from = null) {
+  frame(isIn, from = null, isAll = false) {
     const towards = from ?? this.camera.position.clone().sub(this.controls.target).toArray();
-    const eye = eyeOf(this.sheets, isIn, towards, this.picture);
+    const around = isAll ? outlinesOf(this.sheets) : [];
+    const eye = eyeOf([...this.sheets, ...around], (sheet, i) => around.includes(sheet) || isIn(sheet, i), towards, this.picture);
     if (eye) this.look(new Vector3(...eye.position), new Vector3(...eye.target));
   }
 
@@ -215,8 +219,8 @@ export class Stage {
   get picture() {
     const tall = FILLED * Math.tan((VIEW_ANGLE * Math.PI) / 360);
     const wide = tall * this.camera.aspect;
-    const below = Math.min(BELOW / this.height, 0.2);
-    return { right: wide, left: wide, top: tall, bottom: tall * (1 - 2 * below) };
+    const [above, below] = [ABOVE, BELOW].map((room) => Math.min(room / this.height, 0.2));
+    return { right: wide, left: wide, top: tall * (1 - 2 * above), bottom: tall * (1 - 2 * below) };
   }
 }
 

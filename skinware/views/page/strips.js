@@ -36,15 +36,28 @@ class Strip {
     const { canvas, strips } = this;
     const at = (event) => (event.clientX - canvas.getBoundingClientRect().left - this.plot.x) / this.plot.width;
     let dragged = null;
+    const fingers = new Map(); // by pointer, where they are on the canvas
+    const pinched = () => Math.max(1e-2, Math.abs([...fingers.values()].reduce((one, other) => one - other)));
     canvas.addEventListener("pointermove", (event) => {
+      if (fingers.size === 2 && fingers.has(event.pointerId)) {
+        const before = pinched();
+        fingers.set(event.pointerId, at(event));
+        return strips.zoom(before / pinched(), [...fingers.values()].reduce((one, other) => (one + other) / 2));
+      }
       if (dragged !== null && event.buttons) dragged = strips.pan(dragged, at(event));
       this.point(at(event));
     });
     canvas.addEventListener("pointerdown", (event) => {
       dragged = at(event);
+      if (event.pointerType === "touch") fingers.set(event.pointerId, dragged);
       canvas.setPointerCapture(event.pointerId);
     });
-    canvas.addEventListener("pointerup", () => (dragged = null));
+    for (const end of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(end, ({ pointerId }) => {
+        fingers.delete(pointerId);
+        dragged = null;
+      });
+    }
     canvas.addEventListener("pointerleave", () => this.point(null));
     canvas.addEventListener("dblclick", () => strips.zoom(Infinity));
     const wheel = (event) => {

@@ -1,0 +1,174 @@
+"""Take off what the temperature of its module does to each taxel, as far as sensors of the module measure it.
+
+The stage works before the baselines. It follows the temperature also where a grip covers a whole patch, and no taxel is
+left to measure a common drift. docs/tactile/baselines.md has the formulas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
+from skinware.tactile.curves import TEMPERATURE
+from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
+
+WINDOW_S = 5.0
+"""Seconds over which values and temperatures are averaged: drift of that time counts, noise and touches hardly do."""
+SMOOTH_S = 0.5
+"""Time constant of the temperatures in seconds: skins do not warm up faster."""
+GAIN_LASTS_S = 604800.0
+"""Seconds, a week, in which a known gain becomes as uncertain as at the start: skins age."""
+_MEDIAN2 = 0.455
+"""Median of the square of a standard normal deviate."""
+
+
+class ThermalSettings(StageSettings, frozen=True, kw_only=True, tag="thermal"):
+    """Settings of the influence of the temperature that sensors of type ``temperature`` measure in the same modules.
+
+    Attributes:
+        spread: largest usual change of a taxel with a unit of the temperature, in the unit of the taxel.
+    """
+
+    spread: Positive = 1.0
+
+    def stage(self, taxels: Taxels, pads: Taxels) -> Stage:
+        """Make the stage for some taxels and the temperature sensors of a driver.
+
+        Raises:
+            ConfigurationError: no taxel has a temperature sensor in its module.
+        """
+        if not np.isin(taxels.module, pads.module).any():
+            raise ConfigurationError(f"no module with {taxels.type.name} has a sensor of type {TEMPERATURE}")
+        return ThermalStage(taxels, pads, self.spread)
+
+
+class ThermalGains:
+    """Learns by how much each of n taxels changes with its temperature, from one window of time to the next.
+
+    Args:
+        patch: (n,) int. The taxels of a patch are alike as long as nothing is known of one.
+        spread: standard deviation of the gains before anything is known.
+
+    Attributes:
+        gain: (n,) float64, the change of the value with a unit of the temperature.
+    """
+
+    def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
+        n = len(patch)
+        self.gain: npt.NDArray[np.float64] = np.zeros(n)
+        self._patch, self._spread2 = patch, spread**2
+        self._own = np.zeros(n)
+        self._variance = np.full(n, self._spread2)
+        self._noise2 = np.full(int(patch.max(initial=-1)) + 1, np.nan)
+        self._noisier = np.ones(n)
+        self._means = np.full((2, n), np.nan)
+
+    def learn(self, values: npt.NDArray[np.float64], warmth: npt.NDArray[np.float64]) -> None:
+        """Take in the means of the next window.
+
+        Args:
+            values: (n,) of the taxels; NaN: not known.
+            warmth: (n,) the temperatures of their modules; NaN: not known.
+        """
+        means = np.array([values, warmth])
+        change, warmed = means - self._means
+        self._means = np.where(np.isnan(means), self._means, means)
+        known = np.isfinite(change) & np.isfinite(warmed)
+        self._variance = np.minimum(self._variance + self._spread2 * WINDOW_S / GAIN_LASTS_S, self._spread2)
+        found = np.where(known, change - self._own * warmed, 0.0)
+        warmed = np.where(known, warmed, 0.0)
+        self._find_noise(found**2, known)
+        noise2 = self._noise2[self._patch] * self._noisier + 1e-12
+        total = self._variance * warmed**2 + np.where(known, noise2, 1.0)
+        share = self._variance * warmed / total
+        self._own += share * np.clip(found, -3 * np.sqrt(total), 3 * np.sqrt(total))
+        self._variance *= 1 - share * warmed
+        self._noisier *= np.where(known, np.where(found**2 > _MEDIAN2 * total, 1.3, 1 / 1.3), 1.0)
+        self._noisier = np.maximum(self._noisier, 1.0)
+        unknown = self._variance / self._spread2
+        certain = np.bincount(self._patch, 1 - unknown)
+        typical = np.bincount(self._patch, self._own) / np.maximum(certain, 1e-9)
+        self.gain = self._own + unknown * typical[self._patch]
+
+    def _find_noise(self, found2: npt.NDArray[np.float64], known: npt.NDArray[np.bool_]) -> None:
+        """Take the squares of (n,) surprises in; those of most taxels of a patch show its noise."""
+        for patch in np.unique(self._patch[known]).tolist():
+            noise2 = np.median(found2[known & (self._patch == patch)]) / _MEDIAN2
+            before = noise2 if np.isnan(self._noise2[patch]) else self._noise2[patch]
+            self._noise2[patch] = before + 0.3 * (noise2 - before)
+
+
+@dataclass(eq=False)
+class _Window:
+    """Sums over a window of time: of the values of n taxels, of the temperatures of modules, and their numbers."""
+
+    values: npt.NDArray[np.float64]
+    counts: npt.NDArray[np.int64]
+    warmth: npt.NDArray[np.float64]
+    frames: int = 0
+    passed_s: float = 0.0
+
+
+class ThermalStage(Stage):
+    """Takes what temperatures have changed since its first frame off the values of n taxels.
+
+    Attributes:
+        gains: the gains.
+    """
+
+    name = "thermal"
+
+    def __init__(self, taxels: Taxels, pads: Taxels, spread: float) -> None:
+        self.taxels = taxels
+        self._pads = pads
+        self.gains = ThermalGains(taxels.patch, spread)
+        self._n_modules = int(max(taxels.module.max(initial=-1), pads.module.max(initial=-1))) + 1
+        self._warmth = np.full(self._n_modules, np.nan)
+        self._drift = np.zeros(len(taxels))
+        self._time_ns: int | None = None
+        self._begin_window()
+
+    def _begin_window(self) -> None:
+        n = len(self.taxels)
+        self._window = _Window(np.zeros(n), np.zeros(n, np.int64), np.zeros(self._n_modules))
+
+    @property
+    def axes(self) -> tuple[Taxels, ...]:
+        return self.taxels, self._pads
+
+    def step(self, signal: Signal, *others: Signal) -> None:
+        (pads,) = others
+        passed_s = 0.0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
+        self._time_ns = signal.time_ns
+        self._follow(pads, passed_s)
+        self._collect(signal, passed_s)
+        limits = self.taxels.type
+        is_inside = (signal.values > limits.minimum) & (signal.values < limits.maximum)
+        corrected = (signal.values - self._drift).astype(np.float32)
+        signal.values = np.where(is_inside, corrected, signal.values)
+
+    def _follow(self, pads: Signal, passed_s: float) -> None:
+        usable = pads.usable.astype(np.float64)
+        numbers = np.bincount(self._pads.module, usable, self._n_modules)
+        sums = np.bincount(self._pads.module, np.where(pads.usable, pads.values, np.float32(0)), self._n_modules)
+        now = np.divide(sums, numbers, out=self._warmth.copy(), where=numbers > 0)
+        change = np.where(np.isnan(self._warmth), 0.0, (now - self._warmth) * -np.expm1(-passed_s / SMOOTH_S))
+        self._warmth = np.where(np.isnan(self._warmth), now, self._warmth + change)
+        self._drift += self.gains.gain * np.nan_to_num(change)[self.taxels.module]
+
+    def _collect(self, signal: Signal, passed_s: float) -> None:
+        window = self._window
+        window.values += np.where(signal.usable, signal.values, np.float32(0))
+        window.counts += signal.usable
+        window.warmth += self._warmth
+        window.frames += 1
+        window.passed_s += passed_s
+        if window.passed_s < WINDOW_S:
+            return
+        values = np.divide(window.values, window.counts, out=np.full(len(self.taxels), np.nan), where=window.counts > 0)
+        self.gains.learn(values, (window.warmth / window.frames)[self.taxels.module])
+        self._begin_window()

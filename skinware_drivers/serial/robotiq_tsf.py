@@ -28,7 +28,7 @@ from skinware_drivers import Link, Match, Module, Options, Patch, operation, tax
 from skinware_drivers.fields import Bits, DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Encoding, Field, Framed, Framer, Framing
+from skinware_drivers.serial.framing import Encoding, Field, Framed, Framer, Framing, ReceivedFraming
 from skinware_drivers.serial.packets import Length, Packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -51,7 +51,6 @@ DYNAMIC = SensorType("dynamic_pressure", 0x16D0 << 12 | 1, "counts", minimum=-32
 
 class _Kind(NamedTuple):
     name: str
-    shape: str
     dtype: str
     types: Sequence[SensorType]
     taxels: int = 1
@@ -66,17 +65,17 @@ def _counts(types: Sequence[SensorType]) -> list[SensorType]:
 
 
 _KINDS: Mapping[int, _Kind] = {
-    1: _Kind("static", "7x4", ">u2", [PRESSURE.measured(unit="counts", minimum=0, maximum=65535)], 28),
-    2: _Kind("dynamic", "dynamic", ">i2", [DYNAMIC]),
-    3: _Kind("accelerometer", "accelerometer", ">i2", _counts(ACCELERATION)),
-    4: _Kind("gyroscope", "gyroscope", ">i2", _counts(ANGULAR_RATE)),
-    5: _Kind("magnetometer", "magnetometer", ">i2", _counts(MAGNETIC_FIELD)),
-    6: _Kind("temperature", "temperature", ">i2", _counts([TEMPERATURE])),
+    1: _Kind("static", ">u2", [PRESSURE.measured(unit="counts", minimum=0, maximum=65535)], 28),
+    2: _Kind("dynamic", ">i2", [DYNAMIC]),
+    3: _Kind("accelerometer", ">i2", _counts(ACCELERATION)),
+    4: _Kind("gyroscope", ">i2", _counts(ANGULAR_RATE)),
+    5: _Kind("magnetometer", ">i2", _counts(MAGNETIC_FIELD)),
+    6: _Kind("temperature", ">i2", _counts([TEMPERATURE])),
 }
 
 
 @dataclass(frozen=True)
-class RobotiqPackets(Framing):
+class RobotiqPackets(ReceivedFraming):
     """The framing, for receiving.
 
     Args:
@@ -88,14 +87,6 @@ class RobotiqPackets(Framing):
 
     def framer(self) -> Framer:
         return _Packets(self.times)
-
-    def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Refuse: commands have a framing of their own.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(f"packets of the sensor are only read ({identifier:#x}, {len(payload)} bytes)")
 
 
 class _Packets(Framer):
@@ -254,8 +245,9 @@ class RobotiqTsfDriver(SerialAdapter[RobotiqTsfOptions]):
             times = sum(len(heard.get(key << 4 | finger | bit, ())) for bit in (0, _UNTIMED))
             period_s = self.options.learn_s / max(times - 1, 0.5)  # not heard, or once: twice the time of listening
             channels = taxels(kind.taxels, *(each.name for each in kind.types), first_uid=finger << 8 | key << 5)
+            shape = "7x4" if kind.taxels > 1 else kind.name
             slow = period_s if period_s > 1.5 * self.period_s else None
-            modules.append(Module(channels, key=key, kind=kind.shape, name=kind.name, period_s=slow))
+            modules.append(Module(channels, key=key, kind=shape, name=kind.name, period_s=slow))
         return Patch(f"finger {finger + 1}", modules, key=finger)
 
 

@@ -154,6 +154,29 @@ class Origin:
         self.live.close()
 
 
+@dataclass
+class PlotFunction:
+    """A function of a snapshot whose values are plotted.
+
+    Attributes:
+        driver: name; None: the first.
+        problem: why it failed last; empty: it did not.
+    """
+
+    function: Callable[[DriverSnapshot], float]
+    driver: str | None = None
+    unit: str = ""
+    problem: str = ""
+
+    def __call__(self, frame: DriverSnapshot) -> float:
+        """Return its value; NaN if it fails."""
+        try:
+            value, self.problem = float(self.function(frame)), ""
+        except Exception as error:  # noqa: BLE001 - a user's function may raise anything
+            value, self.problem = float("nan"), f"{type(error).__name__}: {error}"
+        return value
+
+
 class ShownDriver:
     """A driver as all viewers see it.
 
@@ -273,6 +296,7 @@ class Follower:
 
     Attributes:
         edition: changes whenever drivers or structures change.
+        functions: of snapshots that viewers plot, by the names of their lines.
     """
 
     def __init__(self, *origins: Origin, robot: Robot | None = None) -> None:
@@ -280,6 +304,7 @@ class Follower:
         self.drivers: list[ShownDriver] = []
         self.problem: str | None = None
         self.edition = 0
+        self.functions: dict[str, PlotFunction] = {}
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[tuple[str, str], int] = {}

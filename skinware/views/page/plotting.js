@@ -7,6 +7,7 @@ import { Strips } from "./strips.js";
 export class Plotting {
   #dragged = null;
   #isMarking = false;
+  #functions = new Set(); // names of those that are plotted, or were
 
   /**
    * @param {HTMLElement} host
@@ -41,7 +42,13 @@ export class Plotting {
     this.lines.take(taken);
   }
 
-  takeState({ marks = [], recording = null }) {
+  takeState({ marks = [], recording = null, functions = [] }) {
+    for (const { name, driver: id, unit } of functions) {
+      const driver = this.skin.drivers.get(id)?.key;
+      if (!driver || this.#functions.has(name)) continue;
+      this.#functions.add(name);
+      this.strips.add({ key: `function ${name}`, driver, function: name, label: name, unit });
+    }
     this.marks = marks.map(({ time_ns, text }) => ({ time_ns: Number(time_ns), text }));
     const last = marks.at(-1);
     if (!this.#isMarking || !last) return;

@@ -288,7 +288,14 @@ class Chain:
             name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
             for name, baseline in self.baselines.items()
         }
+        for name, arrays in found.items():
+            for stage in self._own_stages(name):
+                arrays |= {f"{stage.name}.{key}": array for key, array in stage.state().items()}
         return ChainState(self._fingerprint, found)
+
+    def _own_stages(self, name: str) -> list[Stage]:
+        """Stages of a type, without those that only read it."""
+        return [stage for stage in self.stages[name] if stage.taxels.type.name == name]
 
     def restore(self, state: ChainState) -> int:
         """Go on with what the baselines of another chain had learned, taxel by taxel, if they saw the same values.
@@ -305,7 +312,12 @@ class Chain:
         for name, baseline in self.baselines.items():
             if name in state.arrays:
                 learned = state.arrays[name]
-                restored += baseline.restore(learned, self.rows_of(name, learned["uid"]))
+                rows = self.rows_of(name, learned["uid"])
+                restored += baseline.restore(learned, rows)
+                for stage in self._own_stages(name):
+                    begin = f"{stage.name}."
+                    of_stage = {key.removeprefix(begin): learned[key] for key in learned if key.startswith(begin)}
+                    stage.restore(of_stage, rows)
         return restored
 
     def fits(self, state: ChainState) -> bool:

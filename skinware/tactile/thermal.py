@@ -158,7 +158,7 @@ class ThermalStage(Stage):
             given = state.get(name)
             if given is None or given.dtype != np.float64 or given.ndim != 1 or len(given) < m:
                 raise ConfigurationError(
-                    f"no state of a stage thermal: {name} is missing or has a wrong shape or dtype"
+                    f"no state of the stage thermal: {name} is missing or has a wrong shape or dtype"
                 )
         self._drift[here] = state["drift"][rows[here]]
         self._warmth[self.taxels.module[here]] = state["warmth"][rows[here]]

@@ -171,7 +171,7 @@ def test_a_restarted_stage_goes_on_where_the_one_before_was() -> None:
 )
 def test_a_state_that_does_not_fit_is_refused(wrong: dict[str, npt.NDArray[np.float64]]) -> None:
     stage = ThermalStage(*taxels(), spread=1.0)
-    with pytest.raises(ConfigurationError, match="no state of a stage thermal"):
+    with pytest.raises(ConfigurationError, match="no state of the stage thermal"):
         stage.restore(stage.state() | wrong if wrong else {}, np.arange(N))
 
 

@@ -234,15 +234,15 @@ def rate_now_hz(life: str, measured_hz: float | None) -> float | None:
     return measured_hz if life == LIVE else 0.0
 
 
-def status_now(life: str, frame: DriverSnapshot) -> npt.NDArray[np.uint8]:
-    """Return (n_sensors,) uint8, the status of a snapshot's sensors now: values that became too old are stale."""
+def status_now(life: str, frame: DriverSnapshot, at_ns: int | None = None) -> npt.NDArray[np.uint8]:
+    """Return (n_sensors,) uint8, the status of a snapshot's sensors now, or at a time: values too old are stale."""
     status, stale = frame.status, np.uint8(Status.STALE)
     if life in WITHOUT_NEWS:
         return status | stale
     fresh = is_fresh(
         status,
         frame.sensor_time_ns,
-        at_ns=now_ns(),
+        at_ns=now_ns() if at_ns is None else at_ns,
         max_age_ns=frame.structure.age_limits_ns(frame.period_ns),
         alive=not frame.stale,
     )

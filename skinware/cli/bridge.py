@@ -12,6 +12,7 @@ from skinware.cli import _command as cli
 from skinware.cli._middlewares import ros2, yarp
 from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json, say
+from skinware.cli._viewers import foxglove, rerun
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,11 +33,12 @@ def command() -> None:
     """Publish the drivers and services of one machine on another, in a ROS 2 graph, or as ports of YARP.
 
     On the robot: skin-bridge serve. On other machines: skin-bridge join. For many robots: skin-bridge list and
-    skin-bridge route. For other middlewares: skin-bridge ros2 and skin-bridge yarp.
+    skin-bridge route. For other middlewares: skin-bridge ros2 and skin-bridge yarp. For other viewers: skin-bridge
+    rerun and skin-bridge foxglove.
     """
 
 
-for _each in (route, list_robots, ros2, yarp):
+for _each in (route, list_robots, ros2, yarp, rerun, foxglove):
     command.add_command(_each)
 
 

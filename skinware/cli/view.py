@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
+import io
+import ipaddress
 import os
 import re
 import secrets
 import signal
 import socket
+import ssl
 import sys
 import threading
 import webbrowser
@@ -22,7 +26,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, say
-from skinware.errors import MissingExtra
+from skinware.errors import ConfigurationError, MissingExtra
 
 if TYPE_CHECKING:
     from skinware.views.access import Access
@@ -66,6 +70,12 @@ def token_text(text: str) -> str:
     help="Token that the address needs.  [default: a random one, if other machines can connect]",
 )
 @click.option(
+    "--tls",
+    metavar="DIR",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Serve https; DIR has cert.pem and key.pem.",
+)
+@click.option(
     "--calm",
     "calm_name",
     metavar="NAMESPACE",
@@ -85,6 +95,7 @@ def command(
     port: int | None,
     host: str,
     token: str | None,
+    tls: Path | None,
     calm_name: str | None,
     links: Path | None,
     no_browser: bool,
@@ -120,20 +131,24 @@ def command(
     for what in () if robot is None else robot.left_out:
         cli.warn(f"left out of {links}: {what}")
     follower = Follower(Origin(place, names, calm), robot=robot)
-    access = Access(host, token)
+    access, context = Access(host, token), None if tls is None else tls_context(tls)
 
     def ready(found: int) -> None:
         query = [("token", token)] * bool(token) + [("recording", str(file)) for file in files]
-        url = _address(host, found) + (f"?{urlencode(query, safe='/')}" if query else "")
+        scheme, asked = "https" if context else "http", f"?{urlencode(query, safe='/')}" if query else ""
+        urls = [f"{scheme}://{f'[{at}]' if ':' in at else at}:{found}/{asked}" for at in addresses(host)]
+        url = urls[0]
         what = ", ".join(map(str, [*files, *names])) or f"all drivers of namespace {place.name!r}"
-        ready = {"event": "ready", "url": url, "namespace": place.name, "names": list(names)}
-        say(as_json, ready, f"{url} shows {what} (Ctrl-C ends)")
+        ready = {"event": "ready", "url": url, "urls": urls, "namespace": place.name, "names": list(names)}
+        say(as_json, ready, "\n".join([f"{url} shows {what} (Ctrl-C ends)", *urls[1:]]))
+        if not as_json and not is_loopback(host):
+            echo(qr_text(urls[0]))
         has_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")  # not a text browser in here
         if not no_browser and has_screen:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
     try:
-        asyncio.run(_serve(follower, access, RecordingFiles(files, names=names), host, port, ready))
+        asyncio.run(_serve(follower, access, RecordingFiles(files, names=names), context, host, port, ready))
     except OSError as error:
         where = f"{host}, port {DEFAULT_PORT if port is None else port}"
         echo(f"skin-view: {where}: {_why(error)}", err=True)
@@ -160,6 +175,7 @@ async def _serve(
     follower: Follower,
     access: Access,
     files: RecordingFiles,
+    tls: ssl.SSLContext | None,
     host: str,
     port: int | None,
     ready: Callable[[int], None],
@@ -176,7 +192,7 @@ async def _serve(
     namespace = origin.namespace.name
     doctor = DoctorProgram((sys.executable, "-m", "skinware_drivers.cli.doctor"), namespace)
     recording = RecordingProgram(program, namespace, origin.names)
-    server = ViewServer(follower, access, recording, doctor=doctor, files=files)
+    server = ViewServer(follower, access, recording, doctor=doctor, files=files, tls=tls)
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:
@@ -191,9 +207,72 @@ def _why(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror or error)
 
 
-def _address(host: str, port: int) -> str:
-    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
-    return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
+def addresses(host: str) -> list[str]:
+    """Return the names and addresses at which other machines, or this one, reach a server that listens at ``host``."""
+    if host not in ("0.0.0.0", "::"):
+        return [host]
+    family = socket.AF_INET if host == "0.0.0.0" else socket.AF_UNSPEC
+    name, found = socket.gethostname(), []
+    with contextlib.suppress(OSError):
+        found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, family, socket.SOCK_STREAM)]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out, contextlib.suppress(OSError):
+        out.connect(("192.0.2.1", 9))  # nothing is sent: the kernel chooses the address towards other networks
+        found.insert(0, out.getsockname()[0])
+    outside = [at for at in dict.fromkeys(found) if not ipaddress.ip_address(at.partition("%")[0]).is_loopback]
+    return [*(at for at in outside if "%" not in at), name]
+
+
+def qr_text(url: str) -> str:
+    """Return an address as a QR code of characters; without the package for it, how to install that."""
+    if find_spec("segno") is None:
+        return "for a QR code of it: pip install segno"
+    import segno
+
+    out = io.StringIO()
+    segno.make(url, error="l").terminal(out, compact=True)
+    return out.getvalue()
+
+
+def tls_context(folder: Path) -> ssl.SSLContext:
+    """Return what a server of https needs, from ``cert.pem`` and ``key.pem`` in a folder.
+
+    Raises:
+        ConfigurationError: a file is missing or no such thing, they do not belong together, or the certificate is not
+            valid today.
+    """
+    certificate, key = folder / "cert.pem", folder / "key.pem"
+    for file in (certificate, key):
+        if not file.is_file():
+            raise ConfigurationError(f"--tls: {file} is missing; the folder needs cert.pem and key.pem")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key)
+    except ssl.SSLError as error:
+        why = "they do not belong together" if error.reason == "KEY_VALUES_MISMATCH" else error.reason or str(error)
+        raise ConfigurationError(f"--tls: {certificate} and {key}: {why}") from None
+    except OSError as error:
+        raise ConfigurationError(f"--tls: {error.filename or folder}: {error.strerror or error}") from None
+    why = _refused(context, certificate)
+    if why:
+        raise ConfigurationError(f"--tls: {certificate}: {why}, and browsers would refuse it")
+    return context
+
+
+def _refused(server: ssl.SSLContext, certificate: Path) -> str:
+    """Return why a client that trusts a certificate would refuse it now; empty if it would not."""
+    client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    client.check_hostname = False
+    client.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    client.load_verify_locations(certificate)
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)
+    try:
+        for end in 2 * ends:
+            with contextlib.suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    except ssl.SSLCertVerificationError as error:
+        return error.verify_message
+    return ""
 
 
 def main() -> None:

@@ -44,9 +44,10 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.baseline import Baseline, Calm
+from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline_stage import RESTLESS, BaselineStage, BaselineStageSettings
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.rule import UNUSABLE, BaselineSettings
+from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.stages import (
     AmplifierSettings,
     FilterSettings,
@@ -60,83 +61,6 @@ from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage,
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
-
-_RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
-"""Beginnings of the names of types that have no rest to go back to."""
-
-
-class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
-    """Settings of a baseline as a stage: 0 = no touch; the unit stays.
-
-    Attributes:
-        types: the sensor types that it is for; None: all for which it can be made.
-    """
-
-    types: tuple[str, ...] | None = None
-
-    def stage(self, taxels: Taxels) -> BaselineStage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the type has no rest to go back to.
-        """
-        name, unit = taxels.type.name, taxels.type.unit
-        if name.startswith(_RESTLESS):
-            raise ConfigurationError(f"a {name} has no rest to return to")
-        if name == "proximity" and unit == "m":
-            raise ConfigurationError(
-                "a proximity in m falls when something comes near; baselines are for rising values"
-            )
-        given = {field: getattr(self, field) for field in BaselineSettings.__struct_fields__}
-        return BaselineStage(taxels, BaselineSettings(**given))
-
-
-class BaselineStage(Stage):
-    """Takes the baselines of n taxels away.
-
-    Attributes:
-        baseline: the baselines.
-        before: the taxels as they come in.
-        given: (n,) float32, the values of the newest frame as they came in.
-        calm: the same, calmed; None before the first frame.
-    """
-
-    name = "baseline"
-
-    def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
-        self.before = taxels
-        before = taxels.type
-        span = before.maximum - before.minimum
-        self.taxels = replace(
-            taxels, type=replace(before, minimum=-span if taxels.signed else 0.0, maximum=span), resolution=0.0
-        )
-        self.baseline = Baseline(
-            taxels.module,
-            taxels.patch,
-            settings,
-            resolution=taxels.resolution,
-            signed=taxels.signed,
-            common=taxels.common,
-            limits=(before.minimum, before.maximum),
-        )
-        self.given: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
-        self.calm: Calm | None = None
-
-    @property
-    def touched(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool, which taxels are touched in the newest frame."""
-        return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
-
-    def step(self, signal: Signal) -> None:
-        self.given = signal.values
-        self.calm = calm = self.baseline.update(
-            signal.time_ns, signal.values, signal.usable, jumped=signal.jumped, bears=signal.bears
-        )
-        signal.deviation = signal.values - calm.baseline
-        signal.values = calm.value
-        signal.forced |= calm.forced
-        signal.unknown |= np.isnan(calm.baseline)
-
 
 AnySettings = (
     BaselineStageSettings
@@ -240,7 +164,7 @@ def _groups(settings: AnySettings, taxels: Mapping[str, Taxels], wanted: Iterabl
     if isinstance(settings, FieldSettings | VectorSettings):
         return [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
     if isinstance(settings, ThermalSettings):
-        return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(_RESTLESS)]
+        return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(RESTLESS)]
     return [(name,) for name in wanted]
 
 
@@ -288,7 +212,14 @@ class Chain:
             name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
             for name, baseline in self.baselines.items()
         }
+        for name, arrays in found.items():
+            for stage in self._own_stages(name):
+                arrays |= {f"{stage.name}.{key}": array for key, array in stage.state().items()}
         return ChainState(self._fingerprint, found)
+
+    def _own_stages(self, name: str) -> list[Stage]:
+        """Stages of a type, without those that only read it."""
+        return [stage for stage in self.stages[name] if stage.taxels.type.name == name]
 
     def restore(self, state: ChainState) -> int:
         """Go on with what the baselines of another chain had learned, taxel by taxel, if they saw the same values.
@@ -305,7 +236,12 @@ class Chain:
         for name, baseline in self.baselines.items():
             if name in state.arrays:
                 learned = state.arrays[name]
-                restored += baseline.restore(learned, self.rows_of(name, learned["uid"]))
+                rows = self.rows_of(name, learned["uid"])
+                restored += baseline.restore(learned, rows)
+                for stage in self._own_stages(name):
+                    begin = f"{stage.name}."
+                    of_stage = {key.removeprefix(begin): learned[key] for key in learned if key.startswith(begin)}
+                    stage.restore(of_stage, rows)
         return restored
 
     def fits(self, state: ChainState) -> bool:

@@ -26,7 +26,8 @@ from skinware._columns import texts
 from skinware.errors import ConfigurationError
 from skinware.service import Column
 from skinware.structure import Structure
-from skinware.tactile.chain import BaselineStage, Chain, ChainState
+from skinware.tactile.baseline_stage import BaselineStage
+from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.health import COLUMNS, Health, HealthReport
 from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
 

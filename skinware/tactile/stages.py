@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -125,6 +126,19 @@ class Stage(ABC):
     def axes(self) -> tuple[Taxels, ...]:
         """The taxels as they come out, for each type that the stage changes together."""
         return (self.taxels,)
+
+    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Return what baselines behind it need after a restart: arrays (n,) by name, copies."""
+        return {}
+
+    def restore(  # noqa: B027
+        self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]
+    ) -> None:
+        """Go on with the state of another stage: (n,) ``rows`` say where each taxel stands there; -1: nowhere.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
 
     @abstractmethod
     def step(self, signal: Signal) -> None:

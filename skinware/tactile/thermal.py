@@ -6,6 +6,8 @@ left to measure a common drift. docs/tactile/baselines.md has the formulas.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,14 +57,16 @@ class ThermalGains:
 
     Attributes:
         gain: (n,) float64, the change of the value with a unit of the temperature.
+        own: (n,) float64, the same, by what is known of each taxel alone.
+        variance: (n,) float64, of ``own``.
     """
 
     def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
         n = len(patch)
         self.gain: npt.NDArray[np.float64] = np.zeros(n)
         self._patch, self._spread2 = patch, spread**2
-        self._own = np.zeros(n)
-        self._variance = np.full(n, self._spread2)
+        self.own: npt.NDArray[np.float64] = np.zeros(n)
+        self.variance: npt.NDArray[np.float64] = np.full(n, self._spread2)
         self._noise2 = np.full(int(patch.max(initial=-1)) + 1, np.nan)
         self._noisier = np.ones(n)
         self._means = np.full((2, n), np.nan)
@@ -78,21 +82,25 @@ class ThermalGains:
         change, warmed = means - self._means
         self._means = np.where(np.isnan(means), self._means, means)
         known = np.isfinite(change) & np.isfinite(warmed)
-        self._variance = np.minimum(self._variance + self._spread2 * WINDOW_S / GAIN_LASTS_S, self._spread2)
-        found = np.where(known, change - self._own * warmed, 0.0)
+        self.variance = np.minimum(self.variance + self._spread2 * WINDOW_S / GAIN_LASTS_S, self._spread2)
+        found = np.where(known, change - self.own * warmed, 0.0)
         warmed = np.where(known, warmed, 0.0)
         self._find_noise(found**2, known)
         noise2 = self._noise2[self._patch] * self._noisier + 1e-12
-        total = self._variance * warmed**2 + np.where(known, noise2, 1.0)
-        share = self._variance * warmed / total
-        self._own += share * np.clip(found, -3 * np.sqrt(total), 3 * np.sqrt(total))
-        self._variance *= 1 - share * warmed
+        total = self.variance * warmed**2 + np.where(known, noise2, 1.0)
+        share = self.variance * warmed / total
+        self.own += share * np.clip(found, -3 * np.sqrt(total), 3 * np.sqrt(total))
+        self.variance *= 1 - share * warmed
         self._noisier *= np.where(known, np.where(found**2 > _MEDIAN2 * total, 1.3, 1 / 1.3), 1.0)
         self._noisier = np.maximum(self._noisier, 1.0)
-        unknown = self._variance / self._spread2
+        self.share_known()
+
+    def share_known(self) -> None:
+        """Find the gains again, of all that is known of taxels and of their patches."""
+        unknown = self.variance / self._spread2
         certain = np.bincount(self._patch, 1 - unknown)
-        typical = np.bincount(self._patch, self._own) / np.maximum(certain, 1e-9)
-        self.gain = self._own + unknown * typical[self._patch]
+        typical = np.bincount(self._patch, self.own) / np.maximum(certain, 1e-9)
+        self.gain = self.own + unknown * typical[self._patch]
 
     def _find_noise(self, found2: npt.NDArray[np.float64], known: npt.NDArray[np.bool_]) -> None:
         """Take the squares of (n,) surprises in; those of most taxels of a patch show its noise."""
@@ -140,23 +148,41 @@ class ThermalStage(Stage):
     def axes(self) -> tuple[Taxels, ...]:
         return self.taxels, self._pads
 
+    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+        warmth = self._warmth[self.taxels.module]
+        return {"drift": self._drift.copy(), "warmth": warmth, "own": self.gains.own, "variance": self.gains.variance}
+
+    def restore(self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]) -> None:
+        here, m = np.flatnonzero(rows >= 0), int(rows.max(initial=-1)) + 1
+        for name in ("drift", "warmth", "own", "variance"):
+            given = state.get(name)
+            if given is None or given.dtype != np.float64 or given.ndim != 1 or len(given) < m:
+                raise ConfigurationError(
+                    f"no state of the stage thermal: {name} is missing or has a wrong shape or dtype"
+                )
+        self._drift[here] = state["drift"][rows[here]]
+        self._warmth[self.taxels.module[here]] = state["warmth"][rows[here]]
+        self.gains.own[here], self.gains.variance[here] = state["own"][rows[here]], state["variance"][rows[here]]
+        self.gains.share_known()
+
     def step(self, signal: Signal, *others: Signal) -> None:
         (pads,) = others
+        is_first = self._time_ns is None
         passed_s = 0.0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
         self._time_ns = signal.time_ns
-        self._follow(pads, passed_s)
+        self._follow(pads, 1.0 if is_first else -math.expm1(-passed_s / SMOOTH_S))
         self._collect(signal, passed_s)
         limits = self.taxels.type
         is_inside = (signal.values > limits.minimum) & (signal.values < limits.maximum)
         corrected = (signal.values - self._drift).astype(np.float32)
         signal.values = np.where(is_inside, corrected, signal.values)
 
-    def _follow(self, pads: Signal, passed_s: float) -> None:
+    def _follow(self, pads: Signal, share: float) -> None:
         usable = pads.usable.astype(np.float64)
         numbers = np.bincount(self._pads.module, usable, self._n_modules)
         sums = np.bincount(self._pads.module, np.where(pads.usable, pads.values, np.float32(0)), self._n_modules)
         now = np.divide(sums, numbers, out=self._warmth.copy(), where=numbers > 0)
-        change = np.where(np.isnan(self._warmth), 0.0, (now - self._warmth) * -np.expm1(-passed_s / SMOOTH_S))
+        change = np.where(np.isnan(self._warmth), 0.0, (now - self._warmth) * share)
         self._warmth = np.where(np.isnan(self._warmth), now, self._warmth + change)
         self._drift += self.gains.gain * np.nan_to_num(change)[self.taxels.module]
 

@@ -154,6 +154,29 @@ class Origin:
         self.live.close()
 
 
+@dataclass
+class PlotFunction:
+    """A function of a snapshot whose values are plotted.
+
+    Attributes:
+        driver: name; None: the first.
+        problem: why it failed last; empty: it did not.
+    """
+
+    function: Callable[[DriverSnapshot], float]
+    driver: str | None = None
+    unit: str = ""
+    problem: str = ""
+
+    def __call__(self, frame: DriverSnapshot) -> float:
+        """Return its value; NaN if it fails."""
+        try:
+            value, self.problem = float(self.function(frame)), ""
+        except Exception as error:  # noqa: BLE001 - a user's function may raise anything
+            value, self.problem = float("nan"), f"{type(error).__name__}: {error}"
+        return value
+
+
 class ShownDriver:
     """A driver as all viewers see it.
 
@@ -220,7 +243,8 @@ class ShownDriver:
             self.rest = DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
-        self.newest = self._judged(frame)
+        at_ns = None if self.origin.recording is None else frame.published_ns  # it may have been paused meanwhile
+        self.newest = self._judged(frame, status_now(LIVE, frame, at_ns))
         self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
         self.changes += 1
 
@@ -231,9 +255,8 @@ class ShownDriver:
             return
         before_life, life = self.life, life_of(self.live.reader, before.frame)
         stands_still = self._stands_still(life)
-        if not stands_still:
-            self.life = life
-        self.newest = self._judged(before.frame, before.status if stands_still else None)
+        self.life = before_life if stands_still else life
+        self.newest = self._judged(before.frame, before.status if stands_still else status_now(life, before.frame))
         if (
             self.life != before_life
             or not np.array_equal(self.newest.status, before.status)
@@ -241,16 +264,14 @@ class ShownDriver:
         ):
             self.changes += 1
 
-    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8] | None = None) -> Newest:
+    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8]) -> Newest:
         self._judged_ns = now_ns()
         services, name = self.origin.services, self.live.name
         calm = services.calm_of(name)
         if calm is not None and not self._fits(calm.structure):
             calm = None
-        if status is None:
-            status = status_now(self.life, frame)
-            if calm is not None:
-                status = status | (calm.status & _UNHEALTHY)
+        if calm is not None:
+            status = status | (calm.status & _UNHEALTHY)
         return Newest(frame, status, calm, services.contacts_of(name), services.motion_of(name))
 
     def _fits(self, calm: Structure) -> bool:
@@ -273,6 +294,7 @@ class Follower:
 
     Attributes:
         edition: changes whenever drivers or structures change.
+        functions: of snapshots that viewers plot, by the names of their lines.
     """
 
     def __init__(self, *origins: Origin, robot: Robot | None = None) -> None:
@@ -280,6 +302,7 @@ class Follower:
         self.drivers: list[ShownDriver] = []
         self.problem: str | None = None
         self.edition = 0
+        self.functions: dict[str, PlotFunction] = {}
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[tuple[str, str], int] = {}

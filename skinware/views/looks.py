@@ -57,13 +57,14 @@ class Names(msgspec.Struct, tag_field="op", tag="names"):
 
 
 class Line(msgspec.Struct, frozen=True):
-    """A line of a plot: a taxel, the sum of modules, or the load of a contact."""
+    """A line of a plot: a taxel, the sum of modules, the load of a contact, or a function of the program."""
 
     driver: Number
     position: Number | None = None
     type: str = ""
     modules: Annotated[tuple[Number, ...], msgspec.Meta(max_length=MOST_MODULES)] = ()
     contact: Number | None = None
+    function: Annotated[str, msgspec.Meta(max_length=200)] | None = None
 
 
 class Plot(msgspec.Struct, tag_field="op", tag="plot"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from skinware.service import ServiceReader
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
-from skinware.views.following import Follower, ShownDriver
+from skinware.views.following import Follower, PlotFunction, ShownDriver
 from skinware.views.looks import Line
 from skinware.views.quantities import WITHOUT_VALUE
 
@@ -67,12 +67,17 @@ class _Feed:
         self._rows: deque[tuple[int, Values]] = deque(maxlen=_MOST_SAMPLES)
         self._last: tuple[int, int] | None = None
 
-    def choose(self, number: int, lines: dict[int, Line], driver: ShownDriver) -> None:
+    def choose(
+        self, number: int, lines: dict[int, Line], driver: ShownDriver, functions: Mapping[str, PlotFunction]
+    ) -> None:
         """Take the values of these lines, by their places in a choice, from now on."""
         self.number, self.lines = number, lines
         if self.of == "contacts":
             ids = [line.contact for line in lines.values()]
             self._values = lambda sample: _loads(sample, ids)
+        elif self.of == "function":
+            names = [line.function or "" for line in lines.values()]
+            self._values = lambda frame: np.array([functions[name](frame) for name in names])
         else:
             self._values = _totals(driver, list(lines.values()))
 
@@ -176,13 +181,16 @@ class Plots:
                 feed = self._feeds.get(source) or self._feeds.setdefault(source, _Feed(source))
                 if (self._number, lines) != (feed.number, feed.lines):
                     self._waiting += [block] if len((block := feed.block()).time_ns) else []
-                    feed.choose(self._number, lines, driver)
+                    feed.choose(self._number, lines, driver, self._follower.functions)
 
     def _source_of(self, driver: ShownDriver, line: Line) -> _PlotSource | None:
         origin = driver.origin
         if line.contact is not None:
             reader = origin.services.contacts_reader(driver.live.name)
             return None if reader is None else _PlotSource("contacts", reader.namespace, reader.name)
+        if line.function is not None:
+            is_known = line.function in self._follower.functions
+            return _PlotSource("function", origin.namespace, driver.live.name) if is_known else None
         is_calm = driver.newest is not None and driver.newest.calm is not None
         if line.modules and is_calm and origin.calm is not None:
             return _PlotSource("calm", origin.calm, driver.live.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import mimetypes
+import ssl
 from collections import deque
 from collections.abc import Callable
 from http import HTTPStatus
@@ -39,10 +40,10 @@ _LONGEST_OPERATION = 1 << 16
 _RECORDINGS = "/recordings/"
 _CLOSE_TIMEOUT_S = 1.0
 """Time for a viewer to close its connection."""
+_SOURCES = "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'"
+_NOTEBOOKS = "'self' http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:* vscode-webview:"
 _HEADERS = {
     "Cache-Control": "no-cache",
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline';"
-    " frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -58,6 +59,8 @@ class ViewServer:
         recording: that viewers may begin and end; None: they may not record.
         doctor: that is asked for advice; None: without it.
         files: recordings that viewers may see instead; each plays them for itself.
+        is_framed: pages of this machine, such as notebooks, may contain the page.
+        tls: encrypts all connections.
     """
 
     def __init__(
@@ -68,6 +71,9 @@ class ViewServer:
         page: Path = PAGE,
         doctor: DoctorProgram | None = None,
         files: RecordingFiles | None = None,
+        *,
+        is_framed: bool = False,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._live, self._files = Show(follower), files or RecordingFiles()
@@ -76,6 +82,7 @@ class ViewServer:
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._news = asyncio.Event()
         self._server: Server | None = None
+        self._frames, self._tls = _NOTEBOOKS if is_framed else "'none'", tls
 
     async def start(self, host: str, port: int) -> int:
         """Listen, and return the port, which the system chooses if ``port`` is 0.
@@ -92,6 +99,7 @@ class ViewServer:
             max_size=_LONGEST_OPERATION,
             server_header=None,
             close_timeout=_CLOSE_TIMEOUT_S,
+            ssl=self._tls,
         )
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
@@ -131,7 +139,9 @@ class ViewServer:
             path = unquote(urlsplit(request.path).path)
             if path == "/live":
                 return None
-            return self._file(path, request)
+            response = self._file(path, request)
+            response.headers["Content-Security-Policy"] = f"{_SOURCES}; frame-ancestors {self._frames}"
+            return response
         except AccessRefused as refused:
             return _response(refused.status, f"{refused}\n".encode(), "text/plain")
         except ValueError:  # the path cannot be an address
@@ -161,6 +171,7 @@ class ViewServer:
         address = urlsplit(connection.request.path if connection.request else "")
         recordings = parse_qs(address.query).get("recording", [])
         show = await asyncio.to_thread(self._files.open, recordings) if recordings else self._live
+        show.follower.functions = self._follower.functions
         viewer = Viewer(show)
         self._viewers.add(viewer)
         try:
@@ -245,6 +256,15 @@ class ViewServer:
 
     def _besides(self, show: Show) -> dict[str, Any]:
         besides: dict[str, Any] = {"recording": None}
+        functions, drivers = show.follower.functions, show.follower.drivers
+        besides["functions"] = [
+            {"name": name, "driver": driver.number, "unit": function.unit}
+            for name, function in functions.items()
+            if (driver := next((d for d in drivers if function.driver in (None, d.name)), None)) is not None
+        ]
+        besides["problems"] = [
+            problem_of_all(f"{name}: {function.problem}") for name, function in functions.items() if function.problem
+        ]
         if not show.is_live:
             return besides
         besides["marks"] = list(self._marks)
@@ -252,7 +272,7 @@ class ViewServer:
         if self._recording is not None:
             besides["recording"] = self._recording.state
             if self._recording.problem is not None:
-                besides["problems"] = [problem_of_all(f"recording: {self._recording.problem}")]
+                besides["problems"].append(problem_of_all(f"recording: {self._recording.problem}"))
         return besides
 
 

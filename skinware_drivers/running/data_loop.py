@@ -121,6 +121,7 @@ class DataLoop:
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
+            self._timer = None
 
     def _empty_batch(self) -> FrameBatch:
         if self._generation is not None:
@@ -152,6 +153,9 @@ class DataLoop:
         if generation is None:
             return
         self._attend(generation)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
         if not generation.flows:
             self._intake.take()  # what has arrived comes first: this may be late
         generation.publisher.writer.keep_files()
@@ -166,7 +170,7 @@ class DataLoop:
         loop = asyncio.get_running_loop()
         due_s = loop.time() + _LOOK_S if generation.flows else generation.path.deadline_ns / NS_PER_S
         if self._timer is not None:
-            if not self._timer.cancelled() and loop.time() < self._timer.when() <= due_s:
-                return  # it comes early enough and then looks again
+            if self._timer.when() <= due_s:
+                return  # it comes early enough and then looks again; also if it is due in this turn of the loop
             self._timer.cancel()
         self._timer = loop.call_at(due_s, self._ending.guard(self._publish_when_due))

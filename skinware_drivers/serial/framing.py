@@ -123,6 +123,18 @@ class Framing(Encoding):
         """Return a framer for a stream, from its beginning."""
 
 
+class ReceivedFraming(Framing):
+    """The framing of a stream that is only read."""
+
+    def encode(self, identifier: int, payload: bytes) -> bytes:
+        """Refuse to make a frame.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"frames of this device are only read ({identifier:#x}, {len(payload)} bytes)")
+
+
 class Framer(ABC):
     """Finds the frames of one stream.
 

@@ -14,6 +14,7 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.stream import CHUNK
 
 Resolved = tuple[socket.AddressFamily, tuple[str, int]]
 """Family, and the first two parts of the address for sockets of that family."""
@@ -217,4 +218,5 @@ class ServerBus(SerialBus):
 
     def _hear(self, chunk: bytes, time_ns: int) -> None:
         self._heard_ns = time_ns
-        super()._hear(chunk, time_ns)
+        for start in range(0, len(chunk), CHUNK):
+            super()._hear(chunk[start : start + CHUNK], time_ns)

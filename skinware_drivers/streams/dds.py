@@ -19,6 +19,7 @@ from msgspec import Meta
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import now_ns
+from skinware.ros2.transport import HIGHEST_DOMAIN
 from skinware_drivers.bus import Bus
 from skinware_drivers.fields import DeviceTime
 from skinware_drivers.options import OptionsT
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-HIGHEST_DOMAIN = 232
 ENCAPSULATION = 4
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIBBI")
@@ -180,16 +180,15 @@ class DdsBus(ServerBus):
 
     def _read(self, port: Port) -> None:
         if records := port.read(CHUNK):
-            time_ns = now_ns()
-            for start in range(0, len(records), CHUNK):
-                self._hear(records[start : start + CHUNK], time_ns)
+            self._hear(records, now_ns())
         self._report()
 
     def _report(self) -> None:
         if self._joined is None or self._port is None:
             return
-        self.counters.dropped += self._joined.take_dropped()
-        self.counters.refused += self._joined.take_refused()
+        dropped, refused = self._joined.take_unused()
+        self.counters.dropped += dropped
+        self.counters.refused += refused
         for level, text in self._joined.take_news(now_ns()):
             log.log(level, "%s: %s", self.name, text)
 

@@ -87,8 +87,7 @@ class DdsPort(Port):
         self._sources: dict[str, _HeardPublisher] = {}
         self._publishers: dict[int, _Publisher] = {}
         self._news: list[News] = []
-        self._refused = 0
-        self._rejected = self._rejected_before = 0
+        self._refused = self._rejected = self._rejected_before = 0
         self._domain, self._participant = _joined(name, domain, options)
         qos = _qos(options, Policy.History.KeepAll, Policy.ResourceLimits(options.depth, 1, options.depth))
         with _as_bus_error(name):
@@ -111,7 +110,7 @@ class DdsPort(Port):
             self._look(time_ns)
             records = [one for number in range(len(self._readers)) for one in self._take(number, time_ns)]
             self._rejected = sum(reader.get_sample_rejected_status().total_count for reader in self._readers)
-        self._waiting.go_on()
+        self._waiting.go_on.set()
         return b"".join(records)
 
     def write(self, data: bytes) -> int:
@@ -124,15 +123,11 @@ class DdsPort(Port):
         del self._publications, self._participant
         self._domain = None
 
-    def take_dropped(self) -> int:
-        """Return the number of samples that found no room since the last call."""
-        dropped, self._rejected_before = self._rejected - self._rejected_before, self._rejected
-        return dropped
-
-    def take_refused(self) -> int:
-        """Return the number of samples of other publishers of a topic since the last call."""
-        refused, self._refused = self._refused, 0
-        return refused
+    def take_unused(self) -> tuple[int, int]:
+        """Return how many samples found no room since the last call, and how many were of further publishers."""
+        unused = self._rejected - self._rejected_before, self._refused
+        self._rejected_before, self._refused = self._rejected, 0
+        return unused
 
     def take_news(self, time_ns: int) -> list[News]:
         """Return the news of publishers since the last call; those that came a while ago must have been matched."""
@@ -210,7 +205,7 @@ class DdsPort(Port):
 
 
 class _WaitingThread:
-    """A thread that makes ``event`` readable when there is something to read."""
+    """A thread that makes ``event`` readable when there is something to read, until ``go_on`` is set."""
 
     def __init__(self, participant: DomainParticipant, readers: Sequence[Any]) -> None:
         self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -218,7 +213,7 @@ class _WaitingThread:
         self._conditions = [ReadCondition(reader, _NEW) for reader in readers]
         for condition in (*self._conditions, self._woken):
             self._waitset.attach(condition)
-        self._go_on, self._is_over = threading.Event(), False
+        self.go_on, self._is_over = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="skinware dds", daemon=True)
         self._thread.start()
 
@@ -226,15 +221,12 @@ class _WaitingThread:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.event)
 
-    def go_on(self) -> None:
-        self._go_on.set()
-
     def close(self) -> None:
         if self._is_over:
             return
         self._is_over = True
         self._woken.set(True)
-        self._go_on.set()
+        self.go_on.set()
         self._thread.join()
         for condition in (*self._conditions, self._woken):
             self._waitset.detach(condition)
@@ -244,10 +236,10 @@ class _WaitingThread:
     def _run(self) -> None:
         while not self._is_over:
             self._waitset.wait(duration(infinite=True))
-            self._go_on.clear()
+            self.go_on.clear()
             os.eventfd_write(self.event, 1)
             if not self._is_over:
-                self._go_on.wait()
+                self.go_on.wait()
 
 
 class DdsDeviceBus(SerialBus):

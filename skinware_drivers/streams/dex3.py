@@ -249,10 +249,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         rows["status"][lost > 0] |= np.uint8(Status.SUSPECT)
         self._numbers[hand] += 1 + lost
         rows["number"] = self._numbers[hand] & 0xFFFF_FFFF
-        data = rows.tobytes()
-        return [
-            (_PAD | hand << 4 | pad, data[pad * _ROW.itemsize : (pad + 1) * _ROW.itemsize]) for pad in range(len(pads))
-        ]
+        return [(_PAD | hand << 4 | pad, row.tobytes()) for pad, row in enumerate(rows)]
 
     def _misfit(self, sample: bytes) -> str:
         """Return why a sample is none of the type, although DDS says so; empty if it is one."""

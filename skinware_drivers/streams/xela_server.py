@@ -35,7 +35,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Framed, Framer, Framing
+from skinware_drivers.serial.framing import Framed, Framer, Framing, ReceivedFraming
 
 MOST_TAXELS = 1024
 MOST_SENSORS = 128
@@ -52,21 +52,13 @@ Seen = dict[str, tuple[str, int, bool]]
 
 
 @dataclass(frozen=True)
-class XelaMessages(Framing):
+class XelaMessages(ReceivedFraming):
     """The framing, for receiving only."""
 
     maximum_body: int = field(default=4 + 4 * _AXES * MOST_TAXELS, init=False)
 
     def framer(self) -> Framer:
         return _SeenMessages()
-
-    def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Refuse: nothing is sent to the server.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(f"XELA's server is only read ({identifier:#x}, {len(payload)} bytes)")
 
 
 class _SeenMessages(Framer):

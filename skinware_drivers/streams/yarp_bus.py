@@ -305,9 +305,7 @@ class YarpBus(ServerBus):
 
     def _read(self, port: Port) -> None:
         if messages := port.read(CHUNK):
-            time_ns = now_ns()
-            for start in range(0, len(messages), CHUNK):
-                self._hear(messages[start : start + CHUNK], time_ns)
+            self._hear(messages, now_ns())
         if isinstance(port, YarpPort):
             self.counters.dropped += port.passed_over
             port.passed_over = 0

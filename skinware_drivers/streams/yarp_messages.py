@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.serial.framing import Framed, Framer, Framing
+from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming
 
 LENGTH, PLAIN, TIMED = 0, 1, 2
 """Kinds of frames."""
@@ -50,7 +50,7 @@ _U32 = 0xFFFF_FFFF
 
 
 @dataclass(frozen=True)
-class YarpMessages(Framing):
+class YarpMessages(ReceivedFraming):
     """The framing, for receiving only.
 
     Args:
@@ -64,14 +64,6 @@ class YarpMessages(Framing):
 
     def framer(self) -> Framer:
         return _Vectors(self)
-
-    def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Refuse: nothing is sent to the port.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(f"a YARP port is only read ({identifier:#x}, {len(payload)} bytes)")
 
 
 def message_size(stream: bytes, start: int = 0) -> int | None:

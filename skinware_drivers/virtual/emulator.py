@@ -183,9 +183,10 @@ class Emulator(Stage[OptionsT]):
         if self.options.pattern == "cycle":
             return [device.cycle % (int(self._each("full_scale").min()) + 1)] * self._n_values
         values = self._each("rest")
-        if self.options.pattern == "touch":
-            from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
-            felt = self.feel(device, (time_ns - from_ns) * 1e-9)
+        from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
+        touched_s = (time_ns - from_ns) * 1e-9 - self.options.calm_s
+        if self.options.pattern == "touch" and touched_s >= 0:
+            felt = self.feel(device, touched_s)
             values = np.clip(felt, self._each("lowest"), self._each("full_scale"))
         listed: list[int] = values.tolist()
         return listed

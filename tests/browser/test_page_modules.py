@@ -217,18 +217,29 @@ def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
         "theme": "light",
         "shifts": {"default/a b": [0.5, -1, 0]},
         "times": [1.5, 0.125],
+        "plots": [
+            [{"key": "taxel default/x:pressure:7a", "label": "a & b", "unit": "N", "taxel": "default/x:pressure:7a"}]
+        ],
     }
     assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False, "sharp": False}
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "#", "#eye=1,2", "#eye=1,2,3,4,5,x&scale=1", "#eye=,,,,,&theme=pink&scale=a,b", "#%%%=&=&eye=1e999,1,1,1,1,1"],
+    [
+        "",
+        "#",
+        "#eye=1,2",
+        "#eye=1,2,3,4,5,x&scale=1",
+        "#eye=,,,,,&theme=pink&scale=a,b",
+        "#%%%=&=&eye=1e999,1,1,1,1,1",
+        "#plot=[1]&plot={&t=x",
+    ],
 )
 def test_a_bad_address_is_no_view(tell: Callable[..., Any], text: str) -> None:
     found = tell("address.js", "m.fromHash(a[0])", text)
     assert [found["camera"], found["scale"], found.get("theme")] == [None, None, None]
-    assert found["pins"] == []
+    assert [found["pins"], found["plots"], found["times"]] == [[], [], None]
 
 
 # -- curves.js, series.js, spectrum.js, format.js ------------------------------------------------------------------

@@ -54,6 +54,10 @@ def test_the_values_of_a_plot_are_those_of_the_ring(sleeve: Sleeve, address: str
     assert set(seen.values()) == {15, 215}
     assert tell(page, DRAWN) > 50
     assert tell(page, "skin.plots[0].unit") == "counts"
+    until(page, "location.hash.includes('plot=')")
+    other = open_page(page.url)  # an address keeps the plots
+    until(other, f"{LINE}?.times.length > 5")
+    assert tell(other, LINE)["key"] == line["key"]
 
 
 def test_it_stands_still_zooms_and_has_a_cursor(sleeve: Sleeve, address: str, open_page: OpenPage) -> None:

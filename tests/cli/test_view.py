@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import datetime
+import shutil
 import signal
 import socket
+import ssl
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+import segno
+import trustme
 from websockets.exceptions import InvalidStatus
 
 from skinware import Namespace
 from skinware.cli import view as view_module
 from skinware.cli._command import exit_status
+from skinware.cli.view import addresses, qr_text
 from skinware.cli.view import command as view
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
@@ -47,6 +53,82 @@ def test_its_address_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert exit_status(view, []) == 0
     assert opened == ["http://127.0.0.1:5/"]
+
+
+def test_all_addresses_for_other_machines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(view_module, "_serve", ready_at_once)
+    monkeypatch.setattr(view_module, "addresses", lambda _: ["10.0.0.7", "fd00::7", "robot"])
+    assert exit_status(view, ["--no-browser", "--host", "0.0.0.0", "--token", "abc"]) == 0
+    first, *more = capsys.readouterr().out.splitlines()
+    assert first.startswith("http://10.0.0.7:5/?token=abc shows all drivers of namespace ")
+    assert more[:2] == ["http://[fd00::7]:5/?token=abc", "http://robot:5/?token=abc"]
+    assert [row for row in more[2:] if row] == qr_text("http://10.0.0.7:5/?token=abc").splitlines()
+    monkeypatch.setattr(view_module, "find_spec", lambda name: None if name == "segno" else True)
+    assert exit_status(view, ["--no-browser", "--host", "0.0.0.0"]) == 0
+    assert capsys.readouterr().out.endswith("for a QR code of it: pip install segno\n")
+
+
+def test_the_qr_code_is_the_address() -> None:
+    url = "http://10.0.0.7:8736/?token=abc"
+    rows = qr_text(url).splitlines()
+    drawn = [[sign in half for sign in row] for row in rows for half in ("█▀", "█▄")]  # light modules
+    quiet = 4
+    code = [[not light for light in row[quiet:-quiet]] for row in drawn[quiet:]]
+    matrix = [[bool(module) for module in row] for row in segno.make(url, error="l").matrix]
+    assert code[: len(matrix)] == matrix
+
+
+def test_addresses_are_those_of_this_machine() -> None:
+    assert addresses("127.0.0.1") == ["127.0.0.1"]
+    *found, name = addresses("0.0.0.0")
+    assert name == socket.gethostname()
+    for address in found:
+        with socket.socket() as listener:
+            listener.bind((address, 0))
+
+
+@pytest.fixture
+def certificates(tmp_path: Path) -> Path:
+    """Certificates of this machine: a good one, one that has expired, and one with the key of another."""
+    authority = trustme.CA()
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    expired = datetime.datetime(2020, 1, 2, tzinfo=datetime.UTC)
+    for folder, end in {"good": None, "expired": expired, "mixed": None}.items():
+        (tmp_path / folder).mkdir()
+        made = authority.issue_cert("127.0.0.1", not_after=end)
+        made.cert_chain_pems[0].write_to_path(tmp_path / folder / "cert.pem")
+        made.private_key_pem.write_to_path(tmp_path / folder / "key.pem")
+    shutil.copy(tmp_path / "good" / "key.pem", tmp_path / "mixed")
+    (tmp_path / "empty").mkdir()
+    return tmp_path
+
+
+def test_https_with_a_certificate(certificates: Path) -> None:
+    with publishing(FakeSkin("torso", fake_structure(1, 2))):
+        arguments = ("--port", "0", "--no-browser", "--tls", str(certificates / "good"))
+        with running("skin-view", *arguments) as server:
+            url = server.wait_for("ready")["url"]
+            assert url.startswith("https://127.0.0.1:")
+            trusting = ssl.create_default_context(cafile=certificates / "ca.pem")
+            with page_of(url, ssl=trusting) as viewer:
+                viewer.pull_until(lambda _: viewer.skin["drivers"])
+            with pytest.raises(ssl.SSLCertVerificationError), page_of(url, ssl=ssl.create_default_context()):
+                pass
+
+
+@pytest.mark.parametrize(
+    ("folder", "why"),
+    [
+        ("empty", "cert.pem is missing; the folder needs cert.pem and key.pem"),
+        ("mixed", "they do not belong together"),
+        ("expired", "certificate has expired"),
+    ],
+)
+def test_certificates_that_nobody_would_trust(
+    certificates: Path, folder: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(view, ["--no-browser", "--tls", str(certificates / folder)]) == 2
+    assert why in capsys.readouterr().err
 
 
 async def ready_at_once(*arguments: object) -> None:

@@ -29,6 +29,7 @@ from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.paxini import PaxiniDriver
+from skinware_drivers.serial.robotiq_tsf import RobotiqTsfDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver
@@ -60,6 +61,7 @@ from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
+from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
@@ -502,3 +504,15 @@ def test_every_driver_that_ships_is_here() -> None:
 class TestDex3(DriverConformance):
     driver = Dex3Driver
     emulator = EmulatedDex3
+
+
+class TestRobotiqTsf(DriverConformance):
+    driver = RobotiqTsfDriver
+    emulator = EmulatedRobotiqTsf
+
+
+@pytest.mark.thorough
+class TestRobotiqTsfWithoutTime(DriverConformance):
+    driver = RobotiqTsfDriver
+    emulator = EmulatedRobotiqTsf
+    emulator_options: ClassVar[Mapping[str, Any]] = {"timed": False, "fingers": (1,)}

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framing
+from skinware_drivers.serial.robotiq_tsf import RobotiqPackets
 from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _Matrix
 from skinware_drivers.streams.dex3 import Dex3Driver, Dex3Options
@@ -23,6 +24,7 @@ from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
 from skinware_drivers.virtual.devices.dex3 import EmulatedDex3, EmulatedDex3Options
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
+from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
 from skinware_drivers.virtual.devices.xela import EmulatedXelaServer, EmulatedXelaServerOptions
@@ -58,6 +60,11 @@ def _dex3() -> tuple[Framing, list[bytes]]:
     return Dex3Driver(Dex3Options()).framing, Spoken(EmulatedDex3(EmulatedDex3Options())).answers(b"", 100)
 
 
+def _robotiq() -> tuple[Framing, list[bytes]]:
+    fingertips = Spoken(EmulatedRobotiqTsf(EmulatedRobotiqTsfOptions()))
+    return RobotiqPackets(), fingertips.answers(bytes.fromhex("9a00580105"), 500)
+
+
 def _dsa() -> tuple[Framing, list[bytes]]:
     driver = WeissDsaDriver(WeissDsaOptions(rle_offset=5))
     driver._cells = (_Matrix(6, 14, 3.4, 3.4), _Matrix(6, 13, 3.4, 3.4))
@@ -72,6 +79,7 @@ DEVICES: dict[str, Callable[[], tuple[Framing, list[bytes]]]] = {
     "yarp": _yarp,
     "icub_eth": _icub,
     "dex3": _dex3,
+    "robotiq_tsf": _robotiq,
     "weiss_dsa": _dsa,
 }
 

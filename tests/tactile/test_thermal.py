@@ -14,6 +14,7 @@ from skinware.realtime import NS_PER_S
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.chain import ChainSettings
+from skinware.tactile.chain_state import read_state, save_state
 from skinware.tactile.stages import Signal, Taxels
 from skinware.tactile.thermal import ThermalSettings, ThermalStage
 from tests.cli.fake_skin import fake_structure
@@ -150,6 +151,44 @@ def test_temperatures_that_come_later_or_again_move_nothing_at_once() -> None:
     shown = np.array([steps(stage, values[i : i + 1], pads[i : i + 1], i).values for i in range(600)])
     assert np.abs(np.diff(shown, axis=0)).max() < 1
     assert np.ptp(shown[500:]) < 6
+
+
+def test_a_restarted_stage_goes_on_where_the_one_before_was() -> None:
+    warm = np.linspace(0, 30, 600)[:, np.newaxis]
+    values, pads = 60 + np.repeat(warm, N, axis=1), 100 + np.repeat(warm, PADS, axis=1)
+    before, after = ThermalStage(*taxels(), spread=1.0), ThermalStage(*taxels(), spread=1.0)
+    last = steps(before, values, pads).values
+    rows = np.arange(N)
+    rows[5] = -1
+    after.restore(before.state(), rows)
+    shown = steps(after, values[-1:] + 4, pads[-1:] + 4).values  # it was 4 counts warmer after a restart
+    assert np.delete(shown, 5) == pytest.approx(np.delete(last, 5), abs=0.5)
+    assert shown[5] == pytest.approx(60 + 30 + 4 - 4, abs=0.5)  # no drift from before, but the gain of its patch
+
+
+@pytest.mark.parametrize(
+    "wrong", [{}, {"own": np.zeros(3)}, {"drift": np.zeros((N, 2))}, {"warmth": np.zeros(N, "i8")}]
+)
+def test_a_state_that_does_not_fit_is_refused(wrong: dict[str, npt.NDArray[np.float64]]) -> None:
+    stage = ThermalStage(*taxels(), spread=1.0)
+    with pytest.raises(ConfigurationError, match="no state of the stage thermal"):
+        stage.restore(stage.state() | wrong if wrong else {}, np.arange(N))
+
+
+def test_a_chain_keeps_what_its_baselines_need(tmp_path: Path) -> None:
+    settings = chain(tmp_path, '[[stage]]\nstage = "thermal"\n[[stage]]\nstage = "baseline"\n')
+    before, after = settings.chain(fake_structure()), settings.chain(fake_structure())
+    (stage,) = (stage for stage in before.stages["pressure"] if isinstance(stage, ThermalStage))
+    stage.gains.own[:] = 0.5
+    stage.gains.variance[:] = 0.0
+    save_state(tmp_path / "state.npz", before.state())
+    state, why = read_state(tmp_path / "state.npz")
+    assert not why
+    assert state is not None
+    assert "thermal.own" in state.arrays["pressure"]
+    after.restore(state)
+    (stage,) = (stage for stage in after.stages["pressure"] if isinstance(stage, ThermalStage))
+    assert stage.gains.gain == pytest.approx(0.5)
 
 
 def chain(tmp_path: Path, stages: str) -> ChainSettings:

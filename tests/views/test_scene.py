@@ -27,6 +27,7 @@ from skinware.sensor_types import (
 )
 from skinware.views.quantities import quantities_of, types_of
 from skinware.views.scene import ASPECT, FLAT_PITCH_M, Scene
+from skinware_drivers.can.allegro_v5 import AllegroV5Options, AllegroV5UdpDriver
 from skinware_drivers.description import Module, Patch, Sensor, assemble, taxels
 from skinware_drivers.hand import Grid, Hand
 from tests.cli.fake_skin import fake_structure
@@ -231,3 +232,39 @@ def test_taxels_come_before_a_few_sums() -> None:
     modules = [Module(taxels(6), 0, "2x3"), Module([Sensor(FORCE_Z.name, 100)], 1)]
     structure = assemble([("bus", [Patch("finger", modules)])], (FORCE_Z, PRESSURE), np.uint16).structure
     assert [t.name for t in types_of(structure)] == ["pressure", "force_z"]
+
+
+def test_a_module_across_fingers_is_a_pad_on_each() -> None:
+    driver = AllegroV5UdpDriver(AllegroV5Options(side="left"))
+    structure = assemble([("bus", driver.patches)], driver.types, driver.dtype).structure
+    (pressure,) = quantities_of(structure.placed(driver.geometry or Geometry.joined([])))
+    pads = pressure.pads
+    assert pads.names == ["thumb", "index", "middle", "ring", "palm"]
+    assert [pads.names[pad] for pad in pads.of_sensor.tolist()] == [
+        "palm", *["thumb"] * 3, *["index"] * 4, *["middle"] * 4, *["ring"] * 4
+    ]  # fmt: skip
+    assert pads.is_on_hand.all()
+    assert (pressure.total, pressure.has_loads) == ("highest", True)
+    (plain,) = quantities_of(structure)  # without places
+    assert plain.pads.names == ["hand"]
+    assert not plain.pads.is_on_hand.any()
+
+
+def test_two_hands_of_one_driver_lie_beside_each_other_with_their_outlines() -> None:
+    structure, grid = structure_of([(0, "10x4", 40)] * 2), Grid(10, 4)
+    first, second = structure.sensor_uid.reshape(2, -1).tolist()
+    places_of = [Hand("right").down("index", [grid])[0], Hand("left").down("index", [grid])[0]]
+    parts = [grid.at(place, ["pressure"], uid) for place, uid in zip(places_of, (first, second), strict=True)]
+    scene = scene_of(both=structure.placed(Geometry.joined(parts)))
+    places = scene.of("both", "pressure").position
+    right, left = places[:40], places[40:]
+    assert abs(right[:, 0].mean() - left[:, 0].mean()) > 0.09  # the width of a palm
+    outlines = scene.outlines("both")
+    assert len(outlines) == 4  # a finger and a palm of each
+    assert np.concatenate(outlines)[:, 2].max() < places[:, 2].min()
+    hands = sorted((np.concatenate(outlines[at : at + 2]) for at in (0, 2)), key=lambda at: at[:, 0].min())
+    taxels = sorted((left, right), key=lambda at: at[:, 0].min())
+    assert hands[0][:, 0].max() < hands[1][:, 0].min()
+    for hand, at in zip(hands, taxels, strict=True):
+        assert (hand.min(axis=0) < at.min(axis=0)).all()
+        assert (hand.max(axis=0)[:2] > at.max(axis=0)[:2]).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -19,7 +20,8 @@ from skinware.realtime import now_ns
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware.tactile.contacts_service import ContactsWriter
-from skinware.views.shows import Outline, RecordingFiles
+from skinware.views.following import Follower, Origin
+from skinware.views.shows import Outline, PlayedRecording, RecordingFiles, Show
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.tactile.skins import AT_ONCE
@@ -109,6 +111,17 @@ def test_a_moment_shows_what_was_recorded_until_then(serving: Serve, recording: 
         for op in ("mark", "record"):
             page.say(op, **({"text": "x"} if op == "mark" else {"action": "start"}))
             assert "cannot" in page.pull_until(lambda turn: "error" in turn)["error"]
+
+
+def test_at_a_paused_moment_nothing_grows_old(recording: Path) -> None:
+    played = PlayedRecording(recording, "walk")
+    follower = Follower(Origin(played.namespace, recording="walk"))
+    with closing(Show(follower, [played])):
+        wait_until(lambda: bool(played.namespace.services()))
+        time.sleep(0.5)  # longer than a value is fresh
+        wait_until(lambda: bool(follower.take(0)))
+        (driver,) = follower.drivers
+        assert (driver.life, driver.status.max()) == ("live", 0)
 
 
 def test_each_viewer_plays_for_itself_and_leaves_nothing(serving: Serve, recording: Path) -> None:

@@ -1,4 +1,4 @@
-"""Robotiq's own parser of TSF-85 packets reads packets that are made here. There is no driver of ours yet."""
+"""Robotiq's own parser of TSF-85 packets reads packets that are made here; tests of the driver, the emulator."""
 
 from __future__ import annotations
 

@@ -64,8 +64,7 @@ SHOWN: Mapping[str, Shown] = {
     "anyskin": _pty(),
     "barrett": Shown(),
     "canopen": Shown(),
-    "cyskin_cpm": Shown(),
-    "dex3": Shown(),
+    "cyskin_cpm": Shown(address="mode=change"),
     "dfrobot": _pty("--units", "1,2", "--shapes", "6x6,4x8", bus="modbus:{port}", driver=("--units", "1,2")),
     "flexitac": Shown(),
     "icub_eth": Shown(),
@@ -74,13 +73,13 @@ SHOWN: Mapping[str, Shown] = {
     "paxini": _pty("--board", "high_speed"),
     "revo2": _pty(bus="modbus:{port}", driver=("--enable",)),
     "revo3": _pty(bus="modbus:{port}"),
-    "skintalk": _pty(),
+    "skintalk": _pty()._replace(address="mode=change"),
     "tactile_glove": _pty(),
     "tesollo": Shown(),
     "weiss_dsa": _pty(),
     "weiss_wts": _pty("--columns", "4", "--rows", "8"),
     "wuji_glove": _pty(),
-    "xela": Shown(),
+    "xela": Shown(address="mode=change"),
     "xela_server": Shown(),
     "yarp": Shown(),
 }
@@ -107,7 +106,7 @@ def picture(browser: Browser, shown: Shown) -> Image.Image:
         until(page, READY, within_ms=PATIENCE_MS)
         page.evaluate(WATCH)
         page.wait_for_timeout(WATCHED_MS)
-        until(page, "skin.drawn && window.score() > 0.9 * window.best", within_ms=PATIENCE_MS)
+        until(page, "window.score() > 0 && window.score() > 0.9 * window.best", within_ms=PATIENCE_MS)
         with Image.open(io.BytesIO(page.locator("#view").screenshot())) as image:
             done = image.convert("RGB")
         page.close()

@@ -1,6 +1,7 @@
 """Pictures of skin-view's page as a real browser shows it, once there is to be seen what each is to show.
 
-Usage: python tools/pictures/skin_view.py FOLDER NAMESPACE CALM   (writes FOLDER/view*.png; see tools/picture)
+Usage: python tools/pictures/skin_view.py FOLDER NAMESPACE CALM RECORDING
+(writes FOLDER/view*.png and view.webp, which moves; see tools/picture)
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -21,9 +22,13 @@ from tests.browser.chromium import chromium
 PATIENCE_MS = 120_000
 SIZE = (1200, 700)
 EYE = "eye=0.02,-0.27,0.18,0.112,0.01,-0.004"
-ALONG = "eye=-0.2,-0.13,0.22,0.115,0,0"
-BELOW = "eye=0.02,-0.27,-0.18,0.112,0.01,-0.004"
-"""Of an emulated arm: from above, along it from the elbow, and from below, where its boards 9 and 10 are."""
+"""Of an emulated arm, from above."""
+BOTH = "eye=0.2,-0.06,0.66,0.2,0.02,0"
+"""Of the arm and the hand beside it."""
+MOVING = (1100, 640)
+FRAMES, FRAME_MS = 40, 200
+"""Of the moving picture; ``]`` goes so far on in a recording."""
+MOST_BYTES = 1_500_000
 
 
 def taxels(condition: str, at_least: int) -> str:
@@ -33,7 +38,11 @@ def taxels(condition: str, at_least: int) -> str:
 
 
 FRESH = taxels("taxel.mark === 'fresh'", 310)
-PRESSED = f"{FRESH} && !skin.problems.length && " + taxels("taxel.level > 150", 8)
+
+
+def contacts(load: float, at_least: int) -> str:
+    """JavaScript: so many contacts have such a load."""
+    return f"skin.contacts.filter(one => one.load > {load}).length >= {at_least}"
 
 
 @dataclass(frozen=True)
@@ -41,39 +50,40 @@ class Shown:
     """One picture.
 
     Attributes:
-        driver: whose.
+        drivers: whose.
         address: its part that says how it is looked at.
         seen: what has to be true in the page, JavaScript.
         size: of the window, CSS pixels.
         calm: of the namespace that skin-calm makes, instead of the drivers' own.
-        pins: positions of taxels that are pinned, whose lines of 10 s are waited for.
+        pins: positions of taxels of the first driver that are pinned, whose lines of 10 s are waited for.
     """
 
-    driver: str
+    drivers: tuple[str, ...]
     address: str
     seen: str
     size: tuple[int, int] = SIZE
-    calm: bool = False
+    calm: bool = True
     pins: tuple[int, ...] = ()
 
 
 PICTURES = {
-    "view": Shown("torso", f"theme=dark&{EYE}", PRESSED, pins=(124, 200)),
-    "view-light": Shown("torso", f"theme=light&{EYE}", PRESSED),
-    "view-phone": Shown("torso", f"theme=dark&{ALONG}", PRESSED, PHONE),
-    "view-contacts": Shown(
-        "arm",
-        f"theme=light&{BELOW}",
-        f"{FRESH} && skin.contacts.filter(contact => contact.load > 300).length >= 2",
-        calm=True,
-    ),
-    "view-problem": Shown("broken", f"theme=dark&{EYE}", "skin.problems.length >= 3"),
+    "view": Shown(("arm", "hand"), f"theme=dark&{BOTH}", contacts(200, 3), pins=(124, 200)),
+    "view-light": Shown(("hand",), "theme=light", contacts(2000, 2)),
+    "view-phone": Shown(("hand",), "theme=dark", contacts(2000, 1), PHONE),
+    "view-contacts": Shown(("arm",), f"theme=light&{EYE}", f"{FRESH} && {contacts(300, 2)}"),
+    "view-problem": Shown(("broken",), f"theme=dark&{EYE}", "skin.problems.length >= 3", calm=False),
 }
+
+
+def screen(page: Page) -> Image.Image:
+    """What a window shows."""
+    with Image.open(io.BytesIO(page.screenshot())) as image:
+        return image.convert("RGB")
 
 
 def picture(browser: Browser, shown: Shown, namespace: str) -> Image.Image:
     """What a window shows once everything is there."""
-    with viewing(shown.driver, "--namespace", namespace) as (_, url):
+    with viewing(*shown.drivers, "--namespace", namespace) as (_, url):
         page = browser.new_page(viewport={"width": shown.size[0], "height": shown.size[1]})
         page.goto(f"{url}#sharp=1&{shown.address}")
         until(page, f"{READY} && skin.drawn > 20", within_ms=PATIENCE_MS)
@@ -83,19 +93,45 @@ def picture(browser: Browser, shown: Shown, namespace: str) -> Image.Image:
             page.mouse.move(1, 1)
             page.wait_for_timeout(10_000)
         until(page, shown.seen, within_ms=PATIENCE_MS)
-        with Image.open(io.BytesIO(page.screenshot())) as image:
-            done = image.convert("RGB")
+        done = screen(page)
         page.close()
     return done
 
 
+def moving(browser: Browser, recording: Path, file: Path) -> None:
+    """Save what a window shows of a recording, moment by moment: no slow machine is seen in it."""
+    with viewing(str(recording)) as (_, url):
+        page = browser.new_page(viewport={"width": MOVING[0], "height": MOVING[1]})
+        page.goto(f"{url}#sharp=1&theme=dark&t=1.0&{BOTH}")
+        until(
+            page,
+            "window.skin?.drivers.length === 2 && skin.replays[0].paused && skin.outlines[0].until_s > 9",
+            within_ms=PATIENCE_MS,
+        )
+        images = []
+        for number in range(FRAMES):
+            drawn = page.evaluate("skin.turn")
+            page.keyboard.press("]")
+            time_s = 1.0 + (number + 1) * FRAME_MS / 1000
+            until(page, f"skin.replays[0].time_s > {time_s - 0.05} && skin.turn > {drawn} + 3", within_ms=PATIENCE_MS)
+            images.append(screen(page))
+        page.close()
+    for quality in range(80, 10, -10):
+        images[0].save(
+            file, save_all=True, append_images=images[1:], duration=FRAME_MS, loop=0, quality=quality, method=4
+        )
+        if file.stat().st_size <= MOST_BYTES:
+            return
+
+
 def main() -> None:
-    folder, own, calm = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+    folder, own, calm, recording = Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
     with chromium() as browser:
+        moving(browser, recording, folder / "view.webp")
         for name, shown in PICTURES.items():
-            file = folder / f"{name}.png"
-            picture(browser, shown, calm if shown.calm else own).save(file, optimize=True)
-            print(f"{file}: {file.stat().st_size / 1000:.0f} kB")
+            picture(browser, shown, calm if shown.calm else own).save(folder / f"{name}.png", optimize=True)
+    for file in sorted(folder.glob("view*.*")):
+        print(f"{file}: {file.stat().st_size / 1000:.0f} kB")
 
 
 if __name__ == "__main__":

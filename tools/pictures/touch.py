@@ -13,13 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import Structure
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import MAGNETIC_FIELD, PRESSURE, TEMPERATURE
 from skinware.tactile import Baseline, Box, Contacts, Health, HealthKind, HealthSettings, Region, Regions
+from skinware.tactile.baseline_stage import BaselineStageSettings
 from skinware.tactile.calibration.placing import Presses, place
 from skinware.tactile.calibration.shapes import shapes_of
 from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import neighbours
+from skinware.tactile.stages import Signal, Taxels
 from skinware.tactile.testing import Response, World, arm, grid, triangles
+from skinware.tactile.thermal import ThermalStage
+from skinware.tactile.vectors import FieldSettings, VectorSettings
 
 ArrayF = npt.NDArray[np.float64]
 
@@ -114,6 +118,65 @@ def contacts_picture() -> str:
         parts.append(f'<circle cx="{last_x:.1f}" cy="{last_y:.1f}" r="5" fill="{_RED}"/>')
         parts.append(_text(last_x + 10, last_y - 8, f"{number}: {load:.0f} counts", colour=_RED, bold=True))
     return _svg("Contacts of two fingers on an arm, seen from above", height, parts)
+
+
+def thermal_picture() -> str:
+    """A taxel of a patch that is gripped whole while it warms and cools: shown without and with temperatures."""
+    random, rate_hz, n, pads = np.random.default_rng(3), 10, 80, 16
+    module, of_pad, patch = np.arange(n) // 10, np.arange(pads) // 2, np.zeros(n, np.int64)
+    pressure, temperature = (of.measured(unit="counts", minimum=0.0, maximum=255.0) for of in (PRESSURE, TEMPERATURE))
+    uid = np.arange(n, dtype=np.uint64)
+    stage = ThermalStage(
+        Taxels(pressure, uid, module, patch, 1.0),
+        Taxels(temperature, uid[:pads] + n, of_pad, patch[:pads], 1.0),
+        spread=1.0,
+    )
+    with_stage, without = Baseline(module, patch), Baseline(module, patch)
+    time_s = np.arange(900 * rate_hz) / rate_hz
+    warm = 8 * np.sin(time_s * 2 * np.pi / 400)
+    truth = 20.0 * ((time_s > 200) & (time_s < 800))
+    follows = (1 + 0.3 * random.standard_normal(n)).clip(0.2, 3)
+    shown = np.zeros((2, len(time_s)))
+    for row, (warmth, load) in enumerate(zip(warm, truth, strict=True)):
+        values = np.round(60 + follows * warmth + load + 0.8 * random.standard_normal(n))
+        signal = Signal.of(row * 10**9 // rate_hz, values)
+        felt = Signal.of(signal.time_ns, np.round(100 + 3 * warmth + 0.4 * random.standard_normal(pads)))
+        shown[0, row] = without.update(signal.time_ns, values).value[0]
+        stage.step(signal, felt)
+        shown[1, row] = with_stage.update(signal.time_ns, signal.values).value[0]
+    lines = [("temperature (counts of a pad / 3)", warm, _AMBER), ("load, in truth", truth, _INK)]
+    lines += [("shown without", shown[0], _RED), ("shown with the stage thermal", shown[1], _GREEN)]
+    return _chart("A patch that is gripped whole while it warms and cools", time_s, lines, (-10.0, 30.0), "counts")
+
+
+def turning_picture() -> str:
+    """A magnetometer of a finger that turns and is pressed: as it is, and behind the stages."""
+    random, rate_hz, n = np.random.default_rng(5), 50, 5
+    axes = [
+        Taxels(of.measured(unit="uT"), np.arange(n, dtype=np.uint64), *np.zeros((2, n), int)) for of in MAGNETIC_FIELD
+    ]
+    field = FieldSettings().stage(*axes)
+    stages = [BaselineStageSettings().stage(one) for one in field.axes]
+    vector = VectorSettings().stage(*(stage.taxels for stage in stages))
+    time_s = np.arange(40 * rate_hz) / rate_hz
+    angle = 1.3 * time_s + np.sin(time_s / 2)
+    turned = 50 * np.array([np.cos(angle), np.sin(angle) * np.cos(time_s / 7), np.sin(angle) * np.sin(time_s / 7)])
+    pressed = 80 * np.interp(time_s % 12, [0, 4, 4.2, 7, 7.2, 12], [0, 0, 1, 1, 0, 0]) * (time_s > 12)
+    response = np.eye(3) + 0.05 * random.standard_normal((n, 3, 3))
+    raw, shown = np.zeros((2, len(time_s)))
+    for row, load in enumerate(pressed):
+        values = response @ turned[:, row] + 0.5 * random.standard_normal((n, 3))
+        values[0, 2] += load
+        raw[row] = np.linalg.norm(values[0] - response[0] @ turned[:, 0])
+        signals = [Signal.of(row * 10**9 // rate_hz, axis) for axis in values.T]
+        field.step(*signals)
+        for stage, signal in zip(stages, signals, strict=True):
+            stage.step(signal)
+        vector.step(*signals)
+        shown[row] = np.linalg.norm([signal.values[0] for signal in signals])
+    lines = [("change of the field since the start", raw, _GREY), ("press, in truth", pressed, _INK)]
+    lines.append(("length of the vector that is shown", shown, _GREEN))
+    return _chart("A magnetometer of a finger that turns", time_s, lines, (0.0, 160.0), "µT")
 
 
 def regions_picture() -> str:
@@ -284,6 +347,37 @@ def _shade(part: float) -> str:
     return f"#{red:02x}{green_:02x}{blue:02x}"
 
 
+def _chart(
+    title: str, time_s: ArrayF, lines: Sequence[tuple[str, ArrayF, str]], limits: tuple[float, float], unit: str
+) -> str:
+    """Lines over time, each with its name and colour, with a scale of the unit at the left."""
+    left, right, top, height, (low, high) = 60, 20, 30, 200, limits
+    x = left + (_WIDTH - left - right) * time_s / time_s[-1]
+    parts = [_text(left, top - 10, unit, bold=True)]
+    for value in np.linspace(low, high, 5):
+        at_y = top + height * (high - value) / (high - low)
+        parts += [
+            _line([left, _WIDTH - right], [at_y] * 2, _PALE),
+            _text(left - 8, at_y + 5, f"{value:g}", anchor="end"),
+        ]
+    rows = slice(None, None, max(len(time_s) // 700, 1))
+    for number, (name, values, colour) in enumerate(lines):
+        parts.append(_line(x[rows], top + height * (high - values[rows]) / (high - low), colour, width=1.5))
+        parts.append(
+            _text(left + (number % 2) * 400, top + height + 48 + number // 2 * 22, name, colour=colour, bold=True)
+        )
+    parts += [
+        _text(
+            float(left + (_WIDTH - left - right) * part),
+            top + height + 20,
+            f"{part * time_s[-1]:.0f} s",
+            anchor="middle",
+        )
+        for part in (0.0, 0.25, 0.5, 0.75, 0.98)
+    ]
+    return _svg(title, top + height + 62 + (len(lines) - 1) // 2 * 22, parts)
+
+
 def _runs(flags: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Begin and end of every stretch of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
@@ -317,6 +411,8 @@ PICTURES = {
     "health": health_picture,
     "motion": motion_picture,
     "calibration": calibration_picture,
+    "thermal": thermal_picture,
+    "turning": turning_picture,
 }
 
 if __name__ == "__main__":

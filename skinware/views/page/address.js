@@ -4,7 +4,7 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `shifts` (by which drivers are moved, by their keys), `selected` (key of a row or null), `pins` (texts), `times` (s, of each recording), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
+ *     null), `shifts` (by which drivers are moved, by their keys), `selected` (key of a row or null), `pins` (texts), `plots` (lines of strips), `times` (s, of each recording), `normals`, `names`, `theme`, `flat`, `sharp`; what is missing is
  *     left out.
  */
 export function toHash(view) {
@@ -15,6 +15,7 @@ export function toHash(view) {
   if (view.scale) parts.set("scale", numbers(view.scale));
   if (view.selected) parts.set("selected", view.selected);
   for (const pin of view.pins ?? []) parts.append("pin", pin);
+  for (const lines of view.plots ?? []) parts.append("plot", JSON.stringify(lines));
   for (const [key, shift] of Object.entries(view.shifts ?? {})) parts.append("at", `${numbers(shift)},${key}`);
   if (view.times) parts.set("t", view.times.map((time_s) => time_s.toFixed(3)).join(","));
   if (view.theme) parts.set("theme", view.theme);
@@ -45,6 +46,7 @@ export function fromHash(hash) {
     scale: list("scale", 2),
     selected: parts.get("selected"),
     pins: parts.getAll("pin"),
+    plots: parts.getAll("plot").flatMap(linesOf),
     times: NUMBERS.test(parts.get("t") ?? "") ? parts.get("t").split(",").map(Number) : null,
     shifts: Object.fromEntries(shifts.filter(([key, shift]) => key && shift.every(Number.isFinite))),
     normals: parts.get("normals") === "1",
@@ -53,6 +55,19 @@ export function fromHash(hash) {
     flat: parts.get("flat") === "1",
     sharp: parts.get("sharp") === "1",
   };
+}
+
+/** The lines of a strip, in a list; empty if they are none. */
+function linesOf(text) {
+  const isText = (...values) => values.every((value) => typeof value === "string");
+  const isLine = (line) =>
+    isText(line?.key, line?.label, line?.unit) && (isText(line.taxel) || (isText(line.driver, line.type) && Array.isArray(line.modules)));
+  try {
+    const lines = JSON.parse(text);
+    return Array.isArray(lines) && lines.every(isLine) ? [lines] : [];
+  } catch {
+    return [];
+  }
 }
 
 const numbers = (list) => list.map((x) => Number(x.toPrecision(5))).join(",");

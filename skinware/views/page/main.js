@@ -90,7 +90,7 @@ const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${loca
 });
 const send = (op) => link.send(op);
 const probes = new Probes(send, () => plotting.ask());
-const plotting = new Plotting(byId("plots"), { send, skin, probes, stage, notify, rewind: { get isPaused() { return rewind.isPaused; }, get at_s() { return rewind.at_s; } } });
+const plotting = new Plotting(byId("plots"), { send, skin, probes, stage, notify, keep: () => keep(), rewind: { get isPaused() { return rewind.isPaused; }, get at_s() { return rewind.at_s; } } });
 const cards = new Cards(byId("tip"), byId("pins"), plotting, (probe) => pin(probe));
 const tree = new Tree(byId("tree"), choose, (row, find) => plotting.draggable(row, () => plotting.row(find())));
 const bar = new Bar(byId("bar"));
@@ -188,6 +188,7 @@ function restructured() {
   sheetsChanged();
   probes.find(skin, wanted.pins ?? probes.keys);
   plotting.ask(true);
+  if (skin.drivers.size) plotting.strips.restore(wanted.plots.splice(0));
   wanted.pins = null;
   tree.update(skin, states);
   if (wanted.selected) tree.select(wanted.selected);
@@ -446,6 +447,7 @@ function keep() {
       camera: { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() },
       selected: tree.selected,
       pins: probes.keys,
+      plots: plotting.strips.kept,
       times: recordings.length ? moments.times_s : null,
       shifts: Object.fromEntries([...skin.drivers.values()].filter(({ shift }) => shift.some(Boolean)).map(({ key, shift }) => [key, shift])),
       theme: view.isThemeChosen ? view.theme : null,

@@ -7,10 +7,11 @@ import { Strips } from "./strips.js";
 export class Plotting {
   #dragged = null;
   #isMarking = false;
+  #functions = new Set(); // names of those that are plotted, or were
 
   /**
    * @param {HTMLElement} host
-   * @param {object} parts `send(op)`, `skin`, `probes`, `stage`, `rewind`, `notify(text)`.
+   * @param {object} parts `send(op)`, `skin`, `probes`, `stage`, `rewind`, `notify(text)`, `keep()`.
    */
   constructor(host, parts) {
     Object.assign(this, parts);
@@ -23,7 +24,10 @@ export class Plotting {
       marks: () => this.marks,
       moment_s: () => (this.rewind.isPaused ? this.rewind.at_s : null),
       footer: (lines, time_ns) => this.footer(lines.map(driverOf), time_ns),
-      changed: () => this.ask(),
+      changed: () => {
+        this.ask();
+        this.keep();
+      },
       refuse: this.notify,
       find: () => this.#dragged,
     });
@@ -41,7 +45,13 @@ export class Plotting {
     this.lines.take(taken);
   }
 
-  takeState({ marks = [], recording = null }) {
+  takeState({ marks = [], recording = null, functions = [] }) {
+    for (const { name, driver: id, unit } of functions) {
+      const driver = this.skin.drivers.get(id)?.key;
+      if (!driver || this.#functions.has(name)) continue;
+      this.#functions.add(name);
+      this.strips.add({ key: `function ${name}`, driver, function: name, label: name, unit });
+    }
     this.marks = marks.map(({ time_ns, text }) => ({ time_ns: Number(time_ns), text }));
     const last = marks.at(-1);
     if (!this.#isMarking || !last) return;

@@ -91,6 +91,7 @@ function asked(skin, line) {
   }
   const driver = [...skin.drivers.values()].find(({ key }) => key === line.driver);
   if (!driver) return null;
+  if (line.function !== undefined) return { driver: driver.id, function: line.function };
   if (line.contact !== undefined) return { driver: driver.id, contact: line.contact };
   const modules = driver.modules.map((_, m) => m).filter((m) => line.modules.includes(nameOf(driver, m)));
   return { driver: driver.id, type: line.type, modules };

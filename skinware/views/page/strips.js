@@ -260,6 +260,18 @@ export class Strips {
     this.#changed();
   }
 
+  /** What an address keeps, strip by strip; contacts come and go. */
+  get kept() {
+    const plain = ({ key, label, unit, taxel, driver, type, modules }) => ({ key, label, unit, taxel, driver, type, modules });
+    const strips = this.#strips.map(({ lines }) => lines.filter(({ contact }) => contact === undefined).map(plain));
+    return strips.filter((lines) => lines.length);
+  }
+
+  /** Show the lines of an address. */
+  restore(kept) {
+    for (const lines of kept) lines.forEach((line, i) => this.add(line, i ? this.#strips.at(-1) : null));
+  }
+
   remove(line) {
     for (const strip of this.#strips) strip.lines = strip.lines.filter(({ key }) => key !== line.key);
     this.#strips = this.#strips.filter(({ lines }) => lines.length);

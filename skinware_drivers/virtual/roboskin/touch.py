@@ -133,7 +133,7 @@ class PressedSkin:
                 path_m=tuple((x, y, z) for x, y, z in path.tolist()),
                 force=_FINGER_N,
                 radius_m=_FINGER_RADIUS_M,
-                begin_s=time_ns / NS_PER_S + _CALM_S + float(random.uniform(0, 1.4)),
+                begin_s=time_ns / NS_PER_S + max(_CALM_S, self._options.calm_s) + float(random.uniform(0, 1.4)),
                 end_s=_NEVER_S,
                 rise_s=_RAMP_S,
                 speed_m_s=_STROKE_M_S,

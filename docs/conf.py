@@ -23,6 +23,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_click",
     "code_tables",
+    "command_pages",
     "driver_options",
     "json_fields",
 ]

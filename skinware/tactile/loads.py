@@ -28,7 +28,8 @@ class Loads:
     def __init__(self, chain: Chain, names: tuple[str, ...]) -> None:
         self.type_name, self.n_sensors = names[-1], chain.structure.n_sensors
         self._stages = [chain.baseline_stages[name] for name in names]
-        self._index = np.array([chain.structure.index(name) for name in names])
+        every = np.arange(self.n_sensors)
+        self._index = np.array([every[chain.structure.index(name)] for name in names])
         self._before = self._stages[-1].before
         self._onsets = Onsets(len(self._before), self._before.resolution)
 

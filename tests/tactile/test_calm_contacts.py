@@ -15,7 +15,7 @@ import pytest
 
 from skinware import DriverReader, Namespace, Status, Structure
 from skinware.geometry import Geometry
-from skinware.sensor_types import SHEAR_X, TEMPERATURE
+from skinware.sensor_types import PRESSURE, SHEAR_X, TEMPERATURE
 from skinware.tactile.calm_service import CalmService
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
 from skinware_drivers.testing.waiting import wait_until
@@ -67,6 +67,29 @@ def calming(into: Namespace, name: str = "fake", **how: Any) -> Iterator[CalmSer
 def tare(into: Namespace, name: str = "fake") -> None:
     with DriverReader(name, namespace=into, timeout_s=10) as reader:
         reader.call("tare")
+
+
+def test_a_driver_with_pressures_alone_has_contacts(into: Namespace) -> None:
+    structure = Structure(
+        types=[PRESSURE.measured(unit="counts")],
+        buses=["can0"],
+        patch_name=["palm"],
+        patch_bus=[0],
+        module_patch=[0],
+        module_kind=["4x4"],
+        sensor_uid=np.arange(16),
+        sensor_type=[PRESSURE.id] * 16,
+        sensor_module=np.zeros(16, int),
+        dtype="u1",
+    )
+    skin = FakeSkin("fake", structure)
+    skin.values = np.full(16, 20)
+    with publishing(skin), calming(into), ContactsReader(namespace=into, timeout_s=10) as contacts:
+        tare(into)
+        skin.values = np.full(16, 20) + 50 * (np.arange(16) == 3)
+        frame = read_until(contacts, lambda frame: len(frame.contacts) == 1 and not frame.contacts.provisional.any())
+        assert [contact.taxels.tolist() for contact in frame] == [[3]]
+        assert frame.contacts.load.tolist() == [50]
 
 
 def test_contacts_stand_beside_the_calmed_driver(into: Namespace) -> None:

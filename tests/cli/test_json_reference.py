@@ -327,16 +327,8 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
 @pytest.mark.thorough
 def test_bridge(namespace: Namespace) -> None:
     here, port = f"{namespace.name}-here", free_port()
-    serving = (
-        "skin-bridge",
-        "serve",
-        "--robot",
-        "r",
-        "--listen",
-        f"tcp/127.0.0.1:{port}",
-        "--connect",
-        "tcp/127.0.0.1:9",
-    )
+    own, other = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:9"
+    serving = ("skin-bridge", "serve", "--robot", "r", "--listen", own, "--connect", other)
     joining = ("skin-bridge", "join", "r", "--connect", f"tcp/127.0.0.1:{port}", "--into", here)
     try:
         with publishing(FakeSkin("torso")), running(*joining) as join:
@@ -386,6 +378,12 @@ def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
         told = [bridge.wait_for("ready"), bridge.wait_for("status", lambda status: "torso" in status["drivers"])]
     with running("skin-bridge", "ros2", "--rmw", "zenoh", "--connect", f"tcp/127.0.0.1:{free_port()}") as bridge:
         check("`skin-bridge ros2`", *told, bridge.wait_for("router"))
+
+
+@pytest.mark.thorough
+def test_other_viewers(tmp_path: Path) -> None:
+    with running("skin-bridge", "rerun", "-o", f"{tmp_path}/skin.rrd") as bridge:
+        check("`skin-bridge rerun`, `skin-bridge foxglove`", bridge.wait_for("ready"))
 
 
 @pytest.mark.thorough

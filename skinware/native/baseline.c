@@ -218,7 +218,7 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
 
 /* Takes the present values as the rest, of all taxels or (0 or more) of a patch; returns their number, or why not. */
 int64_t skinware_baseline_tare(struct baseline *b, int64_t patch) {
-    const float least = (float)least_on(b);
+    const int is_stepless = least_on(b) <= 0;
     int64_t i, number = 0, n_seen = 0;
     for (i = 0; i < b->n; i++) {
         float level = b->level[i] + b->smooth[i], noise2 = 0;
@@ -226,8 +226,8 @@ int64_t skinware_baseline_tare(struct baseline *b, int64_t patch) {
         n_seen += is_asked;
         if (is_asked && !b->ready[i]) {
             if (!measure_now(b, i, &level, &noise2))
-                level = b->last[i], noise2 = least * least; /* a noise that is not known may be as large as a touch */
-            if (noise2 <= 0 && least <= 0)
+                level = b->last[i];
+            if (noise2 <= 0 && is_stepless)
                 continue;
             b->noise2[i] = highest(noise2, least_noise2(b, level));
             b->noise_s[i] = 0;

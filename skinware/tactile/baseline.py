@@ -217,7 +217,7 @@ class Baseline:
         """Take the present values as the rest, touched or not.
 
         A taxel that has no baseline yet begins with the mean and the noise of its last half second. With fewer than
-        four values its noise may be as large as the least touch; without a least touch it goes on being measured.
+        four values it begins with the noise of rounding; values without steps go on being measured.
 
         Args:
             patch: only of this one.

@@ -176,7 +176,7 @@ class SpecifiedBaseline:
             seen &= self._offsets.patches.group == patch
         known, level, noise2 = self._rest.now()
         level = np.where(known, level, self._intake.last)
-        noise2 = np.where(known, noise2, np.float32(self._minimum_on) ** 2)
+        noise2 = np.where(known, noise2, np.float32(0))
         taxels = seen & (self._ready | (noise2 > 0) | (self._minimum_on > 0))
         if not seen.any():
             raise ConfigurationError("nothing to tare: no value has come yet")

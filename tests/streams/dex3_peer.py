@@ -104,6 +104,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--missing", type=int, default=-1)
     parser.add_argument("--losing", type=int, default=-1)
+    parser.add_argument("--readers", type=int, default=1)  # of each topic, before a counted sample is published
     parser.add_argument("--motors", type=int, default=7)
     parser.add_argument("--json", action="store_true")  # as all programs of the tests
     given = parser.parse_args()
@@ -113,7 +114,9 @@ def main() -> None:
     topics = [Topic(participant, f"rt/dex3/{SIDES[hand]}/state", edition.hand) for hand in hands]
     writers = [DataWriter(participant, topic) for topic in topics]
     print('{"event": "ready"}', flush=True)
-    while given.count < 1_000_000 and not all(w.get_publication_matched_status().current_count for w in writers):
+    while given.count < 1_000_000 and not all(
+        w.get_publication_matched_status().current_count >= given.readers for w in writers
+    ):
         time.sleep(0.01)  # every sample is to be read
     begun = time.monotonic()
     for number in range(given.first, given.first + given.count):

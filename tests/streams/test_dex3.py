@@ -100,13 +100,17 @@ def test_both_hands_value_by_value(domain: int) -> None:
 def test_nothing_is_lost_at_500_hz_beside_a_second_reader(domain: int) -> None:
     count = 1000
     ours = DomainParticipant(domain)
-    second = DataReader(ours, Topic(ours, "rt/dex3/left/state", Edition().hand))
+    hand = Edition().hand
+    seconds = [DataReader(ours, Topic(ours, f"rt/dex3/{side}/state", hand)) for side in ("left", "right")]
     seen = 0
-    with driven(domain, hands="both") as skin, robot(domain, "--hz", "500", "--count", str(count)) as there:
+    with (
+        driven(domain, hands="both") as skin,
+        robot(domain, "--hz", "500", "--count", str(count), "--readers", "2") as there,
+    ):
         frame = read_until(skin.reader, is_good)
         while number_of(frame, 0) < count - 1 or number_of(frame, 1, N) < count - 1:
             require_exact(frame)
-            seen += len(second.take(1000))
+            seen += sum(len(second.take(1000)) for second in seconds)
             frame = read_until(skin.reader, _later_than(frame))
         there.wait_for("done")
         frame = read_until(skin.reader, lambda f: skin.reader.bus_counters(f)[0]["frames"] == 2 * PADS * count)

@@ -92,5 +92,6 @@ class View:
             self._failed = error
             self._is_ready.set()
         finally:
+            self._loop.run_until_complete(self._loop.shutdown_default_executor())  # recordings may be closing in it
             self._follower.close()
             self._loop.close()

@@ -73,17 +73,23 @@ def test_a_stopped_writer_times_out() -> None:
 
 def test_a_forked_child_keeps_no_connection_open() -> None:
     """Otherwise a child of the writer would hide its death from requesters."""
+    others = _sockets()  # of libraries, from their import on
     with ServiceWriter("x", SMALL, operations=OPERATIONS) as writer, ServiceReader[Sample]("x") as reader:
         writer.request_server()
         pending = reader.ask("add", a=1, b=2)
         (request,) = writer.requests(1.0)
+        assert _sockets() - others
         child = os.fork()
         if child == 0:
-            left = [fd for fd in os.listdir("/proc/self/fd") if "socket" in _target(fd)]
-            os._exit(len(left))
+            os._exit(len(_sockets() - others))
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
         request.reply(3)
         assert pending.result(5.0).result == 3
+
+
+def _sockets() -> set[str]:
+    targets = {_target(fd) for fd in os.listdir("/proc/self/fd")}
+    return {target for target in targets if target.startswith("socket:")}
 
 
 def _target(fd: str) -> str:

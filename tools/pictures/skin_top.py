@@ -13,12 +13,13 @@ import sys
 from pathlib import Path
 
 from textual.pilot import Pilot
-from textual.widgets import DataTable, Static
+from textual.widgets import Static
 
 from skinware import Namespace
 from skinware.cli._heat_map import BACKGROUND, LEVELS
 from skinware.cli._painting import TRUE_COLOURS
 from skinware.cli._top_app import SkinTop
+from skinware.cli._top_list import DriverList
 
 SIZE = (80, 24)
 PATIENCE_S = 120.0
@@ -30,7 +31,7 @@ async def picture(namespace: str) -> str:
     app = SkinTop(Namespace(namespace), palette=TRUE_COLOURS)
     async with app.run_test(size=SIZE) as pilot:
         async with asyncio.timeout(PATIENCE_S):
-            while not app.query_one("#list", DataTable).row_count or not app._overview.drivers.look()[0].frame:
+            while not app.query_one(DriverList).rows or not app._overview.drivers.look()[0].frame:
                 await pilot.pause(0.1)
             if app._overview.contacts.readers:
                 await _followed(app, pilot)

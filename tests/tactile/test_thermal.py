@@ -88,7 +88,13 @@ def grip(seed: int, share: float, *, thermal: bool = True, heats: float = 0.0, l
 
 @pytest.mark.parametrize(
     ("share", "heats", "lost"),
-    [(1.0, 0.0, 0.0), (0.9, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 10.0, 0.0), (1.0, 0.0, 0.3)],
+    [
+        (1.0, 0.0, 0.3),
+        *(
+            pytest.param(*how, 0.0, marks=pytest.mark.thorough)
+            for how in [(1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (1.0, 10.0)]
+        ),
+    ],
 )
 def test_a_long_grip_is_kept_while_the_skin_warms_and_cools(share: float, heats: float, lost: float) -> None:
     found = grip(1, share, heats=heats, lost=lost)

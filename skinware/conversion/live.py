@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from skinware.conversion.showing import Showing
-from skinware.errors import MissingExtra
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.views.following import Follower, Origin, ShownDriver
@@ -69,16 +68,11 @@ class RerunSink:
 
     Args:
         recording: a ``rerun.RecordingStream``.
-
-    Raises:
-        MissingExtra: rerun-sdk is not installed.
     """
 
     def __init__(self, recording: rerun.RecordingStream) -> None:
-        try:
-            import rerun
-        except ImportError:
-            raise MissingExtra("this needs a package that is not installed: pip install 'skinware[rerun]'") from None
+        import rerun
+
         self._rerun, self._recording, self._look = rerun, recording, Look()
         self._scene: Scene | None = None
 
@@ -116,16 +110,11 @@ class FoxgloveSink:
 
     Args:
         context: of a server or file of ``foxglove``.
-
-    Raises:
-        MissingExtra: foxglove-sdk is not installed.
     """
 
     def __init__(self, context: foxglove.Context) -> None:
-        try:
-            import foxglove
-        except ImportError:
-            raise MissingExtra("this needs a package that is not installed: pip install 'skinware[foxglove]'") from None
+        import foxglove
+
         self._foxglove, self._context = foxglove, context
         self._showing: dict[str, Showing] = {}
         self._channels: dict[str, foxglove.Channel] = {}

@@ -28,8 +28,7 @@ class Loads:
     def __init__(self, chain: Chain, names: tuple[str, ...]) -> None:
         self.type_name, self.n_sensors = names[-1], chain.structure.n_sensors
         self._stages = [chain.baseline_stages[name] for name in names]
-        every = np.arange(self.n_sensors)
-        self._index = np.array([every[chain.structure.index(name)] for name in names])
+        self._indexes = [chain.structure.index(name) for name in names]
         self._before = self._stages[-1].before
         self._onsets = Onsets(len(self._before), self._before.resolution)
 
@@ -44,14 +43,14 @@ class Loads:
 
     def usable(self, status: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
         """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
-        usable: npt.NDArray[np.bool_] = ((status[self._index] & UNUSABLE) == 0).all(axis=0)
+        usable: npt.NDArray[np.bool_] = (status[self._indexes[0]] & UNUSABLE) == 0
+        for index in self._indexes[1:]:
+            usable &= (status[index] & UNUSABLE) == 0
         return usable
 
     def values(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Return (n,) loads of (n_sensors,) values."""
-        found = values[self._index]
-        loads: npt.NDArray[np.float32] = found[0] if len(found) == 1 else np.sqrt((found**2).sum(axis=0))
-        return loads
+        return _length([values[index] for index in self._indexes])
 
     @property
     def touched(self) -> npt.NDArray[np.bool_]:
@@ -64,11 +63,8 @@ class Loads:
         calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
         if not calms:
             return {}
-        doubts = np.array([np.hypot(calm.noise, calm.uncertainty) for _, calm in calms])
-        deviations = np.array([given - calm.baseline for given, calm in calms])
-        deviation, doubt = deviations[0], doubts[0]
-        if len(calms) > 1:
-            deviation, doubt = np.sqrt((deviations**2).sum(axis=0)), np.sqrt((doubts**2).mean(axis=0))
+        deviation = _length([given - calm.baseline for given, calm in calms])
+        doubt = _length([np.hypot(calm.noise, calm.uncertainty) for _, calm in calms]) / np.sqrt(np.float32(len(calms)))
         known = np.logical_and.reduce([usable, *(calm.usable for _, calm in calms)])
         clipped = np.logical_or.reduce([given >= self._before.type.maximum for given, _ in calms])
         return {
@@ -76,3 +72,9 @@ class Loads:
             "clipped": clipped,
             "uncertainty": doubt if unit == self._before.type.unit else None,
         }
+
+
+def _length(axes: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+    """Return (n,) lengths of vectors, by their axes (n,) each; one axis is its own length, with its sign."""
+    length: npt.NDArray[np.float32] = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
+    return length

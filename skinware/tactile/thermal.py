@@ -150,7 +150,8 @@ class ThermalStage(Stage):
 
     def state(self) -> dict[str, npt.NDArray[np.float64]]:
         warmth = self._warmth[self.taxels.module]
-        return {"drift": self._drift.copy(), "warmth": warmth, "own": self.gains.own, "variance": self.gains.variance}
+        own, variance = self.gains.own.copy(), self.gains.variance.copy()
+        return {"drift": self._drift.copy(), "warmth": warmth, "own": own, "variance": variance}
 
     def restore(self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]) -> None:
         here, m = np.flatnonzero(rows >= 0), int(rows.max(initial=-1)) + 1

@@ -1,4 +1,4 @@
-"""What pages need before their snippets run: drivers that publish, and a recording. Only tests use it."""
+"""Prepare the snippets of pages: start the drivers and make the recording that they read. Only tests use it."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def recording(namespace: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture
 def address(recording: Path) -> Iterator[str]:
-    """Of the page of the recording; it outlives all pages."""
+    """Serve the page of the recording; the server outlives all pages."""
     with viewing(str(recording)) as (_, url):
         yield url
 

@@ -99,7 +99,7 @@ def emulated(name: str, shown: Shown) -> Iterator[None]:
 
 
 def picture(browser: Browser, shown: Shown) -> Image.Image:
-    """What the stage shows once everything is there."""
+    """Return the picture on the stage once everything is there."""
     with viewing() as (_, url):
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.goto(f"{url}#sharp=1&theme=light&{shown.address}")

@@ -22,12 +22,12 @@ from tests.browser.chromium import chromium
 PATIENCE_MS = 120_000
 SIZE = (1200, 700)
 EYE = "eye=0.02,-0.27,0.18,0.112,0.01,-0.004"
-"""Of an emulated arm, from above."""
+"""The eye sees an emulated arm from above."""
 BOTH = "eye=0.2,-0.06,0.66,0.2,0.02,0"
-"""Of the arm and the hand beside it."""
+"""The eye sees the arm and the hand beside it."""
 MOVING = (1100, 640)
 FRAMES, FRAME_MS = 40, 200
-"""Of the moving picture; ``]`` goes so far on in a recording."""
+"""The moving picture has so many frames; ``]`` goes so far on in a recording."""
 MOST_BYTES = 1_500_000
 
 
@@ -76,13 +76,13 @@ PICTURES = {
 
 
 def screen(page: Page) -> Image.Image:
-    """What a window shows."""
+    """Return the picture in a window."""
     with Image.open(io.BytesIO(page.screenshot())) as image:
         return image.convert("RGB")
 
 
 def picture(browser: Browser, shown: Shown, namespace: str) -> Image.Image:
-    """What a window shows once everything is there."""
+    """Return the picture in a window once everything is there."""
     with viewing(*shown.drivers, "--namespace", namespace) as (_, url):
         page = browser.new_page(viewport={"width": shown.size[0], "height": shown.size[1]})
         page.goto(f"{url}#sharp=1&{shown.address}")

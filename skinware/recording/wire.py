@@ -11,6 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from typing import BinaryIO
 
@@ -64,13 +65,7 @@ class Exported:
 
 
 def export_candump(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
-    """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
-
-    Raises:
-        BadRecording: no frame of a CAN bus was recorded.
-        ConfigurationError: no wire of a chosen driver was recorded.
-        OSError: the file exists already, or cannot be written.
-    """
+    """Write the frames of all CAN buses as ``candump -L`` does; each line ends with R (received) or T (sent)."""
 
     def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
         for number, item in _in_order(wires, part, exported):
@@ -88,11 +83,6 @@ def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None
     """Write all wires for Wireshark, with times in ns and directions.
 
     An interface of a CAN bus has the link type :data:`SOCKETCAN`, one of a serial line :data:`SERIAL`.
-
-    Raises:
-        BadRecording: no wire was recorded.
-        ConfigurationError: no wire of a chosen driver was recorded.
-        OSError: the file exists already, or cannot be written.
     """
 
     def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
@@ -159,7 +149,10 @@ def _named(recording: Recording) -> _Wires:
 def _in_order(wires: _Wires, chosen: Chosen, exported: Exported) -> Iterator[tuple[int, WireItem]]:
     """Yield (number of its wire, item) of all wires by time; note how many frames were cut."""
     cut = 0
-    streams = [_numbered(number, wire, chosen) for number, (wire, _) in enumerate(wires)]
+    streams = [
+        zip(repeat(number), wire.items(start_s=chosen.start_s, end_s=chosen.end_s))
+        for number, (wire, _) in enumerate(wires)
+    ]
     for count, (number, item) in enumerate(heapq.merge(*streams, key=lambda one: one[1].epoch_ns)):
         if not count % _ASKED_EACH and chosen.is_stopped():
             raise KeyboardInterrupt
@@ -167,11 +160,6 @@ def _in_order(wires: _Wires, chosen: Chosen, exported: Exported) -> Iterator[tup
         yield number, item
     if cut:
         exported.notes.append(f"{cut} CAN FD frames without their end: their driver knows none that are so long")
-
-
-def _numbered(number: int, wire: WireTrack, chosen: Chosen) -> Iterator[tuple[int, WireItem]]:
-    for item in wire.items(start_s=chosen.start_s, end_s=chosen.end_s):
-        yield number, item
 
 
 def _block(kind: int, body: bytes) -> bytes:

@@ -28,12 +28,6 @@ _LONGEST_NAME = 200
 
 
 class PortAddress(NamedTuple):
-    """Address of a port.
-
-    Attributes:
-        port: of TCP, 1 to 65535.
-    """
-
     name: str
     host: str
     port: int
@@ -74,12 +68,7 @@ class NameServer:
         return f"YARP's name server at {self.host}:{self.port}"
 
     def query(self, name: str) -> PortAddress | None:
-        """Return the address of a port; None: there is none of that name.
-
-        Raises:
-            OSError: no name server answers; also in all other methods.
-            ValueError: no port can have this name; also in all other methods.
-        """
+        """Return the address of a port; None: it is not known. OSError: no name server answers, as in all methods."""
         return self._ask(name, f"query {name}")
 
     def register(self, name: str, host: str, port: int) -> PortAddress:

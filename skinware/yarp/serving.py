@@ -265,7 +265,6 @@ class YarpServer:
         return self._ports[name]
 
     def _report(self, about: str, why: str) -> None:
-        """Report trouble when it changes."""
         if self._troubles.get(about, "") != why:
             self._troubles[about] = why
             if why:

@@ -180,8 +180,7 @@ async def _serve(
     port: int | None,
     ready: Callable[[int], None],
 ) -> None:
-    from skinware.views.advice import DoctorProgram
-    from skinware.views.recording import RecordingProgram
+    from skinware.views.programs import DoctorProgram, RecordingProgram
     from skinware.views.server import ViewServer, show
 
     stop = asyncio.Event()

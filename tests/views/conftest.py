@@ -15,7 +15,7 @@ import pytest
 from skinware import Namespace
 from skinware.views.access import Access
 from skinware.views.following import Follower, Origin
-from skinware.views.recording import RecordingProgram
+from skinware.views.programs import RecordingProgram
 from skinware.views.robot import Robot
 from skinware.views.server import ViewServer, show
 from skinware.views.shows import RecordingFiles

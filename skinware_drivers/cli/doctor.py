@@ -12,6 +12,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, style
+from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 from skinware.text import age_text, plural, wrapped
 from skinware_drivers.doctor.finding import Finding, Severity
 
@@ -27,11 +28,7 @@ _SIGNS = {Severity.ERROR: ("✗", "red"), Severity.WARNING: ("!", "yellow"), Sev
 
 
 def as_text(evidence: Evidence, found: Examination, report: str | None = None) -> list[str]:
-    """Return the lines to print, with colours, which ``echo`` takes out without a terminal.
-
-    Args:
-        report: name of the file with the report, if one was written.
-    """
+    """Return the lines to print, with colours, which ``echo`` takes out without a terminal."""
     lines = [*_verdict(evidence, found), ""]
     for finding in found.findings:
         lines += [*_finding(finding), ""]
@@ -119,7 +116,12 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
     progress(-1.0)
     found = examine(evidence)
     if report is not None:
-        _write(report, evidence, found)
+        from skinware_drivers.doctor.report import as_markdown
+
+        try:
+            report.write_text(as_markdown(evidence, found), encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"{report}: {error.strerror or error}") from None
     if as_json:
         print_json(as_data(evidence, found))
     else:
@@ -147,29 +149,7 @@ def as_data(evidence: Evidence, found: Examination) -> dict[str, Any]:
     }
 
 
-def _write(report: Path, evidence: Evidence, found: Examination) -> None:
-    """Write the report.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
-    from skinware.errors import ConfigurationError
-    from skinware_drivers.doctor.report import as_markdown
-
-    try:
-        report.write_text(as_markdown(evidence, found), encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"{report}: {error.strerror or error}") from None
-
-
 def _recorded(file: Path, progress: Callable[[float], None]) -> Evidence:
-    """Return the evidence of a recording.
-
-    Raises:
-        ConfigurationError: the file is not a recording, or cannot be read here.
-    """
-    from skinware.errors import BadRecording, ConfigurationError, MissingExtra
-
     try:
         from skinware_drivers.doctor.recorded import look_at
 

@@ -147,6 +147,7 @@ class Origin:
         namespaces = [namespace, *([] if calm is None else [calm])]
         self._contacts = [LiveSources[ContactsSample](each, ContactsReader) for each in namespaces]
         self._motion = [LiveSources[MotionSample](each, MotionReader) for each in namespaces]
+        self._services: list[LiveSources[Any]] = [*self._contacts, *self._motion]
 
     @property
     def title(self) -> str:
@@ -158,7 +159,7 @@ class Origin:
         drivers = self.live.look()
         if self._calm is not None:
             self._calm.look()
-        for services in (*self._contacts, *self._motion):
+        for services in self._services:
             services.look()
         return drivers
 
@@ -184,9 +185,11 @@ class Origin:
         return next((reader for reader in found if reader.source.driver == driver), None)
 
     def close(self) -> None:
-        for followed in (*self._contacts, *self._motion, self.live, self._calm):
-            if followed is not None:
-                followed.close()
+        for services in self._services:
+            services.close()
+        if self._calm is not None:
+            self._calm.close()
+        self.live.close()
 
 
 @dataclass

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -80,11 +80,19 @@ class ViewServer:
         self._viewers: set[Viewer] = set()
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._news = asyncio.Event()
-        self._server: Server | None = None
         self._frames, self._tls = _NOTEBOOKS if is_framed else "'none'", tls
 
-    async def start(self, host: str, port: int) -> int:
-        self._server = await serve(
+    async def show(self, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
+        """Serve until ``stop`` is set; at the end, disconnect all viewers, and end the recording that they began.
+
+        Args:
+            port: to listen at; 0: any.
+            ready: called with the port when browsers can connect.
+
+        Raises:
+            OSError: the address or port cannot be used.
+        """
+        server = await serve(
             self._attend,
             host,
             port,
@@ -95,9 +103,24 @@ class ViewServer:
             close_timeout=_CLOSE_TIMEOUT_S,
             ssl=self._tls,
         )
-        return int(next(iter(self._server.sockets)).getsockname()[1])
+        following, stopping = asyncio.create_task(self._follow()), asyncio.create_task(stop.wait())
+        try:
+            ready(int(next(iter(server.sockets)).getsockname()[1]))
+            await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (following, stopping):
+                task.cancel()
+            server.close()
+            with contextlib.suppress(TimeoutError):  # of connections that stay silent
+                await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
+            await self._doctor.close()
+            if self._recording is not None:
+                await self._recording.close()
+        if following.done() and not following.cancelled():
+            following.result()
 
-    async def run(self) -> None:
+    async def _follow(self) -> None:
+        """Follow the drivers while there are viewers, without end."""
         while True:
             if self._viewers:
                 for show in {viewer.show for viewer in self._viewers}:
@@ -113,15 +136,6 @@ class ViewServer:
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 self._wake()
             await asyncio.sleep(_TICK_S)
-
-    async def close(self) -> None:
-        if self._server is not None:
-            self._server.close()
-            with contextlib.suppress(TimeoutError):  # of connections that stay silent
-                await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
-        await self._doctor.close()
-        if self._recording is not None:
-            await self._recording.close()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         try:
@@ -248,21 +262,6 @@ class ViewServer:
             if self._recording.problem is not None:
                 besides["problems"].append(problem_of_all(f"recording: {self._recording.problem}"))
         return besides
-
-
-async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
-    """Serve until ``stop`` is set; call ``ready`` with the port when browsers can connect."""
-    found = await server.start(host, port)
-    following, stopping = asyncio.create_task(server.run()), asyncio.create_task(stop.wait())
-    try:
-        ready(found)
-        await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in (following, stopping):
-            task.cancel()
-        await server.close()
-    if following.done() and not following.cancelled():
-        following.result()
 
 
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:

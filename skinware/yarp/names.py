@@ -102,14 +102,11 @@ class NameServer:
                     answer += more
         except OSError as error:
             raise OSError(f"{self}: {error.strerror or error}") from None
-        found = [contact for line in answer.splitlines() if (contact := _contact(line)) and contact.name == name]
-        return found[0] if found else None
-
-
-def _contact(line: bytes) -> PortAddress | None:
-    """Return the port that a line of an answer is about; None: it is about no port."""
-    match = _REGISTRATION.fullmatch(line.strip())
-    if match is None or not 0 < int(match["port"]) < 1 << 16:
+        for line in answer.splitlines():
+            match = _REGISTRATION.fullmatch(line.strip())
+            if match is None or not 0 < int(match["port"]) < 1 << 16:
+                continue
+            about, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
+            if about == name:
+                return PortAddress(name, host, int(match["port"]), carrier)
         return None
-    name, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
-    return PortAddress(name, host, int(match["port"]), carrier)

@@ -139,11 +139,11 @@ class DriverTiming:
     """
 
     rate_hz: float | None
-    period_ns: int
-    missed: int
-    missed_before: int
     late: Histogram
     age: Histogram
+    missed: int = 0
+    missed_before: int = 0
+    period_ns: int = 0
     future_ns: int = 0
     backwards: int = 0
     before_boot: int = 0
@@ -261,18 +261,6 @@ class MachineSeen:
 
 
 @dataclass(frozen=True)
-class ClockSet:
-    """A jump of the wall clock in a recording, because it was set or the machine slept.
-
-    Attributes:
-        by_s: size of the jump, forward or back.
-    """
-
-    time_s: float
-    by_s: float
-
-
-@dataclass(frozen=True)
 class RecordingSeen:
     """A recording.
 
@@ -282,7 +270,7 @@ class RecordingSeen:
         services: names of the services in it that are not drivers.
         missed: number of snapshots that were published meanwhile and are missing.
         events: number of events of each kind: ``restarted``, ``dead`` ...
-        clock_sets: jumps of the wall clock.
+        clock_sets: jumps of the wall clock, because it was set or the machine slept: when, s, and by how much, s.
         boots: number of starts of the machine that it spans.
         recorded_by: program and version; empty: unknown.
     """
@@ -295,7 +283,7 @@ class RecordingSeen:
     services: tuple[str, ...]
     missed: int
     events: Counts
-    clock_sets: tuple[ClockSet, ...]
+    clock_sets: tuple[tuple[float, float], ...]
     boots: int
     recorded_by: str
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from skinware.memory.namespace import Namespace
 from skinware.text import printable
-from skinware_drivers.doctor import buses, files, machine, patches, programs, taxels
+from skinware_drivers.doctor import buses, machine, patches, programs, taxels
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked
 
@@ -21,7 +21,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterator[Note]]] = {
     "patches": patches.check,
     "timing": programs.check_timing,
     "taxels": taxels.check,
-    "files": files.check,
+    "files": programs.check_files,
     "machine": machine.check_machine,
 }
 """The check of each area, in the order in which data travels."""

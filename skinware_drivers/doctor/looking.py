@@ -42,26 +42,6 @@ _DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay", "skin-bridge
 _PROC = Path("/proc")
 
 
-class ReadersWatch:
-    """Compare the readers of a namespace's drivers at the beginning and at the end of the look."""
-
-    def __init__(self, namespace: Namespace) -> None:
-        self._namespace = namespace
-        self._before = self._look()
-
-    def seen(self) -> tuple[ReaderSeen, ...]:
-        found = []
-        for key, record in self._look().items():
-            before = self._before.get(key)
-            if before is not None and record.kind == _EVERY_FRAME:
-                frames, missed = record.frames - before.frames, record.missed - before.missed
-                found.append(ReaderSeen(record.program, record.pid, record.service, max(0, frames), max(0, missed)))
-        return tuple(found)
-
-    def _look(self) -> dict[tuple[int, str], ReaderRecord]:
-        return {(one.pid, one.service): one for one in living_readers(self._namespace)}
-
-
 def waiting_drivers(known: set[int], proc: Path = _PROC) -> tuple[int, ...]:
     """Return the processes of ``skin-driver`` but the ``known`` ones, which publish."""
     found = {int(path.name) for path in proc.glob("[0-9]*") if program_of(int(path.name), proc) == _DRIVER}
@@ -109,8 +89,23 @@ class MachineWatch:
         self._clock_s = time.time() - time.monotonic()
 
     def seen(self) -> MachineSeen:
-        softnet, memory = softnet_dropped(), _memory()
-        total, free, problem = _shared_memory()
+        softnet = softnet_dropped()
+        memory: dict[str, int] = {}
+        for line in text_of(_MEMORY).splitlines():
+            name, _, rest = line.partition(":")
+            with contextlib.suppress(ValueError, IndexError):
+                memory[name] = 1024 * int(rest.split()[0])
+        total = free = 0
+        try:
+            room = os.statvfs(ROOT)
+            total, free = room.f_frsize * room.f_blocks, room.f_frsize * room.f_bavail
+            problem = "" if os.access(ROOT, os.W_OK | os.X_OK) else f"{ROOT} may not be written by this account"
+        except OSError as error:
+            problem = f"{ROOT}: {error.strerror}"
+        groups = set()
+        for number in {os.getegid(), *os.getgroups()}:
+            with contextlib.suppress(KeyError):
+                groups.add(grp.getgrgid(number).gr_name)
         return MachineSeen(
             versions=versions(),
             kernel=f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -124,7 +119,7 @@ class MachineWatch:
             shared_problem=problem,
             locked_memory_bytes=resource.getrlimit(resource.RLIMIT_MEMLOCK)[0],
             realtime_priority=99 if os.geteuid() == 0 else resource.getrlimit(resource.RLIMIT_RTPRIO)[0],
-            groups=_groups(),
+            groups=tuple(sorted(groups)),
             limits={name: int(text) for name, path in _LIMITS.items() if (text := text_of(path)).lstrip("-").isdigit()},
             softnet_dropped=None if softnet is None or self._softnet is None else softnet - self._softnet,
             clock_set_s=time.time() - time.monotonic() - self._clock_s,
@@ -137,19 +132,6 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
-
-
-def interfaces_seen(before: list[CanInterface], now: list[CanInterface]) -> tuple[InterfaceSeen, ...]:
-    """Return the CAN interfaces with their counters, and the growth of these since ``before``."""
-    earlier = {one.name: _counts(one) for one in before}
-    found = []
-    for one in now:
-        total = _counts(one)
-        was = earlier.get(one.name, total)
-        found.append(
-            InterfaceSeen(one, Counted(total, {name: max(0, total[name] - was.get(name, 0)) for name in total}))
-        )
-    return tuple(found)
 
 
 def namespaces_seen(ours: Namespace) -> tuple[NamespaceSeen, ...]:
@@ -183,42 +165,10 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
     return NamespaceSeen(namespace.name, path, is_ours, "", damaged, living, dead, size, idle_s)
 
 
-def _counts(one: CanInterface) -> dict[str, int]:
-    return {**one.statistics, **{f"controller_{name}": count for name, count in one.controller_errors.items()}}
-
-
-def _groups() -> tuple[str, ...]:
-    names = []
-    for number in {os.getegid(), *os.getgroups()}:
-        with contextlib.suppress(KeyError):
-            names.append(grp.getgrgid(number).gr_name)
-    return tuple(sorted(names))
-
-
-def _memory() -> dict[str, int]:
-    """Return the figures of /proc/meminfo, in bytes."""
-    found = {}
-    for line in text_of(_MEMORY).splitlines():
-        name, _, rest = line.partition(":")
-        with contextlib.suppress(ValueError, IndexError):
-            found[name] = 1024 * int(rest.split()[0])
-    return found
-
-
-def _shared_memory() -> tuple[int, int, str]:
-    """Return size and free space of /dev/shm in bytes, and the reason why no file can be made in it."""
-    try:
-        room = os.statvfs(ROOT)
-    except OSError as error:
-        return 0, 0, f"{ROOT}: {error.strerror}"
-    problem = "" if os.access(ROOT, os.W_OK | os.X_OK) else f"{ROOT} may not be written by this account"
-    return room.f_frsize * room.f_blocks, room.f_frsize * room.f_bavail, problem
-
-
 def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
     """Examine everything that runs or is plugged in."""
-    machine, readers = MachineWatch(), ReadersWatch(namespace)
-    before = interfaces.can_interfaces()
+    machine, readers_before = MachineWatch(), _readers(namespace)
+    counts_before = {one.name: _counts(one) for one in interfaces.can_interfaces()}
     namespaces = namespaces_seen(namespace)
     drivers: tuple[DriverSeen, ...]
     try:
@@ -226,28 +176,41 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
     except NamespaceError:  # a finding of its own
         drivers = ()
     living = running.running_drivers()
+    readers = []
+    for key, record in _readers(namespace).items():
+        before = readers_before.get(key)
+        if before is not None and record.kind == _EVERY_FRAME:
+            frames, missed = record.frames - before.frames, record.missed - before.missed
+            readers.append(ReaderSeen(record.program, record.pid, record.service, max(0, frames), max(0, missed)))
+    interfaces_seen = []
+    for one in interfaces.can_interfaces():
+        total = _counts(one)
+        was = counts_before.get(one.name, total)
+        grown = {name: max(0, count - was.get(name, 0)) for name, count in total.items()}
+        interfaces_seen.append(InterfaceSeen(one, Counted(total, grown)))
+    bridges: tuple[BridgeState, ...] = ()
+    with contextlib.closing(LiveBridges(namespace)) as live, contextlib.suppress(NamespaceError):
+        live.look()
+        bridges = tuple(live.states())
     return Evidence(
         seconds=seconds,
         namespace=namespace.name,
         drivers=drivers,
         machine=machine.seen(),
         namespaces=namespaces,
-        interfaces=interfaces_seen(before, interfaces.can_interfaces()),
+        interfaces=tuple(interfaces_seen),
         kernel_has_can=interfaces.kernel_has_can(),
         ports=tuple(ports.serial_ports()),
         running=tuple(one for one in living if not publishes_again(one.pid)),
         waiting=waiting_drivers({one.pid for one in living}),
-        readers=readers.seen(),
-        bridges=_bridges(namespace),
+        readers=tuple(readers),
+        bridges=bridges,
     )
 
 
-def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
-    live = LiveBridges(namespace)
-    try:
-        live.look()
-        return tuple(live.states())
-    except NamespaceError:
-        return ()
-    finally:
-        live.close()
+def _readers(namespace: Namespace) -> dict[tuple[int, str], ReaderRecord]:
+    return {(one.pid, one.service): one for one in living_readers(namespace)}
+
+
+def _counts(one: CanInterface) -> dict[str, int]:
+    return {**one.statistics, **{f"controller_{name}": count for name, count in one.controller_errors.items()}}

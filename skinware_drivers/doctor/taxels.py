@@ -7,83 +7,18 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from skinware.tactile.calibration.checking import SHARED, UNKNOWN, check_file
+from skinware.tactile.calibration.checking import check_file
 from skinware.text import count_text, plural, words
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Rule, Severity, has_operation
+from skinware_drivers.doctor.finding import Looked, Note, NotLooked
+from skinware_drivers.doctor.rules import RULES, has_operation
 
-_STATUS, _HEALTH, _CALIBRATION = "explanation/status.md", "tactile/health.md", "tactile/calibration.md"
 _MOST_NAMES = 3
 _MOST_LINES = 6
-
-STATUSES = {
-    "not_connected": Rule(
-        Severity.ERROR,
-        "{sensors} {are} not connected",
-        "plug their module in; if there is none, leave it out of the driver's options",
-        ("skin-top",),
-        _STATUS,
-    ),
-    "no_ack": Rule(
-        Severity.ERROR,
-        "{sensors} {do} not answer the microcontroller",
-        "check the flat cable and plug of their module",
-        ("skin-top",),
-        _STATUS,
-    ),
-    "out_of_range": Rule(
-        Severity.NOTE,
-        "{sensors} {are} beyond the range",
-        "a very hard press, or broken taxels: see whether it stays when nothing touches them",
-        ("skin-top",),
-        _STATUS,
-    ),
-    "suspect": Rule(
-        Severity.WARNING,
-        "{sensors} {are} doubtful since an event, such as a baseline that moved by itself",
-        "take their baseline again while nothing touches them",
-        ("skin-config {rebaselined} rebaseline", "skin-info {shown}"),
-        _STATUS,
-    ),
-    "unhealthy": Rule(
-        Severity.WARNING,
-        "{sensors} {are} called unhealthy by skin-calm",
-        "see why",
-        ("skin-info {driver} --health",),
-        _HEALTH,
-    ),
-}
-"""By status of the sensors."""
-DARK = Rule(
-    Severity.WARNING,
-    "{modules}",
-    "touch each once: those that go on with 0 are dead or switched off; look at their cables and plugs",
-    ("skin-top",),
-    _STATUS,
-)
-LINES = Rule(
-    Severity.ERROR,
-    "no taxel is good in whole rows or columns of a matrix",
-    "a broken wire or a loose plug rather than so many broken taxels: look at the cables of these lines",
-    ("skin-top",),
-    _STATUS,
-)
-FAULTY = Rule(
-    Severity.WARNING,
-    "{taxels} {are} {kind}",
-    "touch them and see what they show; ignore them if they are broken",
-    ("skin-wipe {driver}", "skin-info {driver} --health"),
-    _HEALTH,
-)
-_CORRECT = "correct the geometry, or measure it by touch"
 _STROKES = (
     "skin-calibrate topology -o skin.toml --driver {driver}",
     "skin-calibrate check skin.toml --driver {driver}",
 )
-PLACES = {
-    SHARED: Rule(Severity.WARNING, "{sensors} {are} at places of others", _CORRECT, _STROKES, _CALIBRATION),
-    UNKNOWN: Rule(Severity.NOTE, "{sensors} {have} no place", _CORRECT, _STROKES, _CALIBRATION),
-}
 
 
 def check(evidence: Evidence) -> Iterator[Note]:
@@ -95,11 +30,18 @@ def check(evidence: Evidence) -> Iterator[Note]:
         untouched = f"; {dark}: {_some(list(driver.dark))}" if driver.dark and not any(driver.dark.values()) else ""
         sensors = plural(driver.structure.n_sensors, "sensor")
         yield Looked(where, f"{sensors}: {statuses or 'no data'}{untouched}")
-        yield from _statuses(driver)
+        can_rebaseline = has_operation(driver.driver_type, "rebaseline")
+        names = {"driver": driver.name, "rebaselined" if can_rebaseline else "shown": driver.name}
+        for status, rule in RULES["status"].items():
+            count = driver.statuses.get(status, 0) - (sum(driver.dark.values()) if status == "suspect" else 0)
+            if count > 0:
+                some = driver.affected.get(status, ())
+                seen = f"status {words(status)}: {'; '.join(some)}{' ...' if count > len(some) else ''}"
+                yield rule.found(where, seen, sensors=plural(count, "sensor"), **_verbs(count), **names)
         if any(driver.dark.values()):
-            yield DARK.found(where, _some(list(driver.dark)), modules=dark)
+            yield RULES["taxel"]["dark"].found(where, _some(list(driver.dark)), modules=dark)
         if driver.lines:
-            yield LINES.found(where, _some(driver.lines))
+            yield RULES["taxel"]["lines"].found(where, _some(driver.lines))
         yield from _health(driver)
         yield from _places(driver)
 
@@ -113,17 +55,6 @@ def _some(names: Sequence[str]) -> str:
     return "; ".join(names[:_MOST_LINES]) + (" ..." if len(names) > _MOST_LINES else "")
 
 
-def _statuses(driver: DriverSeen) -> Iterator[Finding]:
-    can_rebaseline = has_operation(driver.driver_type, "rebaseline")
-    names = {"driver": driver.name, "rebaselined" if can_rebaseline else "shown": driver.name}
-    for status, rule in STATUSES.items():
-        count = driver.statuses.get(status, 0) - (sum(driver.dark.values()) if status == "suspect" else 0)
-        if count > 0:
-            sensors = driver.affected.get(status, ())
-            seen = f"status {words(status)}: {'; '.join(sensors)}{' ...' if count > len(sensors) else ''}"
-            yield rule.found(f"driver {driver.name}", seen, sensors=plural(count, "sensor"), **_verbs(count), **names)
-
-
 def _health(driver: DriverSeen) -> Iterator[Note]:
     seen = driver.health
     if seen is None:
@@ -134,7 +65,7 @@ def _health(driver: DriverSeen) -> Iterator[Note]:
     for kind, count in Counter(fault.kind for fault in seen.faults).items():
         some = [fault for fault in seen.faults if fault.kind == kind][:_MOST_NAMES]
         shown = "; ".join(f"{fault.name}: {fault.evidence}" for fault in some)
-        yield FAULTY.found(
+        yield RULES["taxel"]["faulty"].found(
             f"driver {driver.name}",
             f"{shown}{' ...' if count > len(some) else ''} (judged by {seen.source})",
             taxels=plural(count, "taxel"),
@@ -165,7 +96,7 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
             counts[problem.kind] += len(problem.taxels)
             modules.setdefault(problem.kind, set()).update(structure.module_names[row] for row in problem.modules)
     yield Looked(f"places of {driver.name}", f"{int(np.count_nonzero(structure.geometry.known))} known")
-    for kind, rule in PLACES.items():
+    for kind, rule in RULES["place"].items():
         if counts[kind]:
             names = sorted(modules[kind])
             seen = f"modules {', '.join(names[:_MOST_NAMES])}{' ...' if len(names) > _MOST_NAMES else ''}"

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,9 @@ from skinware.memory.statistics import Histogram, Spread, WriterStatistics
 from skinware.realtime import now_ns
 from skinware.state import life_of, rate_now_hz, status_now
 from skinware.status import Status
-from skinware.structure import Structure
-from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind
 from skinware.tactile.health_service import HealthReader
-from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge, taxel_faults
+from skinware_drivers.doctor.driver_log import DriverLog, taxel_faults
 from skinware_drivers.doctor.evidence import DriverSeen, DriverTiming, HealthSeen
 
 _LOOK_EVERY_S = 0.02
@@ -52,8 +52,7 @@ def watch(namespace: Namespace, seconds: float, progress: Callable[[float], obje
 class _DriverWatch:
     def __init__(self, reader: DriverReader) -> None:
         self._reader = reader
-        self._log = DriverLog(reader.structure)
-        self._judge = TaxelJudge(reader.structure, reader.name)
+        self._log = DriverLog(reader.structure, reader.name)
         self._generation = reader.generation
         self._begun = self._newest_statistics = reader.writer_statistics
         self._restarts = 0
@@ -67,8 +66,7 @@ class _DriverWatch:
         except StructureChanged:
             with contextlib.suppress(ServiceError, NamespaceError):
                 reader.reattach()
-                self._log = DriverLog(reader.structure)
-                self._judge = TaxelJudge(reader.structure, reader.name)
+                self._log = DriverLog(reader.structure, reader.name)
             return
         except (ServiceTimeout, Overrun):
             return
@@ -78,55 +76,39 @@ class _DriverWatch:
         self._newest = frame
         self._newest_statistics = reader.writer_statistics
         self._log.take(frame, reader.static(), time_s)
-        if not frame.stale:
-            self._judge.take(frame)
 
     def seen(self) -> DriverSeen:
-        reader, log = self._reader, self._log
-        frame = self._newest
+        reader, frame = self._reader, self._newest
         life = life_of(reader, frame)
-        status = (
-            np.full(reader.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
-            if frame is None
-            else status_now(life, frame)
-        )
-        statuses, affected = log.affected(status)
-        pid = reader.writer_pid
-        return DriverSeen(
-            name=reader.name,
-            namespace=reader.namespace.name,
-            driver_type=reader.driver_type,
-            life=life,
-            pid=pid,
-            scheduling=_scheduling(pid) if life != "dead" else "",
-            data_path="not_told" if frame is None else frame.data_path.name.lower(),
-            restarts=self._restarts,
-            frames=log.frames,
-            frames_missed=0,
-            structure=reader.structure,
-            statuses=statuses,
-            affected=affected,
-            lines=log.lines(),
-            dark=log.dark(),
-            buses=log.buses(),
-            patches=log.patches(status, now_ns()),
-            timing=self._timing(life),
-            health=_by_calm(reader, life) or self._judge.seen(),
-        )
-
-    def _timing(self, life: str) -> DriverTiming:
-        before, now, log = self._begun, self._newest_statistics, self._log
-        return DriverTiming(
-            rate_hz=rate_now_hz(life, self._reader.rate_hz()),
-            period_ns=0 if self._newest is None else self._newest.period_ns,
+        status = np.full(reader.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
+        if frame is not None:
+            status = status_now(life, frame)
+        before, now = self._begun, self._newest_statistics
+        timing = DriverTiming(
+            rate_hz=rate_now_hz(life, reader.rate_hz()),
             missed=now.missed_periods - before.missed_periods,
             missed_before=before.missed_periods,
             late=_grown(before.lateness, now.lateness),
             age=_grown(before.age, now.age),
-            future_ns=log.future_ns,
-            backwards=log.backwards,
             before_boot=now.before_boot,
-            longest_gap_s=log.longest_gap_s,
+            longest_gap_s=self._log.longest_gap_s,
+        )
+        facts: dict[str, Any] = {}
+        health = _by_calm(reader, life)
+        if health is not None:
+            facts["health"] = health
+        return self._log.seen(
+            status,
+            now_ns(),
+            timing,
+            name=reader.name,
+            namespace=reader.namespace.name,
+            driver_type=reader.driver_type,
+            life=life,
+            pid=reader.writer_pid,
+            scheduling=_scheduling(reader.writer_pid) if life != "dead" else "",
+            restarts=self._restarts,
+            **facts,
         )
 
 
@@ -158,15 +140,11 @@ def _by_calm(reader: DriverReader, life: str) -> HealthSeen | None:
                 if source.driver == reader.name and np.array_equal(source.uid, reader.structure.sensor_uid):
                     sample = judge.read(timeout_s=0.0)
                     if life_of(judge, sample) == "live":
-                        return _calm_health(reader.structure, sample.report)
+                        report, structure, missing = sample.report, reader.structure, {}
+                        judged = int(np.isfinite(report.still_s).sum())
+                        untouched = int((report.kind == HealthKind.NEVER_TOUCHED).sum())
+                        if untouched:
+                            missing["dead and weak taxels"] = f"nothing has touched {untouched:,} of {judged:,} so far"
+                        faults = taxel_faults(structure, np.arange(structure.n_sensors), report)
+                        return HealthSeen("skin-calm", judged, faults, missing)
     return None
-
-
-def _calm_health(structure: Structure, report: HealthReport) -> HealthSeen:
-    judged = int(np.isfinite(report.still_s).sum())
-    untouched = int((report.kind == HealthKind.NEVER_TOUCHED).sum())
-    missing = {}
-    if untouched:
-        missing["dead and weak taxels"] = f"nothing has touched {untouched:,} of {judged:,} so far"
-    faults = taxel_faults(structure, np.arange(structure.n_sensors), report)
-    return HealthSeen("skin-calm", judged, faults, missing)

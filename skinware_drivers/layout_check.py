@@ -28,7 +28,15 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     """
     for cycle in layout.cycles:
         _check_age(cycle, cycle.period_s or period_s)
-        _check_members([frame for frame in layout.frames if frame.name in cycle.members])
+        writer: dict[int, str] = {}
+        for frame in [frame for frame in layout.frames if frame.name in cycle.members]:
+            for channel in {c for values in frame.runs for c in values.channels if c is not None}:
+                other = writer.setdefault(channel, frame.name)
+                if other != frame.name:
+                    raise ConfigurationError(
+                        f"frames {other!r} and {frame.name!r} of a cycle both have a value for channel {channel}: a"
+                        " value lies in one frame, give each frame channels of its own (`to`)"
+                    )
     n_channels = [len(module.channels) for patch in patches for module in patch.modules]
     names = [patch.name for patch in patches for _ in patch.modules]
     addresses = Addresses(layout.frames, [range(len(layout.frames))], tables)
@@ -58,18 +66,6 @@ def _check_age(cycle: Cycle, period_s: float) -> None:
     )
 
 
-def _check_members(members: Sequence[Frame]) -> None:
-    writer: dict[int, str] = {}
-    for frame in members:
-        for channel in {c for values in frame.runs for c in values.channels if c is not None}:
-            other = writer.setdefault(channel, frame.name)
-            if other != frame.name:
-                raise ConfigurationError(
-                    f"frames {other!r} and {frame.name!r} of a cycle both have a value for channel {channel}: a value"
-                    " lies in one frame, give each frame channels of its own (`to`)"
-                )
-
-
 def _check_dtype(frame: Frame, values: Values, dtype: np.dtype[np.generic]) -> None:
     if all(channel is None for channel in values.channels) or _holds(dtype, values.dtype):
         return
@@ -85,13 +81,10 @@ def _holds(dtype: np.dtype[np.generic], sent: str | Packed) -> bool:
         return np.can_cast(sent, dtype, "safe")
     if dtype.kind == "f":
         return True
-    least, most = _range(sent)
+    if isinstance(sent, Packed):
+        bits = sent.bits - sent.signed
+        least, most = -(1 << bits) if sent.signed else 0, (1 << bits) - 1
+    else:
+        least, most = int(np.iinfo(np.dtype(sent).name).min), int(np.iinfo(np.dtype(sent).name).max)
     limits = np.iinfo(dtype.name)
     return bool(limits.min <= least and most <= limits.max)
-
-
-def _range(sent: str | Packed) -> tuple[int, int]:
-    if isinstance(sent, Packed):
-        return (-(1 << sent.bits - 1), (1 << sent.bits - 1) - 1) if sent.signed else (0, (1 << sent.bits) - 1)
-    limits = np.iinfo(np.dtype(sent).name)
-    return int(limits.min), int(limits.max)

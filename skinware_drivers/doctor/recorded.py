@@ -19,6 +19,7 @@ from skinware.status import Status
 from skinware_drivers.doctor.driver_log import DriverLog
 from skinware_drivers.doctor.evidence import (
     BusSeen,
+    Change,
     Counted,
     DriverSeen,
     DriverTiming,
@@ -182,7 +183,8 @@ def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_Pa
             continue
         counts: Counted = part.counted
         counts_before: Counted = was.counted
+        changes: tuple[Change, ...] = (*was.changes, *part.changes)
         grown = dict(Counter(counts_before.grown) + Counter(counts.grown))
         counted = Counted(counts.total, grown, (*counts_before.hours, *counts.hours))
-        found.append(replace(part, counted=counted, changes=(*was.changes, *part.changes)))
+        found.append(replace(part, counted=counted, changes=changes))
     return tuple(found)

@@ -113,7 +113,9 @@ def can_interfaces(
     found = [
         _interface(folder, known.get(folder.name, {})) for folder in folders if _number(folder / "type") == _ARPHRD_CAN
     ]
-    return [one if known else _with_controller(one, controller(one.name)) for one in found]
+    if not known:
+        return [_with_controller(one, controller(one.name)) for one in found]
+    return found
 
 
 def ask_iproute2() -> dict[str, dict[str, Any]]:

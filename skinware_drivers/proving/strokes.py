@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.matrices import filled_by
-
 Floats = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
 """(n, 2): row and column of each taxel."""
@@ -28,12 +26,6 @@ class Matrix(NamedTuple):
 
     rows: int
     columns: int
-
-    @classmethod
-    def of_kind(cls, kind: str, count: int) -> Matrix | None:
-        """Return the matrix of a module's kind (``4x6``) if ``count`` taxels fill it."""
-        shape = filled_by(kind, count)
-        return cls(*shape) if shape is not None and count > 1 else None
 
     @property
     def places(self) -> Places:
@@ -106,17 +98,13 @@ def _turned(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_]) -> tu
             wrong.append(f"{name} are mirrored: the last comes first")
             turned[:, axis] = size - 1 - turned[:, axis]
         elif straight[axis] < _SURE:
-            return [*wrong, _no_order(matrix, moments, heard, name)], None
+            other = Matrix(matrix.columns, matrix.rows)
+            fits = [abs(_agreement(moments[heard, one], other.places[heard, one])) >= _SURE for one in (0, 1)]
+            if matrix.rows != matrix.columns and all(fits):
+                shapes = f"{other.rows} rows of {other.columns}, not {matrix.rows} rows of {matrix.columns}"
+                return [*wrong, f"it answers as {shapes}"], None
+            return [*wrong, f"{name} answer in no order"], None
     return wrong, turned
-
-
-def _no_order(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], name: str) -> str:
-    """Explain an axis without order: perhaps the matrix has another shape."""
-    other = Matrix(matrix.columns, matrix.rows)
-    fits = [abs(_agreement(moments[heard, axis], other.places[heard, axis])) >= _SURE for axis in (0, 1)]
-    if matrix.rows != matrix.columns and all(fits):
-        return f"it answers as {other.rows} rows of {other.columns}, not {matrix.rows} rows of {matrix.columns}"
-    return f"{name} answer in no order"
 
 
 def _agreement(moments: Floats, places: npt.NDArray[np.int64]) -> float:

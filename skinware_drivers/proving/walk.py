@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
+from skinware.matrices import filled_by
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.text import figure_text, plural, words
@@ -127,12 +128,12 @@ class _Walk:
             self._check_losses()
 
     def _check(self, module: int) -> None:
-        name = self._structure.module_names[module]
+        name, n_taxels = self._structure.module_names[module], len(self._taxels[module])
         try:
             self._press(module)
-            matrix = Matrix.of_kind(bytes(self._structure.module_kind[module]).decode(), len(self._taxels[module]))
-            if matrix is not None:
-                self._stroke(module, matrix)
+            shape = filled_by(bytes(self._structure.module_kind[module]).decode(), n_taxels)
+            if shape is not None and n_taxels > 1:
+                self._stroke(module, Matrix(*shape))
         except _Skipped:
             self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
         except _Missed as missed:
@@ -178,7 +179,11 @@ class _Walk:
         self._threshold = _TIMES_THE_NOISE * noise if noise else 1e-6
         unit = self._type.unit
         missing = np.flatnonzero(~self._usable)
-        without_data = f"none from {self._named(missing)}" if len(missing) else plural(len(self._usable), "taxel")
+        without_data = plural(len(self._usable), "taxel")
+        if len(missing):
+            names = self._structure.sensor_names(self._type.name)
+            more = f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
+            without_data = f"none from {', '.join(names[taxel] for taxel in missing[:_MOST_NAMES])}{more}"
         self._proof.add("every taxel has data", "", not len(missing), without_data)
         self._proof.about["noise"] = (
             f"{figure_text(noise, 3)} {unit}; pressed is more than {figure_text(self._threshold, 3)}"
@@ -324,11 +329,6 @@ class _Walk:
             self._first = self._first or frame
             self._last = frame
             yield frame, values
-
-    def _named(self, taxels: npt.NDArray[Any]) -> str:
-        names = self._structure.sensor_names(self._type.name)
-        more = f" and {len(taxels) - _MOST_NAMES} more" if len(taxels) > _MOST_NAMES else ""
-        return ", ".join(names[taxel] for taxel in taxels[:_MOST_NAMES]) + more
 
 
 _LOSSES = ("dropped", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")

@@ -174,7 +174,7 @@ class _DriverTrack:
 
 def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:
     """Return buses or patches with the counters that they had under the same name before the structure changed."""
-    earlier = {part.name: part for part in before}
+    earlier: dict[str, _PartT] = {part.name: part for part in before}
     found: list[_PartT] = []
     for part in now:
         was = earlier.get(part.name)

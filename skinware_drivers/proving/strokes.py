@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from skinware.matrices import filled_by
+
 Floats = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
 """(n, 2): row and column of each taxel."""
@@ -26,6 +28,12 @@ class Matrix(NamedTuple):
 
     rows: int
     columns: int
+
+    @classmethod
+    def of_kind(cls, kind: str, count: int) -> Matrix | None:
+        """Return the matrix of a module's kind (``4x6``) if ``count`` taxels fill it."""
+        shape = filled_by(kind, count)
+        return cls(*shape) if shape is not None and count > 1 else None
 
     @property
     def places(self) -> Places:

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
-from skinware.matrices import filled_by
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.text import figure_text, plural, words
@@ -128,12 +127,12 @@ class _Walk:
             self._check_losses()
 
     def _check(self, module: int) -> None:
-        name, n_taxels = self._structure.module_names[module], len(self._taxels[module])
+        name = self._structure.module_names[module]
         try:
             self._press(module)
-            shape = filled_by(bytes(self._structure.module_kind[module]).decode(), n_taxels)
-            if shape is not None and n_taxels > 1:
-                self._stroke(module, Matrix(*shape))
+            matrix = Matrix.of_kind(bytes(self._structure.module_kind[module]).decode(), len(self._taxels[module]))
+            if matrix is not None:
+                self._stroke(module, matrix)
         except _Skipped:
             self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
         except _Missed as missed:

@@ -79,22 +79,19 @@ class BusCondition:
             self.become(BusState.SILENT, reason or BusReason.NOTHING_HEARD)
         else:
             self.become(BusState.LIVE, reason)
-        if before != (self.state, self.reason):
-            self._log_change(*before)
-        self._has_spoken |= self.heard_ns > self.speaks_from_ns
-
-    def _log_change(self, state: BusState, reason: BusReason) -> None:
-        if self.reason == BusReason.NOTHING_HEARD:
-            if state == BusState.LIVE and self._has_spoken:
-                self.news.log(f"bus {self._name}: {WORDS[self.reason]}")
+        if before == (self.state, self.reason):
+            news = ""
+        elif self.reason == BusReason.NOTHING_HEARD:
+            news = WORDS[self.reason] if before[0] == BusState.LIVE and self._has_spoken else ""
         elif self.reason:
-            if self.reason != reason:
-                self.news.log(f"bus {self._name}: {WORDS[self.reason]}")
-        elif reason == BusReason.NOTHING_HEARD:
-            if self._has_spoken:
-                self.news.log(f"bus {self._name}: frames come again")
-        elif reason:
-            self.news.log(f"bus {self._name}: in order again (was {reason_text(reason)})")
+            news = WORDS[self.reason] if self.reason != before[1] else ""
+        elif before[1] == BusReason.NOTHING_HEARD:
+            news = "frames come again" if self._has_spoken else ""
+        else:
+            news = f"in order again (was {reason_text(before[1])})" if before[1] else ""
+        if news:
+            self.news.log(f"bus {self._name}: {news}")
+        self._has_spoken |= self.heard_ns > self.speaks_from_ns
 
 
 class BusLine:
@@ -164,9 +161,10 @@ class BusLine:
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
-        self.connection.begin_attempts()
+        is_first = True
         while True:
-            await self.connection.pause()
+            await self.connection.pause(is_first=is_first)
+            is_first = False
             self.condition.news.catch_up()
             was_there = self.connection.opened_ns
             try:

@@ -108,18 +108,25 @@ class Connection:
             BusNotAvailable: also if its interface hangs.
         """
         if self._bus.opens_slowly:
-            await self._open_slowly()
+            if self._opening is None:  # or the call of the last attempt has not returned yet
+                self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
+            if not await self._opening.is_over(_OPENING_S):
+                why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
+                raise BusNotAvailable(why, reason=BusReason.FAILED)
+            opening, self._opening = self._opening, None
+            opening.check()
         else:
             self._bus.open()
         self.opened()
 
-    def begin_attempts(self) -> None:
-        """Begin with the shortest pause if the bus was there for a while, not only for a moment again and again."""
-        if now_ns() - self.opened_ns > self._pauses.longest_s * NS_PER_S:
-            self._pauses.begin_again()
+    async def pause(self, *, is_first: bool) -> None:
+        """Let the pause before the next attempt to open the bus pass.
 
-    async def pause(self) -> None:
-        """Let the pause before the next attempt to open the bus pass."""
+        Args:
+            is_first: after a loss; the pauses begin anew, unless the bus is there only for moments again and again.
+        """
+        if is_first and now_ns() - self.opened_ns > self._pauses.longest_s * NS_PER_S:
+            self._pauses.begin_again()
         if self._opening is None:
             await asyncio.sleep(self._pauses.next_s())
 
@@ -148,16 +155,6 @@ class Connection:
             self._close()
         elif not await SlowCall(f"bus {self._name}, closing", self._bus.close).is_over(patience_s):
             log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self._name)
-
-    async def _open_slowly(self) -> None:
-        """Open a bus that may hang; the next attempt then waits for the same call to return."""
-        if self._opening is None:
-            self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
-        if not await self._opening.is_over(_OPENING_S):
-            why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
-            raise BusNotAvailable(why, reason=BusReason.FAILED)
-        opening, self._opening = self._opening, None
-        opening.check()
 
     def _close(self) -> None:
         opening, self._opening = self._opening, None

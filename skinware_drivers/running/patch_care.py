@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,30 +29,33 @@ Sample = Mapping[str, Any]
 
 def why_unused(layout: Layout, bus: Bus) -> list[str]:
     """Return likely reasons why no data comes, in a few words each."""
-    samples = sample_report(bus.samples.rows)
-    reasons = _lengths(layout, samples)
-    if bus.medium == "can":
-        reasons += list(_kinds_of_identifier(layout, samples))[:1]
+    reasons: dict[tuple[str, int], str] = {}
+    advice = ""
+    kinds = {frame.extended for frame in layout.frames}
+    for sample in sample_report(bus.samples.rows):
+        length, is_extended = sample["length"], sample["extended"]
+        if sample["why"] == Unused.BAD_LENGTH.name.lower():
+            came = f"{length} byte{'' if length == 1 else 's'} came ({sample_text(dict(sample))})"
+            for frame in layout.frames:
+                if _is_of(frame, sample):
+                    known = " or ".join(map(str, sorted(frame.length)))
+                    reason = f"frames {frame.name!r} have length {known}, but {came}"
+                    reasons.setdefault((frame.name, length), reason)
+        elif sample["why"] == Unused.UNKNOWN.name.lower() and len(kinds) == 1 and is_extended not in kinds:
+            number = identifier_text(_identifier(sample))
+            heard, known = ("29 bits", "11 bits") if is_extended else ("11 bits", "29 bits")
+            write = f"EXTENDED_FLAG | 0x{number}" if is_extended else f"0x{number}, without EXTENDED_FLAG"
+            advice = advice or (
+                f"heard 0x{number} ({heard}) where the layout has only identifiers of {known}: write {write}"
+            )
+    found = list(reasons.values())
+    if advice and bus.medium == "can":
+        found.append(advice)
     if wrong := bus.counters.framing.checksum_errors:
-        reasons.append(
+        found.append(
             f"{wrong} checksums were wrong: look at the kind of `checksum`, at its byte order and at what it `covers`"
         )
-    return reasons
-
-
-def _lengths(layout: Layout, samples: Sequence[Sample]) -> list[str]:
-    reasons: dict[tuple[str, int], str] = {}
-    for sample in samples:
-        if sample["why"] != Unused.BAD_LENGTH.name.lower():
-            continue
-        came = f"{sample['length']} byte{'' if sample['length'] == 1 else 's'} came ({sample_text(dict(sample))})"
-        for frame in layout.frames:
-            if _is_of(frame, sample):
-                known = " or ".join(map(str, sorted(frame.length)))
-                reasons.setdefault(
-                    (frame.name, sample["length"]), f"frames {frame.name!r} have length {known}, but {came}"
-                )
-    return list(reasons.values())
+    return found
 
 
 def _is_of(frame: Frame, sample: Sample) -> bool:
@@ -65,25 +68,6 @@ def _is_of(frame: Frame, sample: Sample) -> bool:
         elif condition.extended != sample["extended"] or identifier & condition.mask != condition.value:
             return False
     return bool(frame.when) or not sample["extended"]
-
-
-def _kinds_of_identifier(layout: Layout, samples: Sequence[Sample]) -> Iterator[str]:
-    """Yield advice for identifiers of 29 bits where all those of the layout have 11, or the other way round."""
-    kinds = {frame.extended for frame in layout.frames}
-    for sample in samples:
-        if sample["why"] != Unused.UNKNOWN.name.lower() or len(kinds) > 1 or sample["extended"] in kinds:
-            continue
-        identifier = identifier_text(_identifier(sample))
-        if sample["extended"]:
-            yield (
-                f"heard 0x{identifier} (29 bits) where the layout has only identifiers of 11 bits: write"
-                f" EXTENDED_FLAG | 0x{identifier}"
-            )
-        else:
-            yield (
-                f"heard 0x{identifier} (11 bits) where the layout has only identifiers of 29 bits: write"
-                f" 0x{identifier}, without EXTENDED_FLAG"
-            )
 
 
 def _identifier(sample: Sample) -> int:
@@ -176,7 +160,12 @@ class PatchCare:
             states.append(PatchState.RESTARTED)
         silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
         if self._knows_only_all:
-            silent = silent[:1] if self._may_set_up_all(silent) else []  # the others are set up with it
+            is_due = self._set_ups_of_all.are_due or not self._patches_in(PatchState.LIVE)
+            if not silent:
+                self._set_ups_of_all = _SetUps()
+            elif is_due and self._patches_in(PatchState.LIVE):  # which it disturbs: less and less often
+                self._set_ups_of_all.begin()
+            silent = silent[:1] if is_due else []  # the others are set up with it
         for patch in self._patches_in(PatchState.LIVE):
             self._set_ups.pop(patch.key, None)
         for patch in silent:
@@ -231,18 +220,6 @@ class PatchCare:
         set_ups.begin()
         return True
 
-    def _may_set_up_all(self, silent: Sequence[Patch]) -> bool:
-        """Return whether to set up the whole bus for silent patches: less and less often while that disturbs others."""
-        if not silent:
-            self._set_ups_of_all = _SetUps()
-            return False
-        if not self._patches_in(PatchState.LIVE):
-            return True
-        if not self._set_ups_of_all.are_due:
-            return False
-        self._set_ups_of_all.begin()
-        return True
-
     async def attend(self, pause_s: Callable[[], float]) -> None:
         """Listen to reports of devices about themselves, indefinitely.
 
@@ -259,18 +236,14 @@ class PatchCare:
                         await adapter.attend(self._line.link)
                     await asyncio.Event().wait()  # indefinitely: it may still report something when it is asked
                 except BusError as error:
-                    self._log_trouble(str(error))
+                    if str(error) != self._logged and not self._line.connection.lost.is_set():  # once in a row
+                        self._logged = str(error)
+                        log.warning("%s: %s; attending to it again", self._line.name, self._logged)
                 await asyncio.sleep(pause_s())
         finally:
             adapter.heard_by = None
             for task in reviving.values():
                 task.cancel()
-
-    def _log_trouble(self, text: str) -> None:
-        """Log a failure of ``attend`` once in a row, unless the bus is away."""
-        if text != self._logged and not self._line.connection.lost.is_set():
-            self._logged = text
-            log.warning("%s: %s; attending to it again", self._line.name, text)
 
     def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
         line, generation = self._line, self._generation()

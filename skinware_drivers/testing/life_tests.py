@@ -14,9 +14,8 @@ from skinware.errors import BusError, ConfigurationError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.structure import Structure
-from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.adapter import AnyAdapter, check_layout
 from skinware_drivers.description import SkinTables, assemble
-from skinware_drivers.layout_check import check_layout
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.leaks import Belongings, files_left
 from skinware_drivers.testing.rig import Running, Suite, in_its_time, play

@@ -57,19 +57,18 @@ def examine(evidence: Evidence) -> Examination:
 
 
 def _finished(note: Note, area: str, evidence: Evidence) -> Note:
-    """Return a note with its area, printable texts, and the commands that are of use."""
+    """Return a note with its area, printable texts, and the commands that are of use.
+
+    Commands reach the namespace that was examined, even if it is not the default here.
+    """
     texts: dict[str, Any] = {name: printable(value) for name, value in vars(note).items() if isinstance(value, str)}
+    elsewhere = evidence.namespace if evidence.namespace not in ("", Namespace().name) else ""
     if not isinstance(note, Looked):
-        texts["commands"] = tuple(
-            printable(_in_namespace(command, evidence.namespace))
-            for command in note.commands
-            if evidence.is_live or command.startswith(_OF_ANY_TIME)
-        )
+        commands = []
+        for command in note.commands:
+            if evidence.is_live or command.startswith(_OF_ANY_TIME):
+                if elsewhere and "--namespace" not in command and command.startswith(_FOLLOWS_NAMESPACE):
+                    command = f"{command} --namespace {shlex.quote(elsewhere)}"
+                commands.append(printable(command))
+        texts["commands"] = tuple(commands)
     return replace(note, **{**texts, "area": area})
-
-
-def _in_namespace(command: str, namespace: str) -> str:
-    """Return a command that reaches the namespace that was examined, even if it is not the default here."""
-    if not namespace or namespace == Namespace().name or "--namespace" in command:
-        return command
-    return f"{command} --namespace {shlex.quote(namespace)}" if command.startswith(_FOLLOWS_NAMESPACE) else command

@@ -111,7 +111,6 @@ class _DriverWatch:
         timing = DriverTiming(
             rate_hz=rate_now_hz(life, reader.rate_hz()),
             missed=now.missed_periods - before.missed_periods,
-            missed_before=before.missed_periods,
             late=_grown(before.lateness, now.lateness),
             age=_grown(before.age, now.age),
             before_boot=now.before_boot,

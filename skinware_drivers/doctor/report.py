@@ -13,7 +13,6 @@ from pathlib import Path
 from skinware.text import age_text, plural, printable
 from skinware_drivers.doctor.evidence import Counted, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
-from skinware_drivers.doctor.finding import Finding
 
 _PEOPLE = range(1000, 65534)
 """Numbers of accounts of people."""
@@ -121,7 +120,15 @@ def _lines(evidence: Evidence, found: Examination) -> Iterator[str]:
     yield f"{findings} in {about}, {span}, {drivers}."
     yield ""
     for number, finding in enumerate(found.findings, 1):
-        yield from _finding(number, finding)
+        yield f"## {number}. {finding.severity.name.lower()}: {finding.what}"
+        yield ""
+        yield f"* area: {finding.area}"
+        yield f"* where: {finding.where}"
+        yield f"* evidence: {finding.evidence}"
+        yield f"* what to do: {finding.action} (docs/{finding.see})"
+        yield ""
+        if finding.commands:
+            yield from ("```console", *finding.commands, "```", "")
     yield "## Looked at"
     yield ""
     yield from _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
@@ -130,18 +137,6 @@ def _lines(evidence: Evidence, found: Examination) -> Iterator[str]:
     yield from _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
     for driver in evidence.drivers:
         yield from _driver(driver)
-
-
-def _finding(number: int, finding: Finding) -> Iterator[str]:
-    yield f"## {number}. {finding.severity.name.lower()}: {finding.what}"
-    yield ""
-    yield f"* area: {finding.area}"
-    yield f"* where: {finding.where}"
-    yield f"* evidence: {finding.evidence}"
-    yield f"* what to do: {finding.action} (docs/{finding.see})"
-    yield ""
-    if finding.commands:
-        yield from ("```console", *finding.commands, "```", "")
 
 
 def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:

@@ -66,18 +66,18 @@ class ProbeAnswer:
     refused: str = ""
 
 
-async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
+async def listen(
+    bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]], bus: Bus | None = None
+) -> HeardOnBus:
     """Listen to a CAN bus. Nothing is sent.
+
+    Args:
+        bus: of this name, not opened yet; default: it is made.
 
     Raises:
         ConfigurationError: this is not the name of a bus.
     """
-    bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
-    return await listen_on(bus, bus_name, duration_s, drivers)
-
-
-async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
-    """Listen as :func:`listen` does, to a bus that is made already."""
+    bus = bus or make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     traffic, bits_before = Traffic(), bus.wire_bits
     try:
         async with attended(bus, traffic.take):

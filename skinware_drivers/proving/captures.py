@@ -94,12 +94,12 @@ def decoded_now(
         about = recording.about(wires[0].driver)
         began_ns, listens = _began_ns(recording, wires), bool(about.get("listen_only"))
         clock = HandClock()
-        replays = [_ReplayedWire(recording, wire, listens, clock) for wire in wires]
         driver = driver or load_driver(_driver_type(recording, about))
-        of_buses = about.get("buses", {})
-        for replay in replays:
-            usual = of_buses.get(replay.wire.bus, {}).get("options", {})
-            replay.prepare(driver, {**usual, **(options or {})})
+        replays = []
+        for wire in wires:
+            usual = about.get("buses", {}).get(wire.bus, {}).get("options", {})
+            given = {**usual, **(options or {})}
+            replays.append(_ReplayedWire(recording, wire, driver, given, listens, clock))
     log, namespace = SnapshotLog(clock), Namespace(f"captured-{os.getpid()}-{secrets.token_hex(4)}")
     try:
         with package_on(clock), asyncio.Runner(loop_factory=lambda: HandLoop(clock)) as loop:
@@ -147,43 +147,44 @@ def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
 
 
 class _ReplayedWire:
-    """A recorded wire, and the adapter of the present driver on it."""
+    """A recorded wire, and the adapter of the present driver on it.
 
-    def __init__(self, recording: Recording, wire: WireTrack, listens: bool, clock: HandClock) -> None:
-        self.wire = wire
-        self._path, self._listens, self._clock = recording.path, listens, clock
-        self._medium = medium_of(recording, wire)
-        # the replayed bus gives the driver these
-        self._times = [
-            item.time_ns
-            for item in wire.items()
-            if (self._medium == "modbus" if item.is_sent else not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG))
-        ]
+    Raises:
+        ConfigurationError: the driver has no such options, or is for another kind of bus.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        wire: WireTrack,
+        driver: type[AnyAdapter],
+        options: Mapping[str, Any],
+        listens: bool,
+        clock: HandClock,
+    ) -> None:
+        medium = medium_of(recording, wire)
+        self._times = []  # of what the replayed bus gives the driver
+        for item in wire.items():
+            is_data = not item.is_sent and not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG)
+            if is_data or (item.is_sent and medium == "modbus"):
+                self._times.append(item.time_ns)
         self.duration_ns: int = self._times[-1] - self._times[0] if self._times else 0
         self._stamps_ns, self._then_ns = array("q"), array("q")
-        self.line: tuple[str, AnyAdapter, Bus] | None = None
-
-    def prepare(self, driver: type[AnyAdapter], options: Mapping[str, Any]) -> None:
-        """Make the adapter and its bus.
-
-        Raises:
-            ConfigurationError: the driver has no such options, or is for another kind of bus.
-        """
-        kind = next((one for one in (driver, *driver.elsewhere) if one.medium == self._medium), driver)
+        kind = next((one for one in (driver, *driver.elsewhere) if one.medium == medium), driver)
         try:
             adapter = kind(msgspec.convert(dict(options), kind.Options, strict=False))
         except msgspec.ValidationError as error:
             raise ConfigurationError(f"options of {kind.__name__}: {error}") from None
         adapter.check()
         bus = replayed_bus(
-            str(self._path),
-            {"bus": self.wire.bus, "driver": self.wire.driver},
+            str(recording.path),
+            {"bus": wire.bus, "driver": wire.driver},
             payload_size=adapter.payload_size,
-            listen_only=self._listens,
-            clock=self._clock,
+            listen_only=listens,
+            clock=clock,
             note=self._note,
         )
-        self.line = self.wire.bus, adapter, bus
+        self.line: tuple[str, AnyAdapter, Bus] = wire.bus, adapter, bus
 
     @property
     def is_over(self) -> bool:
@@ -249,7 +250,7 @@ async def _run(
     clock: HandClock, replays: Sequence[_ReplayedWire], log: SnapshotLog, namespace: Namespace, listens: bool
 ) -> None:
     """Run the driver until every frame is delivered, and the values are published."""
-    lines = [replay.line for replay in replays if replay.line is not None]
+    lines = [replay.line for replay in replays]
     runner = Runner(_NAME, lines, name=_NAME, listen_only=listens, namespace=namespace, slots=_SLOTS, publish="cycle")
     running = asyncio.create_task(runner.run())
     latest_ns = clock.now_ns + _LATEST_NS + 2 * max(replay.duration_ns for replay in replays)

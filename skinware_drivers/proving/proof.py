@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import enum
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -89,20 +88,15 @@ class Proof:
         }
 
     def as_markdown(self) -> str:
-        return scrubbed("\n".join(map(printable, self._lines())) + "\n", Secrets.of_this_machine())
-
-    def _lines(self) -> Iterator[str]:
-        yield f"# Driver {self.driver_type or self.driver}: {'proven' if self.is_proven else 'not proven'}"
-        yield ""
-        yield f"By `skin-prove`: {', '.join(f'{count} {verdict}' for verdict, count in self.counts.items() if count)}."
-        yield ""
-        yield from (f"* {name}: {text}" for name, text in self.about.items())
-        yield ""
-        yield "| | what | where | seen |"
-        yield "|---|---|---|---|"
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items() if count)
+        lines = [f"# Driver {self.driver_type or self.driver}: {'proven' if self.is_proven else 'not proven'}", ""]
+        lines += [f"By `skin-prove`: {counts}.", ""]
+        lines += [f"* {name}: {text}" for name, text in self.about.items()]
+        lines += ["", "| | what | where | seen |", "|---|---|---|---|"]
         for check in self.checks:
             cells = (check.verdict.value, check.what, check.where, check.seen)
-            yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+        return scrubbed("\n".join(map(printable, lines)) + "\n", Secrets.of_this_machine())
 
 
 class ProofFiles:

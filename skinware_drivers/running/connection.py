@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 
 from skinware.errors import BusNotAvailable
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import Bus
 from skinware_drivers.running.guard import Backoff
@@ -123,10 +123,10 @@ class Connection:
         """Let the pause before the next attempt to open the bus pass.
 
         Args:
-            is_first: after a loss; the pauses begin anew, unless the bus is there only for moments again and again.
+            is_first: after a loss.
         """
-        if is_first and now_ns() - self.opened_ns > self._pauses.longest_s * NS_PER_S:
-            self._pauses.begin_again()
+        if is_first:
+            self._pauses.begin_again_after(now_ns() - self.opened_ns)
         if self._opening is None:
             await asyncio.sleep(self._pauses.next_s())
 

@@ -86,23 +86,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
 
-class _SetUps:
-    """Set-ups without effect, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s."""
-
-    def __init__(self) -> None:
-        self.begun = 0
-        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-        self.not_before_ns = 0
-
-    @property
-    def are_due(self) -> bool:
-        return now_ns() >= self.not_before_ns
-
-    def begin(self) -> None:
-        self.begun += 1
-        self.not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
-
-
 class PatchCare:
     """Looks after the patches of one bus.
 
@@ -127,8 +110,9 @@ class PatchCare:
         adapter = type(line.adapter)
         self._revives_all = adapter.revive is Adapter.revive
         self._knows_only_all = self._revives_all and adapter.probe is Adapter.probe
-        self._set_ups: dict[int, _SetUps] = {}  # by patch key, of those that answer and send nothing
-        self._set_ups_of_all = _SetUps()
+        # set-ups without effect, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s
+        self._set_ups: dict[int, Backoff] = {}  # by patch key, of those that answer and send nothing
+        self._set_ups_of_all = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
         self._logged = ""
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
@@ -160,9 +144,9 @@ class PatchCare:
             states.append(PatchState.RESTARTED)
         silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
         if self._knows_only_all:
-            is_due = self._set_ups_of_all.are_due or not self._patches_in(PatchState.LIVE)
+            is_due = self._set_ups_of_all.is_due or not self._patches_in(PatchState.LIVE)
             if not silent:
-                self._set_ups_of_all = _SetUps()
+                self._set_ups_of_all.begin_again()
             elif is_due and self._patches_in(PatchState.LIVE):  # which it disturbs: less and less often
                 self._set_ups_of_all.begin()
             silent = silent[:1] if is_due else []  # the others are set up with it
@@ -186,7 +170,7 @@ class PatchCare:
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         line, set_ups = self._line, self._set_ups.get(patch.key)
-        if (set_ups is not None and not set_ups.are_due) or not line.condition.limits.knows_load_since(line.set_up_ns):
+        if (set_ups is not None and not set_ups.is_due) or not line.condition.limits.knows_load_since(line.set_up_ns):
             return False
         try:
             with hook("probe", line.name):
@@ -196,7 +180,7 @@ class PatchCare:
             log.debug("%s: %s", line.name, str(error))
             return False
         if set_ups is None:
-            set_ups = self._set_ups[patch.key] = _SetUps()
+            set_ups = self._set_ups[patch.key] = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
             if line.condition.limits.is_full:
                 set_ups.not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
                 log.warning(

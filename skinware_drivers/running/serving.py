@@ -126,8 +126,7 @@ class Serving:
                 self._aside.discard(line)
                 await line.needs_care.wait()
         finally:
-            if now_ns() - begun_ns > self._pauses[line].longest_s * NS_PER_S:
-                self._pauses[line].begin_again()
+            self._pauses[line].begin_again_after(now_ns() - begun_ns)
 
     async def _poll(self, line: BusLine) -> None:
         logged = {""}

@@ -129,15 +129,6 @@ class Truth:
         return felt
 
 
-@dataclass(frozen=True)
-class Damage:
-    """A fault that was made on the wire."""
-
-    time_ns: int
-    fault: Fault
-    payload: bytes
-
-
 @dataclass
 class Interference:
     """Devices behind a wire with faults.
@@ -147,6 +138,7 @@ class Interference:
         every_ns: mean time between two faults.
         silent: nothing passes in either direction.
         foreign: identifiers of frames of other devices beside the data.
+        damages: frames that had a fault, as it left them.
         keep: returns whether a frame passes.
         stumbling: holds frames back and loses some in a row; None: nothing does.
         sent: frames that the driver sent to the devices.
@@ -161,7 +153,7 @@ class Interference:
     foreign: Sequence[int] = ()
     keep: Callable[[int, bytes], bool] = lambda _identifier, _payload: True
     stumbling: Stumbling | None = None
-    damages: list[Damage] = field(default_factory=list)
+    damages: list[WireFrame] = field(default_factory=list)
     frames: int = 0
     foreign_sent: int = 0
     sent: list[tuple[int, bytes]] = field(default_factory=list)
@@ -228,8 +220,9 @@ class Interference:
             payload = self._random.randbytes(1 + self._random.randrange(8)) + payload
         else:
             payload = self._random.randbytes(len(payload))
-        self.damages.append(Damage(frame.time_ns, self.fault or "lost", payload))
-        return [WireFrame(frame.time_ns, frame.identifier, payload)] * times
+        damaged = WireFrame(frame.time_ns, frame.identifier, payload)
+        self.damages.append(damaged)
+        return [damaged] * times
 
     def _pause_ns(self) -> int:
         return round(self.every_ns * self._random.uniform(0.6, 1.4))

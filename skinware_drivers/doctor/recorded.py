@@ -19,7 +19,6 @@ from skinware.status import Status
 from skinware_drivers.doctor.driver_log import DriverLog
 from skinware_drivers.doctor.evidence import (
     BusSeen,
-    Change,
     Counted,
     DriverSeen,
     DriverTiming,
@@ -174,17 +173,13 @@ class _DriverTrack:
 
 def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:
     """Return buses or patches with the counters that they had under the same name before the structure changed."""
-    earlier: dict[str, _PartT] = {part.name: part for part in before}
-    found: list[_PartT] = []
-    for part in now:
-        was = earlier.get(part.name)
-        if was is None:
-            found.append(part)
-            continue
-        counts: Counted = part.counted
-        counts_before: Counted = was.counted
-        changes: tuple[Change, ...] = (*was.changes, *part.changes)
-        grown = dict(Counter(counts_before.grown) + Counter(counts.grown))
-        counted = Counted(counts.total, grown, (*counts_before.hours, *counts.hours))
-        found.append(replace(part, counted=counted, changes=changes))
-    return tuple(found)
+    earlier = {part.name: part for part in before}
+    return tuple(_joined(part, earlier[part.name]) if part.name in earlier else part for part in now)
+
+
+def _joined(part: _PartT, earlier: _PartT) -> _PartT:
+    now: Counted = part.counted
+    before: Counted = earlier.counted
+    grown = dict(Counter(before.grown) + Counter(now.grown))
+    counted = Counted(now.total, grown, (*before.hours, *now.hours))
+    return replace(part, counted=counted, changes=(*earlier.changes, *part.changes))

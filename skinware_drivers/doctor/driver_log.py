@@ -256,12 +256,7 @@ class DriverLog:
 
 
 def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the names of rows, columns (counted from 0) and matrices without a good sensor.
-
-    Args:
-        structure: its modules are matrices if their kind says so: ``12x32``.
-        bad: (n_sensors,) bool.
-    """
+    """Return the names of rows, columns (counted from 0) and whole matrices (kind ``12x32``) of bad sensors."""
     found: list[str] = []
     for module, name in enumerate(structure.module_names):
         kind = structure.module_kind[module].decode()

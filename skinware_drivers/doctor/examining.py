@@ -35,11 +35,7 @@ _FOLLOWS_NAMESPACE = (
 
 @dataclass(frozen=True)
 class Examination:
-    """The result of all checks.
-
-    Attributes:
-        findings: the worst first, then in the order in which data travels.
-    """
+    """The result of all checks: findings, the worst first, then in the order in which data travels."""
 
     findings: tuple[Finding, ...]
     looked: tuple[Looked, ...]

@@ -54,11 +54,7 @@ _POLICIES = {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
 
 
 def watch(namespace: Namespace, seconds: float, progress: Callable[[float], object]) -> tuple[DriverSeen, ...]:
-    """Read all drivers of a namespace.
-
-    Raises:
-        NamespaceError: the namespace cannot be trusted or read.
-    """
+    """Read all drivers of a namespace; raise ``NamespaceError`` if it cannot be trusted or read."""
     with Drivers(namespace, partial(DriverReader, announce=False)) as drivers:
         drivers.look()
         if drivers.trouble:

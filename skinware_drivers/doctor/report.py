@@ -42,12 +42,7 @@ _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 
 @dataclass(frozen=True)
 class Secrets:
-    """Private words, and what to write in their place.
-
-    Attributes:
-        words: replaced where they stand as whole words.
-        texts: replaced everywhere.
-    """
+    """What to write in place of private words, where they stand as whole words, and of texts everywhere."""
 
     words: Mapping[str, str] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
@@ -85,11 +80,7 @@ def scrubbed(text: str, secrets: Secrets) -> str:
 
 
 class Disguise:
-    """Take secrets out of names of buses and other texts; hosts become ``host1``, ``host2``.
-
-    Args:
-        secrets: default: those of this machine.
-    """
+    """Take secrets, by default of this machine, out of names of buses and other texts; hosts become ``host1``."""
 
     def __init__(self, secrets: Secrets | None = None) -> None:
         self._secrets = secrets or Secrets.of_this_machine()

@@ -33,12 +33,7 @@ class Rule:
     unit: str = "frame"
 
     def found(self, where: str, evidence: str, severity: Severity | None = None, /, **names: object) -> Finding:
-        """Return a finding of this kind.
-
-        Args:
-            severity: instead of the rule's.
-            **names: values for ``what`` and, quoted for a shell, for ``commands``.
-        """
+        """Return a finding of this kind; the names are filled in, quoted for a shell in commands."""
         quoted = {name: shlex.quote(str(value)) for name, value in names.items()}
         commands = []
         for command in self.commands:
@@ -66,11 +61,7 @@ RULES = _read()
 
 
 def loss_seen(counted: Counted, name: str, unit: str, evidence: Evidence, beside: str = "") -> tuple[bool, str] | None:
-    """Return whether a counter grew while the doctor looked, and its text; None if it is 0.
-
-    Args:
-        beside: added to the text, before the worst hours of a long recording.
-    """
+    """Return whether a counter grew while the doctor looked, and its text with what is beside it; None if it is 0."""
     total, grown, span = counted.total.get(name, 0), counted.grown.get(name, 0), age_text(evidence.seconds * 1e9)
     if not total and not grown:
         return None

@@ -132,10 +132,7 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
     """Return the drivers that know the frames, the most likely first.
 
     A driver knows a frame if identifier, length and constant bytes are right, and all frames of its cycle were heard.
-    If several know the same frames, the one with more constant bits wins.
-
-    Args:
-        bus: the bus; only its name is used.
+    If several know the same frames, the one with more constant bits wins. Only the name of the bus is used.
     """
     wire = traffic.wire()
     adapters = {
@@ -155,11 +152,7 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
 
 
 async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list[Patch]:
-    """Return the patches of one driver that were heard, as it describes them; nothing is sent.
-
-    Args:
-        bus: the bus; only its name is used.
-    """
+    """Return the patches of one driver that were heard, as it describes them; only the name of the bus is used."""
     match = _match(type(adapter).__name__, adapter, traffic.wire())
     if match is None:
         return []

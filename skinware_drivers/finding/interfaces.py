@@ -192,11 +192,7 @@ class CanAdapterFound:
 
 @dataclass(frozen=True)
 class Detection:
-    """The adapters that python-can found.
-
-    Attributes:
-        problem: an error, else empty.
-    """
+    """The adapters that python-can found, and an error, else empty."""
 
     found: list[CanAdapterFound] = field(default_factory=list)
     problem: str = ""

@@ -107,10 +107,7 @@ async def ask(
     """Ask which devices are on a CAN bus, without disturbing any.
 
     On a silent bus all drivers ask. If frames are heard, only the drivers that know them ask, and only questions that
-    are harmless for devices that send. A bus of a running driver, and one with unknown frames, are left alone.
-
-    Args:
-        owner: the running driver of the bus, in words; empty: none.
+    are harmless for devices that send. A bus of a running driver (owner), and one with unknown frames are left alone.
     """
     if heard.problem:
         return ProbeAnswer(heard.bus, refused=heard.problem)
@@ -165,10 +162,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
 
 
 def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> list[HeardTopic]:
-    """Return the topics of a domain of DDS, and which drivers can read each; nothing is asked or published.
-
-    Args:
-        bus_name: as ``dds://0``; a bus of this name can be made.
+    """Return the topics of a domain of DDS (``dds://0``), and which drivers can read each; nothing is published.
 
     Raises:
         BusNotAvailable: the domain cannot be joined.

@@ -28,11 +28,7 @@ class Verdict(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """A check.
-
-    Attributes:
-        where: module or bus; empty: the whole device.
-    """
+    """A check of a module or bus, or of the whole device if ``where`` is empty."""
 
     what: str
     where: str
@@ -42,11 +38,7 @@ class Check:
 
 @dataclass
 class Proof:
-    """All checks of a device.
-
-    Attributes:
-        about: facts on the device, the driver and this machine's programs.
-    """
+    """All checks of a device, and facts about it, the driver and this machine's programs."""
 
     driver: str
     driver_type: str
@@ -100,11 +92,7 @@ class Proof:
 
 
 class ProofFiles:
-    """The files of a proof: a report, the same as JSON, and a capture.
-
-    Attributes:
-        captured: result of the capture; empty before its end.
-    """
+    """The files of a proof: a report, the same as JSON, and a capture, whose result is empty before its end."""
 
     def __init__(self, stem: Path) -> None:
         self.report, self.data, self.capture = self._all = [
@@ -117,11 +105,7 @@ class ProofFiles:
         return [str(path) for path in self._all if path.exists()]
 
     def refuse_old(self) -> None:
-        """Check before the walk that the files can be written.
-
-        Raises:
-            ConfigurationError: the folder is missing, or a file exists already.
-        """
+        """Raise a ``ConfigurationError`` if the folder is missing, or a file exists already."""
         if not self.capture.parent.is_dir():
             raise ConfigurationError(f"-o {self.capture.with_suffix('')}: there is no folder {self.capture.parent}")
         if self.written:

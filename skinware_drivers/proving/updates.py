@@ -46,11 +46,7 @@ Decoding = Mapping[tuple[int, ...], ModuleUpdates]
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference between two decodings.
-
-    Attributes:
-        then, now: its raw values; None: there is no such update.
-    """
+    """A raw value that differs between two decodings; None: there is no such update."""
 
     time_s: float
     sensor: str
@@ -78,11 +74,7 @@ class Comparison:
 
 
 class Collected:
-    """Collect updates from snapshots.
-
-    Args:
-        began_ns: beginning of the recording, in the time of the snapshots.
-    """
+    """Collect updates from snapshots of a recording that began at ``began_ns``."""
 
     def __init__(self, began_ns: int = 0) -> None:
         self._began_ns = began_ns
@@ -189,11 +181,7 @@ def _without_partner(of: ModuleUpdates, row: int, *, is_then: bool) -> Differenc
 
 
 def save(decoding: Decoding, path: Path) -> None:
-    """Write the expected values of a capture.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the expected values of a capture."""
     arrays: dict[str, Any] = {}
     for number, (uids, of) in enumerate(decoding.items()):
         arrays |= {
@@ -206,12 +194,7 @@ def save(decoding: Decoding, path: Path) -> None:
 
 
 def load(path: Path) -> Decoding:
-    """Read a file of :func:`save`.
-
-    Raises:
-        BadRecording: the file is not one.
-        OSError: the file cannot be read.
-    """
+    """Read a file of :func:`save`; raise ``BadRecording`` if it is not one."""
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             found: dict[tuple[int, ...], ModuleUpdates] = {}

@@ -300,21 +300,12 @@ class _Walk:
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Yield snapshots as :meth:`_frames` does, until the patience ends.
-
-        Raises:
-            _Missed: the patience ended.
-            _Skipped: the person leaves the module out.
-        """
+        """Yield snapshots as :meth:`_frames` does; raise :class:`_Missed` when the patience ends."""
         yield from self._frames(after(self._manner.patience_s))
         raise _Missed(what, else_)
 
     def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Yield snapshots with (n,) physical values of the type; taxels without data have their values at rest.
-
-        Raises:
-            _Skipped: the person leaves the module out.
-        """
+        """Yield snapshots with (n,) physical values of the type; taxels without data have their values at rest."""
         for frame in frames_until(self._reader, is_over):
             if self._person.skips() and may_skip:
                 raise _Skipped

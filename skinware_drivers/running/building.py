@@ -55,9 +55,7 @@ class Builder:
 
     Attributes:
         geometry: as given; call ``build`` after a change.
-        writer: publishes; None before there is a structure.
-        desk: answers requests; None before there is a structure.
-        generation: what is in service; None before there is a structure.
+        writer, desk, generation: in service; None before there is a structure.
         built: locked while a generation is built, and notified afterwards.
     """
 
@@ -90,11 +88,7 @@ class Builder:
             self.rebuild()
 
     def rebuild(self, *, forced: bool = False) -> None:
-        """Build, with ``built`` held.
-
-        Args:
-            forced: also if nothing has changed but the bus behind a name.
-        """
+        """Build, with ``built`` held; if forced, also if nothing has changed but the bus behind a name."""
         if any(line.patches is None for line in self._lines):
             return
         adapters = [line.adapter for line in self._lines if line.patches]

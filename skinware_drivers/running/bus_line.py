@@ -215,11 +215,7 @@ class BusLine:
             self.lose("check", error)
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
-        """Ask for the patches on the bus until there are some.
-
-        Args:
-            described: called after every answer, also after an empty one.
-        """
+        """Ask for the patches on the bus until there are some; ``described`` is called after every answer, also without."""
         is_logged, attempts = False, _attempts()
         while True:
             await asyncio.sleep(attempts.next_s())
@@ -263,11 +259,7 @@ class BusLine:
                 return
 
     def begin_lost(self, error: BusNotAvailable | None = None) -> None:
-        """Wait for a bus that was never open as for one that was lost; nothing is attached to it so far.
-
-        Args:
-            error: why it could not be opened; None: it was not tried.
-        """
+        """Wait for a bus that was never open as for one that was lost; nothing is attached to it so far."""
         self.patches = ()
         self.connection.lost.set()
         self.needs_care.set()
@@ -289,11 +281,7 @@ class BusLine:
         self.condition.news.log(f"{error}; bus {self.name} is set aside, and tried again later")
 
     async def stop(self) -> None:
-        """Stop its devices, if they may send and the bus is open.
-
-        Raises:
-            DriverError: the driver's own code failed.
-        """
+        """Stop its devices, if they may send and the bus is open; raise ``DriverError`` if the driver's code fails."""
         if not self.started or self.connection.is_opening or not self.connection.is_open:
             return
         try:
@@ -330,11 +318,7 @@ async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
 
 
 def are_patches(found: Iterable[object]) -> Sequence[Patch]:
-    """Return the patches that ``describe`` or ``join`` of an adapter returned.
-
-    Raises:
-        TypeError: they are no patches.
-    """
+    """Return the patches that ``describe`` or ``join`` of an adapter returned; raise a TypeError if they are none."""
     patches = []
     for patch in found:
         if not isinstance(patch, Patch):

@@ -48,10 +48,7 @@ class SlowCall:
             raise error
 
     def leave(self, afterwards: Callable[[], object]) -> bool:
-        """Stop waiting for the call.
-
-        Args:
-            afterwards: called in its thread if it returns after all.
+        """Stop waiting for the call; if it returns after all, ``afterwards`` is called in its thread.
 
         Returns:
             False: the call is already over, and nothing is done.
@@ -102,11 +99,7 @@ class Connection:
         return self._opening is not None
 
     async def open(self) -> None:
-        """Open the bus; raises whatever the bus raises.
-
-        Raises:
-            BusNotAvailable: also if its interface hangs.
-        """
+        """Open the bus; raise whatever it raises, and ``BusNotAvailable`` if its interface hangs."""
         if self._bus.opens_slowly:
             if self._opening is None:  # or the call of the last attempt has not returned yet
                 self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
@@ -120,11 +113,7 @@ class Connection:
         self.opened()
 
     async def pause(self, *, is_first: bool) -> None:
-        """Let the pause before the next attempt to open the bus pass.
-
-        Args:
-            is_first: after a loss.
-        """
+        """Let the pause before the next attempt to open the bus pass, or the first one after a loss."""
         if is_first:
             self._pauses.begin_again_after(now_ns() - self.opened_ns)
         if self._opening is None:

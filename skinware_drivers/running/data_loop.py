@@ -103,11 +103,7 @@ class Intake:
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> bool:
-        """Fill a batch from the buses that have frames.
-
-        Returns:
-            Whether no bus had more than its share.
-        """
+        """Fill a batch from the buses that have frames; return whether none had more than its share."""
         if any(fd not in self._by_fd or self._by_fd[fd].bus.fileno() != fd for fd in fds):
             self._by_fd = {line.bus.fileno(): line for line in self._lines}
         ready = [self._by_fd[fd] for fd in fds if fd in self._by_fd]
@@ -177,11 +173,7 @@ def _slept_ns() -> int:
 
 
 class DataLoop:
-    """The data path of a driver in its event loop.
-
-    Args:
-        on_patches: called with patches that fell silent, or are live again.
-    """
+    """The data path of a driver in its event loop."""
 
     def __init__(
         self,

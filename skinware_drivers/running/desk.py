@@ -66,11 +66,7 @@ class RequestDesk:
         return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=NEVER_NS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
-        """Answer the requests that waited for a snapshot that was published.
-
-        Args:
-            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
-        """
+        """Answer the requests that waited for a snapshot that was published, by the oldest stamp of its new data."""
         answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
         self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
         for request in answered:

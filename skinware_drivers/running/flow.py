@@ -27,11 +27,7 @@ _LATENCY_WHILE_ASKING_S, _LATENCY_IN_STEP_S = 5e-4, 5e-5
 
 
 class FlowSelector(selectors.EpollSelector):
-    """A selector in whose waits frames flow.
-
-    Attributes:
-        flow: lets frames flow; called with this selector's descriptor and the longest wait, s. None: it only waits.
-    """
+    """A selector that waits in ``flow``, called with its descriptor and the longest wait, s; None: it only waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,11 +62,7 @@ def flow_of(
 
 
 class Flow:
-    """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable.
-
-    Args:
-        latency_s: the longest rest.
-    """
+    """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable."""
 
     def __init__(
         self,

@@ -45,11 +45,7 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
 
 
 def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
-    """Return the driver's watch, which knows already of the patches that report errors.
-
-    Raises:
-        DriverError: the driver's own code failed.
-    """
+    """Return the driver's watch, which knows already of the patches that report errors."""
     with hook("watch", *(line.name for line in lines), of_all=True):
         watch = lines[0].adapter.watch(tables)
     for line in lines:
@@ -135,11 +131,7 @@ class Generation:
         return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]
 
     def update_bus_states(self, settled: bool = True) -> None:
-        """Publish the states of the buses.
-
-        Args:
-            settled: look also at buses that were in order the last time.
-        """
+        """Publish the states of the buses; if settled, look also at those that were in order the last time."""
         if settled:
             self._look_ns = now_ns() + _LOOK_PAUSE_NS
         for line in self.lines:

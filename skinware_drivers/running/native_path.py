@@ -70,12 +70,7 @@ class NativePath:
             self._quick.skinware_path_free(self._path)
 
     def announce_waits(self, expects_data: bool, awaited: Sequence[Filter]) -> None:
-        """Set the frames that coroutines wait for, before a call of C.
-
-        Args:
-            expects_data: a coroutine waits for a frame that may be data.
-            awaited: filters for awaited frames that are of no module.
-        """
+        """Set what coroutines wait for, before a call of C: frames that may be data, or awaited ones of no module."""
         self._words.expects_data = expects_data
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in awaited]
         self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
@@ -87,11 +82,7 @@ class NativePath:
         self._batch.start = self._batch.headroom - self._words.carried
 
     def digest(self, interrupted: Sequence[int] = ()) -> None:
-        """Decode the batch, and publish snapshots that are due.
-
-        Args:
-            interrupted: buses that are known to have lost frames since the last batch.
-        """
+        """Decode the batch, and publish snapshots that are due; some buses have lost frames since the last batch."""
         self.interrupt(interrupted)
         self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
         self._enter()
@@ -105,22 +96,14 @@ class NativePath:
         self._exchange.interrupted[list(buses)] = True
 
     def publish_if_due(self, read_ns: int) -> None:
-        """Publish a snapshot if it is due.
-
-        Args:
-            read_ns: all frames that arrived until then were taken, CLOCK_MONOTONIC ns.
-        """
+        """Publish a snapshot if it is due; all frames that arrived until ``read_ns`` were taken."""
         self._words.read_ns = max(self._words.read_ns, read_ns)
         self._enter()
         self._waiting.skinware_path_publish_if_due(self._path)
         self._leave()
 
     def run(self, flow: structs.Flow) -> int:
-        """Let frames flow until Python has something to do.
-
-        Returns:
-            The reason, as a number of ``flow.c``.
-        """
+        """Let frames flow until Python has something to do; return the reason, a number of ``flow.c``."""
         self._enter()
         result = int(self._waiting.skinware_flow_run(self._path, ctypes.byref(flow)))
         self._leave()

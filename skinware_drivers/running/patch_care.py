@@ -87,12 +87,7 @@ Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
 
 class PatchCare:
-    """Looks after the patches of one bus.
-
-    Args:
-        generation: returns the generation in service; None: there is none yet.
-        beside: starts a task of the driver.
-    """
+    """Looks after the patches of one bus, while a generation is in service; ``beside`` starts a task of the driver."""
 
     def __init__(
         self,
@@ -205,11 +200,7 @@ class PatchCare:
         return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
-        """Listen to reports of devices about themselves, indefinitely.
-
-        Args:
-            pause_s: returns the pause after a failure of the bus, s.
-        """
+        """Listen to reports of devices about themselves, indefinitely, with pauses after failures of the bus."""
         adapter = self._line.adapter
         reviving: dict[int, asyncio.Task[None]] = {}
         adapter.heard_by = partial(self._note, reviving)

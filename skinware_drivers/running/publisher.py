@@ -171,11 +171,7 @@ class Publisher:
         return NEVER_NS if self._desk is None else self._desk.wanted_ns
 
     def answer(self, oldest_ns: int) -> None:
-        """Answer the requests that waited for a snapshot that was published.
-
-        Args:
-            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
-        """
+        """Answer the requests that waited for a snapshot that was published, by the oldest stamp of its new data."""
         if self._desk is not None:
             self._desk.published(oldest_ns, self.writer.position)
 
@@ -185,10 +181,9 @@ class Publisher:
         self.patches.state[patch] = state
 
     def excuse(self, since_ns: int, asleep_ns: int) -> None:
-        """Count silence from now on, for patches that lived when this process was held up.
+        """Count silence from now on, for patches that lived when this process last ran.
 
         Args:
-            since_ns: when it last ran, CLOCK_MONOTONIC ns.
             asleep_ns: how long the machine was suspended: older data is older by that time.
         """
         lives_until_ns = self.patches.lives_until_ns
@@ -209,11 +204,7 @@ class Publisher:
         return self._counts
 
     def look(self, updates: Updates) -> None:
-        """Let the watch look at updates that were shown.
-
-        Raises:
-            DriverError: the watch raised an exception.
-        """
+        """Let the watch look at updates that were shown; raise ``DriverError`` if it fails."""
         try:
             self.watch.look(updates)
         except (Exception, SystemExit):

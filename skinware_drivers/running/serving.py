@@ -31,11 +31,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
 
 class Serving:
-    """Serves buses one by one.
-
-    Args:
-        be_ready: called whenever a bus delivers for the first time.
-    """
+    """Serves buses one by one; ``be_ready`` is called whenever one delivers for the first time."""
 
     def __init__(
         self,
@@ -167,9 +163,6 @@ class BusChanges:
 
     A bus keeps its place, and with it the uids of its sensors: the place of a removed bus stays empty until a bus of
     the same name is added.
-
-    Args:
-        lines: the driver's buses, by place; changed.
     """
 
     def __init__(self, lines: list[BusLine], epoll: select.epoll, builder: Builder, serving: Serving) -> None:

@@ -27,11 +27,7 @@ _FEWEST_UPDATES = 3
 
 @dataclass(frozen=True)
 class Update:
-    """New values of a module in a snapshot.
-
-    Attributes:
-        burst: number of the burst of its device that it shows; None: it shows none.
-    """
+    """New values of a module in a snapshot, and the number of the burst that they show; None: none."""
 
     frame: int
     module: int
@@ -137,11 +133,7 @@ class ShownUpdates:
         return f"modules {modules[0]} to {modules[-1]} ({names})"
 
     def require_complete(self, spare: Callable[[int], bool] = lambda _time_ns: False, because: str = "") -> None:
-        """Fail unless every burst was shown, from the first shown one on.
-
-        Args:
-            spare: returns whether a burst at this time need not be shown.
-        """
+        """Fail unless every burst was shown, from the first shown one on, but for those at times to spare."""
         end_ns = self.rig.record.times_ns[-1] - 2 * self.rig.period_ns - _LATE_NS
         for module in range(self.structure.n_modules):
             shown = self.bursts_shown(module)

@@ -249,11 +249,7 @@ def _path(rig: Running, wire: npt.NDArray[np.void], watch: Watch) -> DirectPath:
 
 
 class _SensorLog(Watch):
-    """Note which sensors whole updates have values of.
-
-    Attributes:
-        has_values: (n_sensors + 1,) bool; the last one: values without a sensor.
-    """
+    """Note which sensors whole updates have values of; the last one stands for values without a sensor."""
 
     sees_all = True
 

@@ -105,12 +105,7 @@ class TornTests(Suite):
 
 
 class Delivery(NamedTuple):
-    """Frames that a bus delivered at once.
-
-    Attributes:
-        wire: (n,) as in a batch.
-        time_ns: (n,) int64, stamps.
-    """
+    """Frames that a bus delivered at once, and their stamps, as in a batch."""
 
     now_ns: int
     wire: npt.NDArray[np.void]
@@ -118,11 +113,7 @@ class Delivery(NamedTuple):
 
 
 class FrameLog:
-    """Write down the frames that the bus of a running driver delivers.
-
-    Attributes:
-        takes: deliveries in order, without empty ones.
-    """
+    """Write down the frames that the bus of a running driver delivers, in order."""
 
     def __init__(self, rig: Running) -> None:
         if rig.runner is None or rig.runner.builder.generation is None:
@@ -155,12 +146,7 @@ class FrameLog:
 
 
 class Bursts(NamedTuple):
-    """Some bursts of one patch.
-
-    Attributes:
-        wire: (bursts * size,) frames, as in a batch.
-        time_ns: (bursts * size,) int64.
-    """
+    """Some bursts of one patch: (bursts * size,) frames and their stamps, as in a batch."""
 
     layout: Layout
     tables: SkinTables
@@ -211,11 +197,7 @@ class Marked(NamedTuple):
 
 @dataclass
 class Outcome:
-    """The result of all troubles.
-
-    Attributes:
-        first: the first trouble that tore an update.
-    """
+    """The result of all troubles, and the first one that tore an update."""
 
     tried: int = 0
     shown: int = 0
@@ -226,12 +208,7 @@ class Outcome:
 def record(
     layout: Layout, tables: SkinTables, period_s: float, wire: npt.NDArray[Any], time_ns: Indices, bursts: int = BURSTS
 ) -> Bursts | None:
-    """Return bursts of the first patch among the frames of a bus; None if there are too few.
-
-    Args:
-        wire: (n,) frames in order, as in a batch.
-        time_ns: (n,) int64.
-    """
+    """Return bursts of the first patch among the frames of a bus, as in a batch; None if there are too few."""
     # a device's own time would say when frames were sent; bursts must be distinguished without it
     layout = replace(layout, frames=[replace(frame, time=None) for frame in layout.frames])
     entry, kind = _named(layout, tables, wire, time_ns)
@@ -249,8 +226,7 @@ def record(
 def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and count torn updates.
 
-    Args:
-        with_period: False: decode without knowing the period of the device.
+    Without the period of the device, cycles are joined whenever their frames come.
     """
     outcome, size = Outcome(), recording.size
     step = -(-size // min(_MOST_PLACES, max(1, _MOST_FRAMES // size)))

@@ -24,11 +24,7 @@ _LOSES_ONLY = 0.3
 
 
 class Stumbling:
-    """A sender that loses runs of frames, stands still and catches up; all chance comes from one seed.
-
-    Args:
-        frames: number of frames of a burst; up to twice as many are lost in a row.
-    """
+    """A sender that loses up to two bursts of frames, stands still and catches up; all chance comes from one seed."""
 
     def __init__(self, period_ns: int, frames: int) -> None:
         self._period_ns = period_ns
@@ -84,12 +80,7 @@ _FOREIGN_NS = 3_000_000
 
 @dataclass(frozen=True)
 class Burst:
-    """One sample of all sensors of a device.
-
-    Attributes:
-        time_ns: the latest time at which the emulator took it.
-        values: (n,) as the protocol can send them.
-    """
+    """One sample of all sensors of a device, as the protocol can send it, and when it was taken at the latest."""
 
     time_ns: int
     values: Values

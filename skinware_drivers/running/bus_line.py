@@ -215,7 +215,7 @@ class BusLine:
             self.lose("check", error)
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
-        """Ask for the patches on the bus until there are some; ``described`` is called after every answer, also without."""
+        """Ask for the patches on the bus until there are some; call ``described`` after every answer, also without."""
         is_logged, attempts = False, _attempts()
         while True:
             await asyncio.sleep(attempts.next_s())

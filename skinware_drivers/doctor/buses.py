@@ -15,7 +15,7 @@ _FLAPS = 4
 """Changes of state that are no accident."""
 _AWAY = ("silent", "down", "gone")
 _REASON_OF_STATE = {"silent": "nothing-heard", "down": "interface-down", "gone": "interface-gone"}
-"""What a state means, if the driver gives no reason."""
+"""The usual reason of a state, if the driver gives none."""
 _UNKNOWN_SHARE = 0.05
 """Share of frames with unknown identifiers that is worth a note."""
 _OF_A_BUSY_MACHINE = ("dropped", "polls_missed", "updates_skipped")

@@ -42,7 +42,7 @@ _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 
 @dataclass(frozen=True)
 class Secrets:
-    """What to write in place of private words, where they stand as whole words, and of texts everywhere."""
+    """Texts in place of private words, where they stand as whole words, and of private texts everywhere."""
 
     words: Mapping[str, str] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)

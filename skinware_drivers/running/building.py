@@ -199,13 +199,11 @@ def put_in_place(tables: SkinTables, given: Geometry | None, of_buses: Sequence[
                 "the geometry has no place for any of the sensors: types and uid in its file are of another skin"
             )
         return tables
-    known = [_on_bus(geometry, bus) for bus, geometry in enumerate(of_buses) if geometry is not None]
+    known = []
+    for bus, geometry in enumerate(of_buses):
+        if geometry is not None:  # each bus has a coordinate frame of its own
+            frames = [f"{frame} {bus + 1}" if bus else frame for frame in geometry.frame.tolist()]
+            known.append(replace(geometry, uid=uid_on_bus(bus, geometry.uid), frame=np.array(frames, object)))
     placed = tables.placed(Geometry.joined(known)) if known else tables
     geometry = placed.structure.geometry
     return placed if geometry is not None and geometry.known.any() else tables
-
-
-def _on_bus(geometry: Geometry, bus: int) -> Geometry:
-    """Return the geometry with the uids of the whole driver, and a coordinate frame of its own for each bus."""
-    frames = [f"{frame} {bus + 1}" if bus else frame for frame in geometry.frame.tolist()]
-    return replace(geometry, uid=uid_on_bus(bus, geometry.uid), frame=np.array(frames, object))

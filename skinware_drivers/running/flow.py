@@ -109,7 +109,9 @@ class Flow:
         try:
             return self._path.run(flow)
         finally:
-            self._take_back()
+            for line, bus, source in self._handed:
+                line.condition.heard_ns = source.heard_ns
+                bus.take_back(source)
             self._generation.interrupted()  # C knows of these
 
     def _rest_s(self) -> float:
@@ -137,11 +139,6 @@ class Flow:
                 self._handed.append((line, line.bus, source))
         n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
         self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)
-
-    def _take_back(self) -> None:
-        for line, bus, source in self._handed:
-            line.condition.heard_ns = source.heard_ns
-            bus.take_back(source)
 
     def _heard(self) -> None:
         for line, _, source in self._handed:

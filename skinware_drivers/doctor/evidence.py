@@ -204,14 +204,6 @@ class NamespaceSeen:
 
 
 @dataclass(frozen=True)
-class InterfaceSeen:
-    """A CAN interface of the kernel at the end of the look, and the counters of the kernel and of its controller."""
-
-    interface: CanInterface
-    counted: Counted
-
-
-@dataclass(frozen=True)
 class MachineSeen:
     """The machine and its software.
 
@@ -294,6 +286,7 @@ class Evidence:
         seconds: duration of the look, or length of the recording.
         machine: this one; nothing is known of the machine that recorded.
         recording: None: a running skin was examined.
+        interfaces: CAN interfaces of the kernel at the end, and the counters of the kernel and of their controllers.
         kernel_has_can: the kernel supports CAN.
         running: living drivers in all namespaces that may be read, without those that publish another driver's data.
         waiting: processes of ``skin-driver`` that have published nothing so far.
@@ -307,7 +300,7 @@ class Evidence:
     machine: MachineSeen
     recording: RecordingSeen | None = None
     namespaces: tuple[NamespaceSeen, ...] = ()
-    interfaces: tuple[InterfaceSeen, ...] = ()
+    interfaces: tuple[tuple[CanInterface, Counted], ...] = ()
     kernel_has_can: bool = True
     ports: tuple[SerialPort, ...] = ()
     running: tuple[RunningDriver, ...] = ()

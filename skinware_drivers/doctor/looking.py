@@ -39,7 +39,6 @@ from skinware_drivers.doctor.evidence import (
     DriverTiming,
     Evidence,
     HealthSeen,
-    InterfaceSeen,
     MachineSeen,
     NamespaceSeen,
     ReaderSeen,
@@ -320,7 +319,7 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
         total = _counts(one)
         was = counts_before.get(one.name, total)
         grown = {name: max(0, count - was.get(name, 0)) for name, count in total.items()}
-        interfaces_seen.append(InterfaceSeen(one, Counted(total, grown)))
+        interfaces_seen.append((one, Counted(total, grown)))
     bridges: tuple[BridgeState, ...] = ()
     with contextlib.closing(LiveBridges(namespace)) as live, contextlib.suppress(NamespaceError):
         live.look()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from skinware.text import count_text, plural, words
-from skinware_drivers.doctor.evidence import Evidence, InterfaceSeen
+from skinware_drivers.doctor.evidence import Counted, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
 from skinware_drivers.doctor.rules import RULES
 from skinware_drivers.finding.interfaces import CanInterface
@@ -26,15 +26,15 @@ def check_interfaces(evidence: Evidence) -> Iterator[Note]:
         yield NotLooked("CAN interfaces", why, ("sudo modprobe can-raw",))
     elif not evidence.interfaces:
         yield Looked("CAN interfaces", "none is plugged in")
-    for one in evidence.interfaces:
-        yield Looked(one.interface.name, _interface_as_seen(one))
-        yield from _interface(one.interface, evidence.running)
-        grown = one.counted.grown
+    for one, counted in evidence.interfaces:
+        yield Looked(one.name, _interface_as_seen(one, counted))
+        yield from _interface(one, evidence.running)
+        grown = counted.grown
         went = grown.get("rx_packets", 0) + grown.get("tx_packets", 0)
         for counter, rule in RULES["drop"].items():
             if count := grown.get(counter, 0):
                 in_words = f"{words(counter)} {count_text(count)} in {evidence.seconds:.1f} s, {plural(went, 'frame')}"
-                yield rule.found(one.interface.name, in_words, interface=one.interface.name)
+                yield rule.found(one.name, in_words, interface=one.name)
     if not evidence.ports:
         yield Looked("serial ports", "none is plugged in")
     for port in evidence.ports:
@@ -49,8 +49,7 @@ def check_interfaces(evidence: Evidence) -> Iterator[Note]:
                 yield RULES["port"]["taken"].found(port.path, seen, pid=user.pid)
 
 
-def _interface_as_seen(seen: InterfaceSeen) -> str:
-    one = seen.interface
+def _interface_as_seen(one: CanInterface, counted: Counted) -> str:
     parts = ["up" if one.up else "down", one.kind]
     if one.bit_rate:
         parts.append(f"{one.bit_rate / 1000:g} kbit/s")
@@ -59,7 +58,7 @@ def _interface_as_seen(seen: InterfaceSeen) -> str:
     parts += [one.state.lower()] if one.state else []
     parts += [f"restart-ms {one.restart_ms}"] if one.restart_ms is not None else []
     parts.append(f"queue {one.queue_length}")
-    parts += [f"{words(name)} {count_text(count)}" for name, count in seen.counted.total.items() if count]
+    parts += [f"{words(name)} {count_text(count)}" for name, count in counted.total.items() if count]
     return ", ".join(parts)
 
 

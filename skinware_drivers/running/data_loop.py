@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import FrameBatch, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import FlowLoop, flow_of
+from skinware_drivers.running.flow import Flow, FlowLoop
 from skinware_drivers.running.generation import Generation, latency_for, make_batch, split_by_bus
 from skinware_drivers.running.guard import Ending
 from skinware_drivers.running.news import MachineLimits, PatchChange
@@ -201,14 +201,15 @@ class DataLoop:
         self._intake.latency_s = int(generation.publisher.latency_ns[0]) / NS_PER_S
         loop = asyncio.get_running_loop()
         if isinstance(loop, FlowLoop):
-            take = self._ending.guard(self._intake.take)
-            flow = flow_of(generation, self._epoll.fileno(), self._intake.latency_s, take, self._ending.fail)
-            generation.flows = flow is not None
-            loop.selector.flow = None if flow is None else flow.run
-            if flow is None:
-                self._intake.start()
-            else:
+            generation.flows = any(is_read_natively(line.bus) for line in generation.lines if not line.is_removed)
+            if generation.flows:
+                take = self._ending.guard(self._intake.take)
+                flow = Flow(generation, self._epoll.fileno(), self._intake.latency_s, take, self._ending.fail)
+                loop.selector.flow = flow.run
                 self._intake.stop()
+            else:
+                loop.selector.flow = None
+                self._intake.start()
         self._ending.guard(self._publish_when_due)()
 
     def stop(self) -> None:

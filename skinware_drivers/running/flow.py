@@ -15,7 +15,7 @@ from collections.abc import Callable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusState
-from skinware_drivers.bus import KernelBus, is_read_natively
+from skinware_drivers.bus import KernelBus
 from skinware_drivers.native import structs
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
@@ -46,19 +46,6 @@ class FlowLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         self.selector = FlowSelector()
         super().__init__(self.selector)
-
-
-def flow_of(
-    generation: Generation,
-    epoll_fd: int,
-    latency_s: float,
-    take: Callable[[], object],
-    fail: Callable[[BaseException], None],
-) -> Flow | None:
-    buses = [line.bus for line in generation.lines if not line.is_removed]
-    if not any(is_read_natively(bus) for bus in buses):
-        return None
-    return Flow(generation, epoll_fd, latency_s, take, fail)
 
 
 class Flow:

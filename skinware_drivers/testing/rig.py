@@ -136,6 +136,9 @@ class Running(Rig):
         return self
 
     async def __aexit__(self, *raised: object) -> None:
+        await self.stop()
+
+    async def stop(self) -> None:
         """Stop the driver as ``skin-driver`` does; raise the exception that ended it."""
         if self.runner is None or self._task is None:
             return

@@ -13,7 +13,6 @@ import selectors
 from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import Unused
 from skinware.status import BusState
 from skinware_drivers.bus import KernelBus
 from skinware_drivers.native import structs
@@ -68,7 +67,7 @@ class Flow:
         self._handed: list[tuple[BusLine, KernelBus, structs.Source]] = []
         listeners = self._path.listeners
         listeners.sort_out, listeners.lose = self._sort_out, self._lose
-        listeners.heard, listeners.damaged = self._heard, self._keep_sample
+        listeners.heard = self._heard
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, at most for a time, s."""
@@ -141,9 +140,6 @@ class Flow:
         kept = self._bus(bus).sort_out(self._batch, slice(first, first + n))
         self._path.interrupt(self._generation.interrupted())
         return kept
-
-    def _keep_sample(self, bus: int, chunk: bytes) -> None:
-        self._lines[bus].bus.samples.note(Unused.REFUSED, 0, chunk)
 
     def _lose(self, bus: int, number: int) -> None:
         line = self._lines[bus]

@@ -137,15 +137,15 @@ class NativePath:
 
 def _compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs.Arrays) -> SharedArrays:
     """Fill in the part of a plan that is about publishing; return the arrays that both sides change."""
-    pauses, patches, buses, pace = publisher.pauses, publisher.patches, publisher.buses, publisher.pace
+    patches, buses, pace = publisher.patches, publisher.buses, publisher.pace
     exchange = SharedArrays(publisher.watch, len(buses.counters))
     plan.period_ns, plan.silence_ns, plan.patience_ns = pace.period_ns, pace.silence_ns, pace.patience_ns
     plan.pause_ns, plan.idle_ns = pace.pause_ns, pace.idle_ns
     plan.by_cycle, plan.most_at_once = publisher.by_cycle, publisher.writer.slots
     plan.stale = int(Status.STALE)
     plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
-    plan.burst_pause_ns = arrays.at(pauses.pause_ns)
-    plan.standing_out_ns, plan.gap_ns = arrays.at(pauses.standing_out_ns), arrays.at(pauses.gap_ns)
+    plan.burst_pause_ns = arrays.at(patches.pause_ns)
+    plan.standing_out_ns, plan.gap_ns = arrays.at(patches.standing_out_ns), arrays.at(patches.gap_ns)
     plan.is_prompt = arrays.at(publisher.state.is_prompt)
     plan.group_heard_ns, plan.age_limit_ns = arrays.at(patches.group_heard_ns), arrays.at(patches.age_limit_ns)
     plan.patch_heard_ns, plan.patch_state = arrays.at(patches.heard_ns), arrays.at(patches.state)

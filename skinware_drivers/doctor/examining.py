@@ -9,7 +9,7 @@ from typing import Any
 
 from skinware.memory.namespace import Namespace
 from skinware.text import printable
-from skinware_drivers.doctor import buses, machine, patches, programs, taxels
+from skinware_drivers.doctor import buses, machine, patches, programs
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked
 
@@ -18,9 +18,9 @@ CHECKS: dict[str, Callable[[Evidence], Iterator[Note]]] = {
     "permissions": machine.check_permissions,
     "bridges": programs.check_bridges,
     "buses": buses.check,
-    "patches": patches.check,
+    "patches": patches.check_patches,
     "timing": programs.check_timing,
-    "taxels": taxels.check,
+    "taxels": patches.check_taxels,
     "files": programs.check_files,
     "machine": machine.check_machine,
 }

@@ -13,7 +13,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware_drivers.testing.rig import LONGEST_START_S, SHOWN_ANYWAY, Running, is_fresh, sensor_name
+from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, is_fresh, sensor_name
 from skinware_drivers.testing.waiting import defect, require
 
 Values = npt.NDArray[np.int64]
@@ -245,7 +245,7 @@ class ShownUpdates:
         return f"shows {shown[-1]} where {example} was felt — look at `offset`, `dtype` and `bits` of the layout"
 
 
-async def until_fresh(rig: Running, within_s: float = LONGEST_START_S) -> DriverSnapshot:
+async def until_fresh(rig: Running) -> DriverSnapshot:
     """Let time pass until every sensor is fresh; explain why if that does not happen."""
     frames, begun_ns = rig.wire.frames, rig.clock.now_ns
     heard_ns: int | None = None
@@ -260,7 +260,7 @@ async def until_fresh(rig: Running, within_s: float = LONGEST_START_S) -> Driver
         return is_fresh(frame) or is_late
 
     try:
-        frame = await rig.until(is_decided, "", within_s)
+        frame = await rig.until(is_decided, "")
         require(is_fresh(frame), "")
     except BaseException:
         _explain_not_fresh(rig, (rig.clock.now_ns - begun_ns) / 1e9)

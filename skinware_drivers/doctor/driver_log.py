@@ -147,33 +147,27 @@ class DriverLog:
         Args:
             status: (n_sensors,) of the sensors at the end.
             at_ns: time of the end, CLOCK_MONOTONIC.
-            facts: of the driver; they replace those of these snapshots.
+            facts: fields that snapshots do not tell: the name of the driver, its process, its life and restarts.
         """
         statuses, affected = self._affected(status)
         suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
         is_dark = self._dark_modules()
         dark_sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
         bad = ((self._always & _BAD) != 0) & ~is_dark[self.structure.sensor_module]
-        parts: dict[str, Any] = {
-            "frames": self._frames,
-            "frames_missed": 0,
-            "data_path": "not_told" if self.newest is None else self.newest.data_path.name.lower(),
-            "buses": self.buses(),
-            "patches": self.patches(status, at_ns),
-        }
+        period_ns = 0 if self.newest is None else self.newest.period_ns
         return DriverSeen(
+            data_path="not_told" if self.newest is None else self.newest.data_path.name.lower(),
+            frames=self._frames,
             structure=self.structure,
             statuses=statuses,
             affected=affected,
             lines=whole_lines(self.structure, bad) if self._frames else (),
             dark={self.structure.module_names[row]: int(dark_sensors[row]) for row in np.flatnonzero(is_dark).tolist()},
-            timing=replace(
-                timing,
-                period_ns=0 if self.newest is None else self.newest.period_ns,
-                future_ns=self._future_ns,
-                backwards=self._backwards,
-            ),
-            **({"health": self._judge.seen()} | parts | facts),
+            buses=self.buses(),
+            patches=self.patches(status, at_ns),
+            timing=replace(timing, period_ns=period_ns, future_ns=self._future_ns, backwards=self._backwards),
+            health=self._judge.seen(),
+            **facts,
         )
 
     def buses(self) -> tuple[BusSeen, ...]:

@@ -168,7 +168,6 @@ class DriverSeen:
     data_path: str
     restarts: int
     frames: int
-    frames_missed: int
     structure: Structure
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
@@ -178,6 +177,7 @@ class DriverSeen:
     patches: tuple[PatchSeen, ...]
     timing: DriverTiming
     health: HealthSeen | None = None
+    frames_missed: int = 0
 
 
 @dataclass(frozen=True)

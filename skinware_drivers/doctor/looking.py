@@ -9,10 +9,10 @@ import platform
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -111,11 +111,7 @@ class _DriverWatch:
             before_boot=now.before_boot,
             longest_gap_s=self._log.longest_gap_s,
         )
-        facts: dict[str, Any] = {}
-        health = _by_calm(reader, life)
-        if health is not None:
-            facts["health"] = health
-        return self._log.seen(
+        seen = self._log.seen(
             status,
             now_ns(),
             timing,
@@ -126,8 +122,8 @@ class _DriverWatch:
             pid=reader.writer_pid,
             scheduling=_scheduling(reader.writer_pid) if life != "dead" else "",
             restarts=self._restarts,
-            **facts,
         )
+        return replace(seen, health=_by_calm(reader, life) or seen.health)
 
 
 def _grown(before: Histogram, now: Histogram) -> Histogram:

@@ -153,7 +153,7 @@ class _DriverTrack:
             age=self._age,
             longest_gap_s=self._longest_gap_ns / NS_PER_S,
         )
-        return log.seen(
+        seen = log.seen(
             status,
             at_ns,
             timing,
@@ -164,11 +164,9 @@ class _DriverTrack:
             pid=0,
             scheduling="",
             restarts=self._restarts,
-            frames=self._frames,
-            frames_missed=sum(_missed_in(event) for event in own),
-            buses=buses,
-            patches=patches,
         )
+        missed = sum(_missed_in(event) for event in own)
+        return replace(seen, frames=self._frames, frames_missed=missed, buses=buses, patches=patches)
 
 
 def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -64,6 +64,17 @@ def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: N
 
 def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> RecordingSeen:
     clock = recording.clock
+    # the wall clock against CLOCK_MONOTONIC, which cannot be set
+    offsets = [
+        (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
+        for moment in clock
+        if isinstance(moment.get("realtime_ns"), int) and isinstance(moment.get("monotonic_ns"), int)
+    ]
+    clock_sets = [
+        (time_s, now - before)
+        for (_, before, boot), (time_s, now, boot_now) in pairwise(offsets)
+        if boot == boot_now and abs(now - before) > _SET_S
+    ]
     return RecordingSeen(
         name=recording.path.name,
         size=recording.path.stat().st_size,
@@ -73,22 +84,10 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
         services=tuple(name for name in recording.services if name not in recording.drivers),
         missed=sum(_missed_in(event) for event in events),
         events=Counter(str(event.get("event")) for event in events),
-        clock_sets=tuple(_clock_sets(clock)),
+        clock_sets=tuple(clock_sets),
         boots=len({str(moment.get("boot")) for moment in clock}),
         recorded_by=recording.recorded_by,
     )
-
-
-def _clock_sets(clock: Sequence[Mapping[str, Any]]) -> Iterator[tuple[float, float]]:
-    """Yield the jumps of the wall clock against CLOCK_MONOTONIC, which cannot be set: when, and by how much, s."""
-    offsets = [
-        (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
-        for moment in clock
-        if isinstance(moment.get("realtime_ns"), int) and isinstance(moment.get("monotonic_ns"), int)
-    ]
-    for (_, before, boot), (time_s, now, boot_now) in pairwise(offsets):
-        if boot == boot_now and abs(now - before) > _SET_S:
-            yield time_s, now - before
 
 
 def _missed_in(event: dict[str, Any]) -> int:

@@ -98,36 +98,30 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
     """Return the report."""
-    text = "\n".join(map(printable, _lines(evidence, found))) + "\n"
-    return scrubbed(text, secrets or Secrets.of_this_machine())
-
-
-def _lines(evidence: Evidence, found: Examination) -> Iterator[str]:
-    yield "# Report of skin-doctor"
-    yield ""
     about = "a running skin" if evidence.recording is None else f"the recording {evidence.recording.name}"
     span = age_text(evidence.seconds * 1e9)
     drivers, findings = plural(len(evidence.drivers), "driver"), plural(len(found.findings), "finding")
-    yield f"{findings} in {about}, {span}, {drivers}."
-    yield ""
+    lines = ["# Report of skin-doctor", "", f"{findings} in {about}, {span}, {drivers}.", ""]
     for number, finding in enumerate(found.findings, 1):
-        yield f"## {number}. {finding.severity.name.lower()}: {finding.what}"
-        yield ""
-        yield f"* area: {finding.area}"
-        yield f"* where: {finding.where}"
-        yield f"* evidence: {finding.evidence}"
-        yield f"* what to do: {finding.action} (docs/{finding.see})"
-        yield ""
+        lines += [
+            f"## {number}. {finding.severity.name.lower()}: {finding.what}",
+            "",
+            f"* area: {finding.area}",
+            f"* where: {finding.where}",
+            f"* evidence: {finding.evidence}",
+            f"* what to do: {finding.action} (docs/{finding.see})",
+            "",
+        ]
         if finding.commands:
-            yield from ("```console", *finding.commands, "```", "")
-    yield "## Looked at"
-    yield ""
-    yield from _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
-    yield "## Not looked at"
-    yield ""
-    yield from _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
+            lines += ["```console", *finding.commands, "```", ""]
+    lines += ["## Looked at", ""]
+    lines += _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
+    lines += ["## Not looked at", ""]
+    lines += _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
     for driver in evidence.drivers:
-        yield from _driver(driver)
+        lines += _driver(driver)
+    text = "\n".join(map(printable, lines)) + "\n"
+    return scrubbed(text, secrets or Secrets.of_this_machine())
 
 
 def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:

@@ -121,22 +121,20 @@ class _Walk:
         try:
             self._check_rest()
             for module in self._modules:
-                self._check(module)
+                name = self._structure.module_names[module]
+                kind = bytes(self._structure.module_kind[module]).decode()
+                try:
+                    self._press(module)
+                    matrix = Matrix.of_kind(kind, len(self._taxels[module]))
+                    if matrix is not None:
+                        self._stroke(module, matrix)
+                except _Skipped:
+                    self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
+                except _Missed as missed:
+                    self._proof.add(missed.what, name, False, f"{missed} within {self._manner.patience_s:g} s")
             self._tare()
         finally:
             self._check_losses()
-
-    def _check(self, module: int) -> None:
-        name = self._structure.module_names[module]
-        try:
-            self._press(module)
-            matrix = Matrix.of_kind(bytes(self._structure.module_kind[module]).decode(), len(self._taxels[module]))
-            if matrix is not None:
-                self._stroke(module, matrix)
-        except _Skipped:
-            self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
-        except _Missed as missed:
-            self._proof.add(missed.what, name, False, f"{missed} within {self._manner.patience_s:g} s")
 
     def _tare(self) -> None:
         try:

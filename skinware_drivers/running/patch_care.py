@@ -254,7 +254,13 @@ class PatchCare:
             generation.decoder.forget(number)
             if not self._revives_all or self._begun_ns < asked_ns:
                 generation.publisher.lose(number, PatchState.RESTARTED)
-                await self._set_up(patch)
+                self._begun_ns, self._error = now_ns(), ""
+                try:
+                    with hook("revive", line.name):
+                        await line.adapter.revive(line.link, patch)
+                    line.revived_ns = now_ns()
+                except BusError as error:
+                    self._error = str(error) or type(error).__name__
             generation = self._generation()  # it may be another one by now
             number = None if generation is None else generation.number_of(line, patch)
             if generation is None or number is None:
@@ -266,16 +272,6 @@ class PatchCare:
                 line.suspects.discard(patch.key)
                 with hook("Watch.forget", line.name):
                     generation.watch.forget(number)
-
-    async def _set_up(self, patch: Patch) -> None:
-        self._begun_ns, self._error = now_ns(), ""
-        try:
-            with hook("revive", self._line.name):
-                await self._line.adapter.revive(self._line.link, patch)
-        except BusError as error:
-            self._error = str(error) or type(error).__name__
-        else:
-            self._line.revived_ns = now_ns()
 
     def _patches_in(self, state: PatchState) -> list[Patch]:
         generation = self._generation()

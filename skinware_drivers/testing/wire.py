@@ -45,7 +45,14 @@ class Stumbling:
         self._next_ns = self._next_ns or now_ns + self._pause_ns()
         for frame in frames:
             if frame.time_ns >= self._next_ns:
-                self._stumble(frame.time_ns)
+                self.stumbles += 1
+                if self._random.random() > _LOSES_ONLY:
+                    self._until_ns = frame.time_ns + round(self._random.uniform(0, _LONGEST_HOLD) * self._period_ns)
+                self._skip = self._random.randrange(self._frames)
+                near = self._random.choice((-1, 0, 0, 0, 1))
+                lose = self._frames * self._random.choice((0, 1, 1, 2)) + near
+                self._lose = max(1, min(2 * self._frames, lose))
+                self._next_ns = max(frame.time_ns, self._until_ns) + self._pause_ns()
             if self._skip:
                 self._skip -= 1
             elif self._lose:
@@ -56,15 +63,6 @@ class Stumbling:
             return []
         passed, self._held = self._held, []
         return [frame._replace(time_ns=max(frame.time_ns, self._until_ns)) for frame in passed]
-
-    def _stumble(self, time_ns: int) -> None:
-        self.stumbles += 1
-        if self._random.random() > _LOSES_ONLY:
-            self._until_ns = time_ns + round(self._random.uniform(0, _LONGEST_HOLD) * self._period_ns)
-        self._skip = self._random.randrange(self._frames)
-        near = self._random.choice((-1, 0, 0, 0, 1))
-        self._lose = max(1, min(2 * self._frames, self._frames * self._random.choice((0, 1, 1, 2)) + near))
-        self._next_ns = max(time_ns, self._until_ns) + self._pause_ns()
 
     def _pause_ns(self) -> int:
         return round(_BETWEEN * self._period_ns * self._random.uniform(0.8, 1.6))
@@ -179,7 +177,13 @@ class Interference:
         if self.fault is not None:
             frames = [damaged for frame in frames for damaged in self._damage(frame)]
         if self.foreign:
-            frames = self._among_others(frames, now_ns)
+            others = []
+            while self._next_foreign_ns <= now_ns:
+                payload = self._random.randbytes(self._random.randrange(9))
+                others.append(WireFrame(self._next_foreign_ns, self._random.choice(self.foreign), payload))
+                self._next_foreign_ns += round(_FOREIGN_NS * self._random.uniform(0.3, 1.7))
+            self.foreign_sent += len(others)
+            frames = sorted([*frames, *others], key=lambda frame: frame.time_ns)
         for frame in frames:
             self.identifiers[frame.identifier] = self.identifiers.get(frame.identifier, 0) + 1
         self.frames += len(frames)
@@ -217,15 +221,6 @@ class Interference:
 
     def _pause_ns(self) -> int:
         return round(self.every_ns * self._random.uniform(0.6, 1.4))
-
-    def _among_others(self, frames: list[WireFrame], now_ns: int) -> list[WireFrame]:
-        others = []
-        while self._next_foreign_ns <= now_ns:
-            payload = self._random.randbytes(self._random.randrange(9))
-            others.append(WireFrame(self._next_foreign_ns, self._random.choice(self.foreign), payload))
-            self._next_foreign_ns += round(_FOREIGN_NS * self._random.uniform(0.3, 1.7))
-        self.foreign_sent += len(others)
-        return sorted([*frames, *others], key=lambda frame: frame.time_ns)
 
 
 EmulatedBus = VirtualCanBus | VirtualSerialBus | VirtualModbusBus

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import json
 import logging
 import os
 import re
@@ -66,11 +67,7 @@ class PatientStream(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Accept text, and write as much as possible now.
-
-        Raises:
-            BrokenPipeError: the reader is gone.
-        """
+        """Accept text, and write as much as possible now; BrokenPipeError if the reader is gone."""
         data = text.encode(self.encoding, self.errors or "strict")
         with self._lock:
             if self._size + len(data) > _MOST_WAITING:
@@ -82,11 +79,7 @@ class PatientStream(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write as much as possible now.
-
-        Raises:
-            BrokenPipeError: the reader is gone.
-        """
+        """Write as much as possible now; BrokenPipeError if the reader is gone."""
         with self._lock:
             while self._waiting:
                 data = self._waiting[0]
@@ -240,14 +233,9 @@ def say(as_json: bool, data: object, text: str) -> None:
 def json_text(data: object) -> str:
     """Return an object as JSON, in which characters that cannot be printed are escaped."""
     text = msgspec.json.encode(data).decode()
-    return text if text.isprintable() else "".join(map(_escaped, text))
-
-
-def _escaped(sign: str) -> str:
-    if sign.isprintable():
-        return sign
-    units = sign.encode("utf-16-be", "surrogatepass")
-    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else json.dumps(sign)[1:-1] for sign in text)
 
 
 class Formatter(logging.Formatter):

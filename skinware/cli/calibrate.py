@@ -81,8 +81,7 @@ class _How:
     as_json: bool
 
 
-@click.group("skin-calibrate", context_settings=cli.CONTEXT_SETTINGS)
-@cli.version_option
+@cli.group("skin-calibrate")
 def command() -> None:
     """Find the places of sensors by touching the skin; check a geometry.
 
@@ -426,5 +425,4 @@ def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mappin
     click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -6,6 +6,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -363,5 +364,4 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         time.sleep(_WATCH_PERIOD_S)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

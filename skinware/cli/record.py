@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +103,7 @@ def past(text: str) -> float:
     "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
     "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @cli.output_option("The new file.  [default: skin-DATE-TIME.mcap]")
 @cli.duration_option()
 @click.option(
@@ -267,8 +268,7 @@ def _text_of(event: dict[str, Any]) -> str:
     return f"the wall clock was set by {event['by_ns'] / 1e9:+.1f} s: times in the file go on as before"
 
 
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)
 
 
 if __name__ == "__main__":

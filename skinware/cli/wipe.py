@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -164,5 +165,4 @@ class _Wipe:
             echo(self._progress())
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

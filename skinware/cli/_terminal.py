@@ -200,10 +200,14 @@ def overwrite(text: str, *, err: bool = False) -> None:
     click.echo(f"\r{shown(text)}\x1b[K", nl=False, err=err, color=True)
 
 
+def are_terminals(*streams: TextIO | None) -> bool:
+    """Return whether all these streams are open and on a terminal."""
+    return all(stream is not None and stream.isatty() for stream in streams)
+
+
 def terminal_width() -> int | None:
     """Return the columns of the terminal on stdout; None without a terminal, where lines may have any length."""
-    is_terminal = sys.stdout is not None and sys.stdout.isatty()
-    return shutil.get_terminal_size().columns if is_terminal else None
+    return shutil.get_terminal_size().columns if are_terminals(sys.stdout) else None
 
 
 def redraw(lines: list[str]) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import are_terminals, echo, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,8 +72,7 @@ def command(
     place = Namespace(namespace)
     names = () if region is None else (region,)
     regions = cli.regions_of(region_files, names) if names or region_files else None
-    streams = (sys.stdin, sys.stdout, sys.stderr)  # Textual draws on stderr
-    if not plain and not as_json and all(stream is not None and stream.isatty() for stream in streams):
+    if not plain and not as_json and are_terminals(sys.stdin, sys.stdout, sys.stderr):  # Textual draws on stderr
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 

@@ -69,15 +69,6 @@ def _spread(colours: Sequence[_T]) -> tuple[_T, ...]:
     return tuple(colours[-(-level * (len(colours) - 1) // (LEVELS - 1))] for level in range(LEVELS))
 
 
-def _between(anchors: Sequence[str]) -> Colours:
-    """Return one colour for each level, from the first anchor to the last."""
-    colours = [Color.parse(text).get_truecolor() for text in anchors]
-    steps = [level * (len(colours) - 1) / (LEVELS - 1) for level in range(LEVELS)]
-    return tuple(
-        mixed(colours[int(step)], colours[min(int(step) + 1, len(colours) - 1)], step - int(step)) for step in steps
-    )
-
-
 def _ansi(numbers: Sequence[int]) -> Colours:
     """Return colours of the table of 256, which stay the same when they are turned into numbers again."""
     return tuple(Color.from_ansi(number).get_truecolor() for number in numbers)
@@ -86,20 +77,28 @@ def _ansi(numbers: Sequence[int]) -> Colours:
 _GROUND = ColorTriplet(18, 18, 18)
 """Colour of the screen."""
 _BLACK, _WHITE = ColorTriplet(0, 0, 0), ColorTriplet(255, 255, 255)
-_VIRIDIS = _between(
-    (
+_VIRIDIS = tuple(
+    Color.parse(text).get_truecolor()
+    for text in (
         "#482475",
-        "#414487",
-        "#355f8d",
+        "#443780",
+        "#3f4988",
+        "#375a8c",
+        "#31698d",
         "#2a788e",
-        "#21918c",
-        "#22a884",
+        "#25878d",
+        "#21968a",
+        "#22a386",
+        "#30b17c",
         "#44bf70",
-        "#7ad151",
-        "#bddf26",
+        "#64ca5d",
+        "#87d448",
+        "#b0dc2f",
+        "#d7e226",
         "#fde725",
     )
 )
+"""One colour for each level."""
 _BASIC = {
     name: ColorTriplet(*rgb)
     for name, rgb in {
@@ -224,9 +223,11 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
         return _character(lower if upper == BACKGROUND else upper, palette), Style.null()
     if upper != lower and BACKGROUND in (upper, lower):
         code = upper if lower == BACKGROUND else lower
-        return "▀" if code == upper else "▄", _GROUND_STYLE + Style(color=_colour(colour_of(code, palette)))
+        return "▀" if code == upper else "▄", _GROUND_STYLE + Style(color=Color.from_triplet(colour_of(code, palette)))
     if upper != lower:
-        return "▀", Style(color=_colour(colour_of(upper, palette)), bgcolor=_colour(colour_of(lower, palette)))
+        return "▀", Style(
+            color=Color.from_triplet(colour_of(upper, palette)), bgcolor=Color.from_triplet(colour_of(lower, palette))
+        )
     if upper == BACKGROUND:
         return " ", _GROUND_STYLE
     ground = colour_of(upper, palette)
@@ -234,7 +235,7 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
     red, green, blue = ground
     readable = _BLACK if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else _WHITE
     ink = palette.ramp[level] if mark == heat.STALE else readable
-    return _character(upper, palette), Style(color=_colour(ink), bgcolor=_colour(ground))
+    return _character(upper, palette), Style(color=Color.from_triplet(ink), bgcolor=Color.from_triplet(ground))
 
 
 def _character(code: int, palette: Palette) -> str:
@@ -242,10 +243,6 @@ def _character(code: int, palette: Palette) -> str:
         return " "
     mark, level = divmod(code, LEVELS)
     return palette.characters[level] if palette.characters and mark == heat.FRESH else MARK_CHARACTERS.get(mark, "?")
-
-
-def _colour(triplet: ColorTriplet) -> Color:
-    return Color.from_triplet(triplet)
 
 
 def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
@@ -263,7 +260,7 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
                 text.append(palette.characters[level + 1])
             else:
                 left, right = palette.ramp[level : level + 2]
-                text.append("▌", Style(color=_colour(left), bgcolor=_colour(right)))
+                text.append("▌", Style(color=Color.from_triplet(left), bgcolor=Color.from_triplet(right)))
         text.append(f" {other}{' ' * (number + 1 < len(others))}")
     return text.append(f" {unit}".rstrip())
 

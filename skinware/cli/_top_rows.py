@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,14 +99,10 @@ def rows_of(report: DriverReport, *, worst_first: bool = True) -> list[ListRow]:
             patches.append(ListRow(RowKey(name, PATCH, number), patch_cells, badness(state), is_fresh, patch.counters))
         are_fresh = all(patch.is_fresh for patch in patches)
         row = ListRow(RowKey(name, BUS, at), cells, badness(report.state_of(bus)), are_fresh, bus.counters)
-        branches.append([row, *(sorted(patches, key=_bad) if worst_first else patches)])
+        branches.append([row, *(sorted(patches, key=attrgetter("bad"), reverse=True) if worst_first else patches)])
     if worst_first:
-        branches.sort(key=lambda rows: min(map(_bad, rows)))
+        branches.sort(key=lambda rows: max(row.bad for row in rows), reverse=True)
     return [driver, *(row for rows in branches for row in rows)]
-
-
-def _bad(row: ListRow) -> int:
-    return -row.bad
 
 
 def patches_of(key: RowKey, structure: Structure) -> list[int]:

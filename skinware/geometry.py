@@ -147,8 +147,12 @@ class Geometry:
     def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
         """Return the places of n sensors; not known where this geometry does not have them."""
         rows = {pair: row for row, pair in enumerate(zip(self.type_name.tolist(), self.uid.tolist(), strict=True))}
-        found = [rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)]
-        return self._take(np.array(found, np.int64), type_name, uid)
+        found = np.array([rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)], np.int64)
+        known, places = found >= 0, _empty(len(found))
+        places.type_name[:], places.uid[:] = type_name, uid
+        for name in ("position_m", "normal", "radius_m", "confidence", "frame"):
+            getattr(places, name)[known] = getattr(self, name)[found[known]]
+        return places
 
     def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Geometry:
         return Geometry(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
@@ -228,17 +232,6 @@ class Geometry:
             radius_m=np.array(columns["sensor_radius_m"]),
             confidence=np.full(n, np.nan),
         )
-
-    def _take(self, rows: npt.NDArray[np.int64], type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """Return the places of ``rows``; -1: not known."""
-        n = len(rows)
-        taken = _empty(n)
-        known = rows >= 0
-        taken.type_name[:] = type_name
-        taken.uid[:] = uid
-        for name in ("position_m", "normal", "radius_m", "confidence", "frame"):
-            getattr(taken, name)[known] = getattr(self, name)[rows[known]]
-        return taken
 
 
 def read_geometry(path: str | Path) -> Geometry:

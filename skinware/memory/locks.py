@@ -52,7 +52,7 @@ class ForkGuard:
 
     @classmethod
     def abandon_all(cls) -> None:
-        """Run by fork() in the child: all of them, whatever goes wrong with one."""
+        """Abandon all in a forked child, whatever goes wrong with one."""
         with contextlib.ExitStack() as stack:
             for guarded in list(cls._all):
                 stack.callback(guarded.abandon)
@@ -79,12 +79,7 @@ class Descriptor(ForkGuard):
         if fd >= 0:
             os.close(fd)
 
-    def abandon(self) -> None:
-        """See :class:`ForkGuard`."""
-        self.close()
-
-    def __del__(self) -> None:
-        self.close()
+    abandon = __del__ = close
 
 
 UNKNOWN, ENDED = -1, -2

@@ -309,28 +309,14 @@ class Tap(ServiceReader[SampleT]):
             return None
 
     def newest(self) -> SampleT:
-        """Return a copy of the newest sample of the generation at hand.
-
-        Raises:
-            ServiceTimeout: nothing was published yet.
-            Overrun: the writer is too fast for this number of slots.
-        """
+        """Return a copy of the newest sample of the generation at hand."""
         return self._newest_now(self._ring.copy, True)
 
     def newest_acquired_ns(self) -> int:
-        """``acquired_ns`` of the newest sample.
-
-        Raises:
-            Overrun: it was overwritten meanwhile, or nothing was published yet.
-        """
         return self._acquisitions()[-1][1]
 
     def nearest(self, time_ns: int) -> SampleT:
-        """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time.
-
-        Raises:
-            Overrun: it was overwritten meanwhile, or nothing was published yet.
-        """
+        """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time."""
         sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
         frame = self._ring.copy(sequence)
         if frame is None:

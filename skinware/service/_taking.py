@@ -42,8 +42,19 @@ class Accounts:
 
     @property
     def record(self) -> ReaderRecord:
-        self._add_up()
-        return self._record
+        """The figures so far, all turns added up."""
+        record = self._record
+        turns, self._turns = self._turns, []
+        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
+            age_ns = taken_ns - acquired_ns
+            record.age.add(age_ns)
+            record.age_ms = round(age_ns / 1e6, 3)
+            if cpu_ns:
+                record.wall.add(ended_ns - taken_ns)
+                if 0 < self._cpu_ns <= cpu_ns:
+                    record.cpu.add(cpu_ns - self._cpu_ns)
+                self._cpu_ns = cpu_ns
+        return record
 
     def begin_loop(self, kind: str) -> None:
         """From now on the reader reads in a loop, whose turns are timed."""
@@ -69,25 +80,9 @@ class Accounts:
         time_ns = now_ns()
         if turn is not None:
             self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
-        if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
-            self._add_up()
-            self._announce(time_ns)
-
-    def _add_up(self) -> None:
-        record = self._record
-        turns, self._turns = self._turns, []
-        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
-            age_ns = taken_ns - acquired_ns
-            record.age.add(age_ns)
-            record.age_ms = round(age_ns / 1e6, 3)
-            if cpu_ns:
-                record.wall.add(ended_ns - taken_ns)
-                if 0 < self._cpu_ns <= cpu_ns:
-                    record.cpu.add(cpu_ns - self._cpu_ns)
-                self._cpu_ns = cpu_ns
-
-    def _announce(self, time_ns: int) -> None:
-        record = self._record
+        if time_ns - self._announced_ns < _ANNOUNCE_EVERY_NS:
+            return
+        record = self.record
         if self._announced_ns:
             passed_ns = time_ns - self._announced_ns
             record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
@@ -104,11 +99,7 @@ class Accounts:
 
 
 class Taking(Attachment[SampleT]):
-    """Takes the samples of a service: the newest, or one after the other.
-
-    Args:
-        name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
-    """
+    """Takes the samples of a service: the newest, or one after the other."""
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None, announce: bool) -> None:
         super().__init__(name, namespace, timeout_s)

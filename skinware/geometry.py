@@ -256,7 +256,9 @@ def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]
-        lines += [f"{key} = {_string(getattr(group, key))}" for key in ("name", "type", "frame") if getattr(group, key)]
+        for key in ("name", "type", "frame"):
+            if text := getattr(group, key):  # JSON escapes as TOML does, but for DEL
+                lines.append(f"{key} = {msgspec.json.encode(text).decode()}".replace("\x7f", "\\u007f"))
         for key in ("radius_m", "confidence"):
             if getattr(group, key) is not None:
                 lines.append(f"{key} = {getattr(group, key)!r}")
@@ -315,8 +317,3 @@ def _empty(n: int) -> Geometry:
 
 def _triples(rows: npt.NDArray[np.float64]) -> tuple[Triple, ...]:
     return tuple((x, y, z) for x, y, z in rows.tolist())
-
-
-def _string(text: str) -> str:
-    """Return a TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
-    return msgspec.json.encode(text).decode().replace("\x7f", "\\u007f")

@@ -53,11 +53,7 @@ class Limits:
     time_ns: int = (1 << 62) - 1
 
     def room(self, size: int) -> int:
-        """Return how many bytes ``size`` bytes may become when they are unpacked.
-
-        Args:
-            size: of the packed data, bytes.
-        """
+        """Return how many bytes so many packed bytes may become."""
         return max(self.always_size, self.ratio * size)
 
     def is_time(self, time_ns: object) -> bool:
@@ -95,15 +91,7 @@ def read_json(data: bytes | memoryview, type_: Any = Any, *, limits: Limits = LI
 
 
 def unpack(data: bytes | memoryview, most: int) -> bytes:
-    """Decompress DEFLATE data that others packed.
-
-    Args:
-        data: with zlib's header.
-        most: bytes that it may become.
-
-    Raises:
-        ValueError: it cannot be decompressed, is incomplete, or becomes larger.
-    """
+    """Decompress zlib's data that others packed; ValueError if they are broken or become larger than this."""
     unpacker = zlib.decompressobj()
     try:
         unpacked = unpacker.decompress(data, most + 1)

@@ -61,11 +61,7 @@ def command(
     context_settings: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a command of a function, with ``-h``, ``--version``, and these examples in its help.
-
-    Args:
-        more: further arguments of ``click.command``.
-    """
+    """Make a command of a function, with ``-h``, ``--version``, these examples in its help, and arguments of click."""
     settings = {**CONTEXT_SETTINGS, **(context_settings or {})}
     made = click.command(name, cls, context_settings=settings, epilog=examples(*lines), **more)
     return lambda function: version_option(made(function))

@@ -41,11 +41,7 @@ def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]
 
 
 def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64], width: int) -> Iterator[str]:
-    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage.
-
-    Args:
-        coverage: (n,) 0 to 1 for each sensor.
-    """
+    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage, 0 to 1."""
     drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
     of_sensor = np.zeros(structure.n_sensors)
     of_sensor[structure.index(type_name)] = coverage
@@ -100,14 +96,7 @@ _WIDTH = 100
 
 
 class Gathering:
-    """Take the snapshots of a driver into a session, and report the progress.
-
-    Args:
-        fresh: begin with nothing, and ignore that file.
-
-    Raises:
-        ConfigurationError: the data of the state file do not fit.
-    """
+    """Take the snapshots of a driver into a session, and report the progress."""
 
     def __init__(
         self,
@@ -129,14 +118,7 @@ class Gathering:
         self._reported = -1.0
 
     def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
-        """Gather until enough sensors have all that is wanted, for a time, or until Enter.
-
-        Gathered data are in the state file afterwards, also after Ctrl-C.
-
-        Args:
-            share: part of the sensors that is enough, 0 to 1.
-            duration_s: longest time after the baselines are known; None: no limit.
-        """
+        """Gather until a share of the sensors has all that is wanted, for a time, or until Enter."""
         gathers = duration_s is None or duration_s > 0
         with self._kept():
             if gathers:
@@ -152,11 +134,7 @@ class Gathering:
             self._show_coverage()
 
     def weigh(self, weight_n: float, duration_s: float, source: ForceSource) -> None:
-        """Ask for a known weight, and gather while it rests. Baselines are measured before, and followed until Enter.
-
-        Args:
-            source: pairs the weight with the temperature.
-        """
+        """Ask for a known weight, and gather while it rests. Baselines are followed until Enter."""
         with self._kept():
             self._wait_for_rest()
             echo(f"lay {weight_n:g} N on the skin, and press Enter", err=True)

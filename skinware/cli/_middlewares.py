@@ -15,9 +15,7 @@ from skinware.cli._terminal import echo, print_json, say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from skinware.ros2.transport import Node, NodeIdentity
+    from skinware.ros2.transport import Node
     from skinware.yarp.names import NameServer
 
 
@@ -130,7 +128,15 @@ def ros2(
         else:
             cli.echo_changes(shown, {name: driver.state for name, driver in drivers.items()})
 
-    with contextlib.closing(_node(rmw, identity, connect, interfaces, report_router)) as node:
+    if rmw == "zenoh":
+        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
+
+        node: Node = ZenohNode(identity, connect=connect or (ROUTER,), router_changed=report_router)
+    else:
+        from skinware.ros2.dds import DdsNode
+
+        node = DdsNode(identity, interfaces)
+    with contextlib.closing(node):
         server = Ros2Server(
             node,
             place,
@@ -146,22 +152,6 @@ def ros2(
             ready = {"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
             say(as_json, ready, f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
             server.run(report)
-
-
-def _node(
-    rmw: str,
-    identity: NodeIdentity,
-    connect: tuple[str, ...],
-    interfaces: tuple[str, ...],
-    router_changed: Callable[[bool, str], None],
-) -> Node:
-    if rmw == "zenoh":
-        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
-
-        return ZenohNode(identity, connect=connect or (ROUTER,), router_changed=router_changed)
-    from skinware.ros2.dds import DdsNode
-
-    return DdsNode(identity, interfaces)
 
 
 @click.command(

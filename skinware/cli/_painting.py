@@ -48,12 +48,7 @@ class Palette:
 
 
 def palette_for(color_system: str | None, *, no_color: bool = False) -> Palette:
-    """Return the palette for a terminal.
-
-    Args:
-        color_system: of the terminal as rich detects it: ``truecolor``, ``256``, ``standard`` (16 colours), None.
-        no_color: the person wants no colours (``NO_COLOR`` is set).
-    """
+    """Return the palette for a terminal, of a colour system as rich detects it."""
     if no_color or color_system is None:
         return CHARACTERS
     return {"truecolor": TRUE_COLOURS, "256": COLOURS_256}.get(color_system, COLOURS_16)
@@ -184,12 +179,7 @@ def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> 
 def segments_of(
     upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label], palette: Palette
 ) -> list[Segment]:
-    """Return one line of a map.
-
-    Args:
-        upper: (columns,) uint8, codes of the pixels in the upper half of the line.
-        lower: (columns,) uint8, codes of the pixels in the lower half.
-    """
+    """Return one line of a map from the codes of its pixels, (columns,) uint8 for each half of the line."""
     pairs = upper.astype(np.uint16) << 8 | lower
     segments: list[Segment] = []
     text, style = "", _PLAIN
@@ -246,11 +236,7 @@ def _character(code: int, palette: Palette) -> str:
 
 
 def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
-    """Return the colours from the lowest level to the highest, with their values.
-
-    Args:
-        values: of the lowest level, of the middle one if it is wanted, and of the highest.
-    """
+    """Return the colours from the lowest level to the highest, with values at both and perhaps in the middle."""
     first, *others = map(figure_text, values)
     text = Text(f"{first} ", no_wrap=True)
     half = LEVELS // len(others)
@@ -266,12 +252,7 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
 
 
 def marks_text(marks: npt.NDArray[np.uint8], reasons: Mapping[str, int], palette: Palette) -> Text:
-    """Return how many sensors are fresh, the other marks that are seen, and the reasons of a calmed driver.
-
-    Args:
-        marks: (n,) uint8, marks of all sensors that are drawn.
-        reasons: how many of them have each; see :func:`skinware.state.count_reasons`.
-    """
+    """Return how many sensors are fresh, the other marks that are seen, and the reasons of a calmed driver."""
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
     text = Text(f"{counts[heat.FRESH]} fresh", no_wrap=True, overflow="ellipsis")
     for mark, name in MARK_NAMES.items():
@@ -355,11 +336,7 @@ class HeatMap(TextLines):
         pixels: npt.NDArray[np.uint8],
         marks: Mapping[int, Sequence[Label]],
     ) -> None:
-        """Draw the lines that changed.
-
-        Args:
-            pixels: (2 * lines, columns) uint8 from ``arrangement.draw``; not changed afterwards.
-        """
+        """Draw the lines that changed; ``pixels`` of ``arrangement.draw`` are not changed afterwards."""
         before = self._pixels if arrangement is self._arrangement else None
         moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}
         self._arrangement, self._pixels, self._marks = arrangement, pixels, marks

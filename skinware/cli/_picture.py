@@ -109,11 +109,7 @@ class Picture:
         self._levels = None
 
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
-        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts.
-
-        Args:
-            life: what the driver is doing; nothing is fresh where no news comes.
-        """
+        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts; ``life`` says whether news comes."""
         structure = frame.structure
         sensor_type, physical = self.type_in(structure), physical_values(frame)
         memory = self._memories.get(key.driver)

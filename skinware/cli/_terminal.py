@@ -33,11 +33,7 @@ _AT_THE_END_S = 1.0
 
 
 class PatientStream(io.TextIOBase):
-    """Accept text at once, and write it when the reader takes it.
-
-    Attributes:
-        left_out: writes that were left out because too much text waited.
-    """
+    """Accept text at once, and write it when the reader takes it; too much text is left out, and counted."""
 
     def __init__(self, stream: TextIO) -> None:
         self._own_fd: int | None = None  # first: Python also closes a stream that could not be made

@@ -116,16 +116,7 @@ class _BlankScreen(Screen[None]):
 
 
 class SkinTop(App[None]):
-    """Show drivers, buses and patches, and a picture of the sensors under the cursor.
-
-    Args:
-        type_name: type of sensors to draw first; default: each driver's first.
-        duration_s: end after this time; None: only by a key or signal.
-        scale_name: the first meaning of the colours: ``change``, ``range`` or ``raw``.
-        palette: default: the best that the terminal can show.
-        regions: that a person may choose from; None: there are none.
-        region: draw only sensors in this one at first; None: all.
-    """
+    """Show drivers, buses and patches, and a picture of the sensors under the cursor."""
 
     TITLE = "skin-top"
     ENABLE_COMMAND_PALETTE = False

@@ -16,8 +16,6 @@ from skinware.cli._terminal import echo, print_json, say
 from skinware.cli._viewers import foxglove, rerun
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from skinware.bridge_state import BridgeState
 
 _PORT = 7448
@@ -201,20 +199,6 @@ def _show_event(event: dict[str, Any]) -> None:
         echo(f"{event['service']}: {_MODES[event['mode']]}")
     else:
         echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
-
-
-def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
-    from skinware.bridge_state import as_data
-
-    shown: dict[str, str] = {}
-
-    def report(bridge: BridgeState) -> None:
-        if as_json:
-            print_json({"event": "status"} | as_data(bridge))
-            return
-        cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
-
-    return report
 
 
 main = partial(cli.run, command, goes_on=True)

@@ -98,11 +98,7 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
 
 
 def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
-    """Return the report for people, as lines with colours; on a terminal no line is wider than it.
-
-    Args:
-        brief: patches of a bus without problems share a line.
-    """
+    """Return the report for people, with colours, no wider than the terminal; brief: good patches share a line."""
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
     if not drivers and not services:

@@ -61,11 +61,7 @@ class Schema:
 
     @staticmethod
     def of(columns: Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]], description: str) -> Schema:
-        """Return a schema from what a person wrote.
-
-        Raises:
-            ConfigurationError: a dtype or shape that cannot be shared.
-        """
+        """Return a schema from what a person wrote; refuse dtypes and shapes that cannot be shared."""
         made: dict[str, Column] = {}
         for name, given in columns.items():
             column = given if isinstance(given, Column) else Column(np.dtype(given[0]), _shape(given[1]))
@@ -114,11 +110,7 @@ class _SchemaText(msgspec.Struct):
 
 
 def from_file(layout: FileLayout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
-    """Return the schema of an attached file.
-
-    Raises:
-        BadServiceFile: its schema contradicts its column table, or cannot be read.
-    """
+    """Return the schema of an attached file, if it can be read and agrees with the column table."""
     columns = {c.name: Column(c.dtype, (c.count,)) for c in layout.slot}
     if STATIC_NAME not in static:
         return Schema(columns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
 import secrets
@@ -104,14 +103,6 @@ class Segment:
         futex.Word(self.data, file_layout.WAKE_WORD_OFFSET).wake_all()
 
 
-def previous(namespace: Namespace, name: str) -> Segment | None:
-    """Return the generation that a dead writer left, None if none is left that anybody can be attached to."""
-    try:
-        return attach(namespace, name, writable=True)
-    except (ServiceNotFound, BadServiceFile):
-        return None
-
-
 def create(
     namespace: Namespace,
     name: str,
@@ -177,12 +168,6 @@ def publish(segment: Segment, namespace: Namespace, name: str) -> None:
     segment.path = str(final)
 
 
-def discard(segment: Segment) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(segment.path)
-    segment.close()
-
-
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
     """Return a writable map through an open file of its own.
 
@@ -197,13 +182,7 @@ def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
 
 
 def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segment:
-    """Map the present generation of a service after checking everything that is mapped.
-
-    Raises:
-        ServiceNotFound: there is none.
-        BadServiceFile: the file is not one that can be read safely.
-        NamespaceError: the namespace cannot be trusted or read, or this program has no descriptors or memory left.
-    """
+    """Map the present generation of a service after checking everything that is mapped."""
     if not namespace.exists():
         raise ServiceNotFound(_not_found(namespace, name))
     owner = namespace.check()

@@ -32,15 +32,7 @@ class Library:
 
 @functools.cache
 def load(file: Path, abi: int) -> Library:
-    """Load a library of this package, once for the process.
-
-    Args:
-        file: beside the module that calls it.
-        abi: what its ``skinware_native_abi`` has to return.
-
-    Raises:
-        PlatformError: it is missing, cannot be loaded, or was compiled from other sources.
-    """
+    """Load a library of this package once for the process, if its ``skinware_native_abi`` returns this number."""
     try:
         file.stat()
         library = Library(ctypes.CDLL(str(file)), ctypes.PyDLL(str(file)))

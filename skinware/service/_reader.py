@@ -288,21 +288,12 @@ class Tap(ServiceReader[SampleT]):
         return self._last
 
     def begin_in_order(self, *, with_first: bool) -> None:
-        """Read in order from now on.
-
-        Args:
-            with_first: begin with the first sample of the generation at hand, otherwise with the one that is its newest
-                now. Samples that are overwritten before they are taken are missed.
-        """
+        """Read in order from now on, from the first sample of the generation at hand, or else from its newest."""
         self._accounts.begin_loop("in order")
         self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
 
     def next_in_order(self) -> SampleT | None:
-        """Return the sample after the last one taken, over generations; None if it is not there yet. Never wait.
-
-        Raises:
-            StructureChanged, Overrun, Closed: as ``in_order``.
-        """
+        """Return the sample after the last one taken, over generations; None if it is not there yet. Never wait."""
         try:
             return self._read_in_order(0)
         except ServiceTimeout:

@@ -169,12 +169,7 @@ class RequestServer(ForkGuard):
         return -1 if self._epoll.closed else self._epoll.fileno()
 
     def take(self, timeout_s: float = 0.0, *, at_most: int | None = None) -> list[Request]:
-        """Return the requests that have arrived, as many as fit into one turn.
-
-        Args:
-            timeout_s: longest wait for one.
-            at_most: no more than these, though the turn is not over.
-        """
+        """Return the requests that have arrived, as many as fit into one turn; wait for the first."""
         found: list[Request] = []
         wait_until_ns = now_ns() + round(timeout_s * NS_PER_S)
         self._bytes_left, end_ns = _TURN_BYTES, 0

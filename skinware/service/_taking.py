@@ -248,14 +248,7 @@ class Taking(Attachment[SampleT]):
     def _take_turn(
         self, wanted: int, timeout_ns: int, max_age_s: float | None = None, newer_than: Position | None = None
     ) -> SampleT:
-        """Return the next sample after ``newer_than`` (default: the last one taken).
-
-        C takes it, as long as nothing but samples happens since the last one.
-
-        Args:
-            wanted: ``NEWER`` for the newest, or ``NEXT``.
-            max_age_s: as for ``read``.
-        """
+        """Return the sample after ``newer_than`` or the last one taken; C takes it while only samples come."""
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:
             ring = self._ring
@@ -263,7 +256,7 @@ class Taking(Attachment[SampleT]):
                 frames = ring.take.next(wanted, timeout_ns)
                 if frames:
                     return frames[0]
-                begun_ns = ring.take.begun_ns
+                begun_ns = ring.take.state_in_c.begun_ns
         deadline_ns = (begun_ns or now_ns()) + timeout_ns
         if wanted == NEXT:
             frame = self._read_in_order(deadline_ns)

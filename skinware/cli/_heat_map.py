@@ -28,18 +28,7 @@ BACKGROUND = 255
 _HOLD = 0.75
 """A level stays while the value is within this many levels of its middle, so that noise on an edge does not flicker."""
 _LABEL_ROOM = 2
-_SIZES = (
-    (8, _LABEL_ROOM),
-    (8, 0),
-    (6, _LABEL_ROOM),
-    (6, 0),
-    (4, _LABEL_ROOM),
-    (4, 0),
-    (2, _LABEL_ROOM),
-    (2, 0),
-    (1, _LABEL_ROOM),
-    (1, 0),
-)
+_SIZES = tuple((zoom, room) for zoom in (8, 6, 4, 2, 1) for room in (_LABEL_ROOM, 0))
 """Zooms, and pixels above a block for the name of its module; the first that fits is used."""
 _LONGEST_NAME = 16
 _NAMES_FROM_WIDTH = 48

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeVar
 
@@ -127,13 +127,7 @@ COLOURS_16 = Palette(
     no_value=_BASIC["red"],
     settling=_BASIC["grey"],
 )
-CHARACTERS = Palette(
-    ramp=TRUE_COLOURS.ramp,
-    stale=TRUE_COLOURS.stale,
-    no_value=TRUE_COLOURS.no_value,
-    settling=TRUE_COLOURS.settling,
-    characters="".join(_spread("▁▂▃▄▅▆▇█")),
-)
+CHARACTERS = replace(TRUE_COLOURS, characters="".join(_spread("▁▂▃▄▅▆▇█")))
 
 
 MARK_CHARACTERS = {

@@ -125,7 +125,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
     untouched = sum(patch["untouched"] for patch in driver["patch_list"])
-    columns = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
+    columns = [title for title in ("reason", "for", "load") if any(_columns_of(bus)[title] for bus in driver["buses"])]
     timed = _TIMES_OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
     timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     samples = [
@@ -140,7 +140,11 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         *_counter_table(
             driver["buses"],
             ("bus", "state", *columns),
-            lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in columns.values())),
+            lambda bus: (
+                bus["name"],
+                _state(driver, bus),
+                *(_columns_of(bus)[title] or NO_VALUE for title in columns),
+            ),
             {"frames", "dropped"},
         ),
         *(["", *table(("bus", "not used", "for example"), samples, left=3)] if samples else []),
@@ -240,18 +244,15 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     return state_shown(part["state"], part["fresh"], part["sensors"]) if "fresh" in part else part["state"]
 
 
-def _load(bus: dict[str, Any]) -> str | None:
-    if bus.get("load_unknown") == "filter":
-        return "unknown (filter)"
-    return None if bus.get("load") is None else f"{100 * bus['load']:.0f} %"
-
-
-_OF_A_BUS: dict[str, Callable[[dict[str, Any]], str | None]] = {
-    "reason": lambda bus: (bus.get("reason") or "").replace("_", "-"),
-    "for": lambda bus: None if bus.get("state_age_s") is None else age_text(bus["state_age_s"] * 1e9),
-    "load": _load,
-}
-"""Columns of a bus that are shown where any bus has a text for them."""
+def _columns_of(bus: dict[str, Any]) -> dict[str, str]:
+    """Return the texts of a bus that are shown where any bus has one."""
+    age_s, load = bus.get("state_age_s"), bus.get("load")
+    load_text = "" if load is None else f"{100 * load:.0f} %"
+    return {
+        "reason": (bus.get("reason") or "").replace("_", "-"),
+        "for": "" if age_s is None else age_text(age_s * 1e9),
+        "load": "unknown (filter)" if bus.get("load_unknown") == "filter" else load_text,
+    }
 
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:

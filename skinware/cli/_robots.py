@@ -168,7 +168,27 @@ def _report(robots: Sequence[Seen]) -> dict[str, Any]:
         for seen in robots
         if seen.guard.count
     ]
-    return {"event": "status", "robots": [_report_of(seen) for seen in robots], "problems": problems}
+    entries = []
+    for seen in robots:
+        told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
+        clock = {
+            "offset_ms": seen.clock.offset_ns(now_ns()) / 1e6,
+            "error_ms": seen.clock.error_ns / 1e6,
+            "round_trip_ms": seen.clock.round_trip_ns / 1e6,
+        }
+        entry = {
+            "robot": seen.robot,
+            "instance": seen.instance,
+            "version": seen.version,
+            "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
+            "told_s": told_s,
+            "bytes": seen.bytes,
+            "refused": seen.guard.count,
+            "last_refused": seen.guard.last or None,
+            "clock": clock if seen.clock.is_known else None,
+        }
+        entries.append(entry | ({} if seen.summary is None else msgspec.to_builtins(seen.summary)))
+    return {"event": "status", "robots": entries, "problems": problems}
 
 
 def _as_text(found: dict[str, Any]) -> list[str]:
@@ -178,29 +198,6 @@ def _as_text(found: dict[str, Any]) -> list[str]:
     if rows:
         lines += table(_TITLES, rows, left=3, width=terminal_width())
     return [*lines, *(style("problem: ", fg="red") + text for text in found["problems"])]
-
-
-def _report_of(seen: Seen) -> dict[str, Any]:
-    told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
-    summary, clock = seen.summary, seen.clock
-    return {
-        "robot": seen.robot,
-        "instance": seen.instance,
-        "version": seen.version,
-        "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
-        "told_s": told_s,
-        "bytes": seen.bytes,
-        "refused": seen.guard.count,
-        "last_refused": seen.guard.last or None,
-        "clock": {
-            "offset_ms": clock.offset_ns(now_ns()) / 1e6,
-            "error_ms": clock.error_ns / 1e6,
-            "round_trip_ms": clock.round_trip_ns / 1e6,
-        }
-        if clock.is_known
-        else None,
-        **({} if summary is None else msgspec.to_builtins(summary)),
-    }
 
 
 def _rows_of(robot: dict[str, Any], has_namesakes: bool) -> list[tuple[str, ...]]:

@@ -196,6 +196,7 @@ class RingReader(Generic[SampleT]):
         self._half_words = segment.data.data.cast("I")
         self.wake_word: futex.Word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
         self._slots = slots_of(segment)
+        self.slot_count: int = len(self._slots)
         self._slot_words = slot_headers_of(segment)
         self.state_in_c = ReaderState.of(segment)
         self.state_in_c.descriptor, self.state_in_c.writer = segment.descriptor.fd, segment.maker.fd_for_c
@@ -206,10 +207,6 @@ class RingReader(Generic[SampleT]):
     def latest(self) -> int:
         """Sequence of the newest sample, 0 before the first."""
         return self.words[LATEST]
-
-    @property
-    def slot_count(self) -> int:
-        return len(self._slots)
 
     @property
     def state(self) -> int:
@@ -239,7 +236,7 @@ class RingReader(Generic[SampleT]):
             )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
-            f"give the service more slots (it has {len(self._slots)}) or publish less often"
+            f"give the service more slots (it has {self.slot_count}) or publish less often"
         )
 
     def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> None:
@@ -278,8 +275,8 @@ class RingReader(Generic[SampleT]):
         """Return (sequence, ``PUBLISHED`` or ``ACQUIRED`` time) of the samples in the ring, oldest first."""
         times = []
         latest = self.latest
-        for sequence in range(max(1, latest - len(self._slots) + 2), latest + 1):
-            words = self._slot_words[sequence % len(self._slots)]
+        for sequence in range(max(1, latest - self.slot_count + 2), latest + 1):
+            words = self._slot_words[sequence % self.slot_count]
             time_ns = words[word]
             fence()
             if words[SEQUENCE] == sequence:
@@ -292,7 +289,7 @@ class RingReader(Generic[SampleT]):
             wanted = self.latest
             if wanted == 0:
                 return None
-            slot = wanted % len(self._slots)
+            slot = wanted % self.slot_count
             frame = self.frame_class(self, self._slots[slot], in_ring=self._slot_words[slot])
             if frame.sequence == wanted and frame.valid:
                 return frame

@@ -35,7 +35,7 @@ class Accounts:
         self._record = ReaderRecord(service, os.getpid(), program, "on demand")
         self._namespace, self._announce_it = namespace, announce
         self._announcement: Announcement | None = None
-        self._announced_ns = self._announced_frames = 0
+        self._announced_ns = self._announced_frames = self.due_ns = 0
         self._in_loop = False
         self._turns: list[Turn] = []
         self._cpu_ns = 0
@@ -66,10 +66,6 @@ class Accounts:
         if missed:
             self._record.missed += missed
 
-    @property
-    def due_ns(self) -> int:
-        return self._announced_ns + _ANNOUNCE_EVERY_NS
-
     def settle(self, turns: Turns) -> None:
         self._record.frames += turns.frames
         self._record.missed += turns.missed
@@ -80,7 +76,7 @@ class Accounts:
         time_ns = now_ns()
         if turn is not None:
             self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
-        if time_ns - self._announced_ns < _ANNOUNCE_EVERY_NS:
+        if time_ns < self.due_ns:
             return
         record = self.record
         if self._announced_ns:
@@ -91,6 +87,7 @@ class Accounts:
                 self._announcement = Announcement(self._namespace, record.service)
             self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, record.frames
+        self.due_ns = time_ns + _ANNOUNCE_EVERY_NS
 
     def close(self) -> None:
         self._announce_it = False

@@ -133,11 +133,7 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     watch = ZeroWatch
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hand of the option ``model``, or of the frames that are heard.
-
-        Raises:
-            BusError: no hand is heard, or two.
-        """
+        """Return the hand of the option ``model``, or of the frames that are heard."""
         model = self.options.model
         of_tips = [Match(one) for ids in TIPS.values() for one in ids]
         with link.follow(*of_tips) as frames:

@@ -55,13 +55,7 @@ class SdoClient:
         self._busy = asyncio.Lock()
 
     async def read(self, index: int, subindex: int = 0) -> bytes:
-        """Return the bytes of an object.
-
-        Raises:
-            SdoAborted: the device refuses.
-            HandshakeTimeout: no answer.
-            BusSendError: as ``Link.send``.
-        """
+        """Return the bytes of an object."""
         target = struct.pack("<HB", index, subindex)
         async with self._busy:
             answer = await self._ask(target, bytes([sdo.REQUEST_UPLOAD]) + target + bytes(4), sdo.RESPONSE_UPLOAD)
@@ -194,9 +188,6 @@ class PdoMap:
 
     Args:
         default_type: type of objects whose name contains none.
-
-    Raises:
-        ConfigurationError: no mapped object is a number, or sensors of one type differ in scale.
     """
 
     def __init__(self, dictionary: ObjectDictionary, nodes: Mapping[int, Sequence[Tpdo]], default_type: str) -> None:

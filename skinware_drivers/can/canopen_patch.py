@@ -133,11 +133,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         return await self._is_there(patch.key)
 
     async def revive(self, link: Link, patch: Patch) -> None:
-        """Set up and start one node.
-
-        Raises:
-            MappingChanged: its TPDOs have changed.
-        """
+        """Set up and start one node."""
         if await self._read_tpdos(patch.key) != self._tpdos[patch.key]:
             log.error("%s: the TPDOs of %s have changed: start the driver again", link.bus_name, patch.name)
             raise MappingChanged(f"{patch.name}: other TPDOs than before")

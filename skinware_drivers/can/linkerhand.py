@@ -123,11 +123,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         ]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hands that answer, or whose touch is heard.
-
-        Raises:
-            BusError: there is no hand, no touch that can be read, or the hands differ.
-        """
+        """Return the hands that answer, or whose touch is heard."""
         found = await self._find(link, self._wanted)
         if not found:
             names = ", ".join(map(identifier_text, self._wanted))
@@ -181,11 +177,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return self.options.ask and not link.listen_only
 
     def _take(self, found: Mapping[int, _Found]) -> None:
-        """Describe these hands.
-
-        Raises:
-            BusError: they have different kinds of touch.
-        """
+        """Describe these hands."""
         if len({of.touch for of in found.values()}) > 1:
             kinds = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
             raise BusError(
@@ -232,11 +224,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return found
 
     async def _ask_hand(self, link: Link, hand: int) -> _Found | None:
-        """Return the kind of touch for which this hand answers; None if it does not answer.
-
-        Raises:
-            BusError: it has no touch that can be read.
-        """
+        """Return the kind of touch for which this hand answers; None if it does not answer."""
         names: Sequence[str] = (self.options.touch,)
         if self.options.touch == "auto":
             names = await self._likely(link, hand)

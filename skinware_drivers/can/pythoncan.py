@@ -80,12 +80,7 @@ class PythonCanBus(Bus):
         self._echoes: deque[tuple[int, int, bytes]] = deque()  # of sent frames: time, identifier, payload
 
     def open(self) -> None:
-        """Open the interface and start taking its messages.
-
-        Raises:
-            ConfigurationError: the interface refuses one of the options (the first time only).
-            BusNotAvailable: the interface's library, adapter or channel is missing.
-        """
+        """Open the interface and start taking its messages."""
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
         if self.payload_size > 8:
             keywords.setdefault("fd", True)
@@ -232,11 +227,7 @@ class _MessageQueue:
         os.close(self.fd)
 
     def _take_all(self) -> None:
-        """Take messages. One that the library refuses is counted, unless all that follow are refused, too.
-
-        Raises:
-            Exception: of the library, when its interface has failed.
-        """
+        """Take messages. One that the library refuses is counted, unless all that follow are refused, too."""
         failures = 0
         while not self._closing.is_set():
             try:

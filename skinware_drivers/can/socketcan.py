@@ -104,11 +104,7 @@ class SocketCanBus(KernelBus):
         self._speed_up = 1.0
 
     def open(self) -> None:
-        """Open and bind the socket.
-
-        Raises:
-            BusNotAvailable: no CAN in the kernel, no such interface, not a CAN interface, down, or not permitted.
-        """
+        """Open and bind the socket."""
         try:
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -296,11 +292,7 @@ class SocketCanBus(KernelBus):
             self.counters.bus_offs = self._health.bus_offs
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of frames; return 0 if more frames may come.
-
-        Raises:
-            BusNotAvailable: the interface went down or away.
-        """
+        """Interpret an error of the kernel in the place of frames; return 0 if more frames may come."""
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:

@@ -188,9 +188,6 @@ class CompiledLayouts:
         alone: by number of its kind, what reads a frame that is an update by itself.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
         header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.
-
-    Raises:
-        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(

@@ -170,9 +170,6 @@ class Decoder:
         last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
-
-    Raises:
-        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(

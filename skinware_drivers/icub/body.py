@@ -54,11 +54,7 @@ def is_drawing(text: str) -> bool:
 
 
 def read_drawing(path: Path, notes: Notes) -> Drawing:
-    """Read a drawing; note lines that are not understood.
-
-    Raises:
-        ConfigurationError: the file is not a drawing.
-    """
+    """Read a drawing; note lines that are not understood."""
     text = read_text(path)
     if not is_drawing(text):
         raise ConfigurationError(f"{path}: not a drawing of skinGui: it has no robotPart and [SENSORS]")

@@ -44,11 +44,7 @@ class DeviceReader:
         self._seen: set[int] = set()
 
     def devices(self, path: Path) -> Iterator[Element]:
-        """Return the elements ``device`` of a file and its included files, without those found before.
-
-        Raises:
-            ConfigurationError: the file itself is not XML.
-        """
+        """Return the elements ``device`` of a file and its included files, without those found before."""
         root = self._read(path)
         if root.tag != "params":  # parameters belong to the including element
             yield from self._devices(root, [path.resolve()])

@@ -55,20 +55,12 @@ def is_positions(text: str) -> bool:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file; bytes that are not UTF-8 are kept as signs.
-
-    Raises:
-        ConfigurationError: the file cannot be read.
-    """
+    """Read a text file; bytes that are not UTF-8 are kept as signs."""
     return read_bytes(path).decode("utf-8", "replace")
 
 
 def read_positions(path: Path, notes: Notes) -> Positions:
-    """Read a position file; note oddities.
-
-    Raises:
-        ConfigurationError: the file is not a position file.
-    """
+    """Read a position file; note oddities."""
     text = read_text(path)
     head, mark, body = text.partition(_CALIBRATION)
     found = _REPRESENTATIVES.search(head)

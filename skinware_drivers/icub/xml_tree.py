@@ -68,11 +68,7 @@ def words(text: str) -> list[str]:
 
 
 def number(text: str) -> int:
-    """Return a whole number as these files write it.
-
-    Raises:
-        ValueError: the text is not a whole number.
-    """
+    """Return a whole number as these files write it."""
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
         raise ValueError(f"{text[:20]!r} is not a whole number")
     try:
@@ -173,11 +169,7 @@ class Element:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read an ordinary file that is not too large.
-
-    Raises:
-        ConfigurationError: the file is not one.
-    """
+    """Read an ordinary file that is not too large."""
     try:
         if not path.is_file():
             raise ConfigurationError(f"{path}: not there, or not an ordinary file")
@@ -193,11 +185,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_xml(path: Path, notes: Notes) -> Element:
-    """Return the root element of a file.
-
-    Raises:
-        ConfigurationError: the file does not exist, is not XML, or defines entities; the message says where.
-    """
+    """Return the root element of a file."""
     return _TreeBuilder(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
 
 

@@ -59,11 +59,7 @@ class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    """Make the device's end, for emulators: a bus of bytes, which they take apart themselves.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
-    """
+    """Make the device's end, for emulators: a bus of bytes, which they take apart themselves."""
     if channel.startswith(_TCP):
         address = parse_address("modbus:tcp", channel.removeprefix(_TCP), default_port=DEFAULT_PORT, needs_host=False)
         return TcpServerBus(str(address), options, **more)
@@ -83,9 +79,6 @@ class ModbusBus(KernelBus):
 
     Args:
         channel: ``tcp://HOST[:PORT]``, or the path of a port.
-
-    Raises:
-        ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
     """
 
     medium: ClassVar[str] = "modbus"
@@ -152,9 +145,6 @@ class ModbusBus(KernelBus):
 
         Args:
             turnaround_s: pause after a reply; None: that of the standard on a serial line, none over TCP.
-
-        Raises:
-            ConfigurationError: a serial line has no unit 0.
         """
         self._baudrate = baudrate if self._address is not None else self._serial_options.baudrate or baudrate
         if turnaround_s is None:
@@ -187,12 +177,7 @@ class ModbusBus(KernelBus):
         return characters * _BITS_PER_CHARACTER / (self._serial_options.baudrate or baudrate)
 
     def open(self) -> None:
-        """Connect, or open the line for us alone.
-
-        Raises:
-            BusNotAvailable: it is missing, not permitted or taken; the message says what to do.
-            ConfigurationError: no such kind of port, or it has no such baud rate.
-        """
+        """Connect, or open the line for us alone."""
         if self._epoll is not None:
             return
         self._port = port = self._open_port()
@@ -242,11 +227,7 @@ class ModbusBus(KernelBus):
         return -1 if epoll is None else epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Take replies, ask what is due, and append the frames that are whole.
-
-        Raises:
-            BusNotAvailable: the port went away, or sends no Modbus.
-        """
+        """Take replies, ask what is due, and append the frames that are whole."""
         port, talk = self._port, self._talk
         if port is None or talk is None:
             raise BusNotAvailable(f"{self!r} is not open")
@@ -314,9 +295,6 @@ class ModbusBus(KernelBus):
         Args:
             identifier: the unit.
             payload: function and data of a read or write of registers.
-
-        Raises:
-            BusSendError: the bus is closed or only listens, too many messages wait, or this is no read or write.
         """
         self.may_send_by(self._port)
         message = wire.Message(identifier, payload)

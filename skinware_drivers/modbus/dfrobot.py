@@ -46,12 +46,6 @@ _MODELS: Mapping[int, Shape] = {0: "4x8", 1: "6x6"}
 
 
 class DfrobotOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or there are not as many shapes as units.
-    """
-
     units: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=31)], ...], Meta(min_length=1, description="numbers of the arrays")
     ] = (1,)
@@ -105,11 +99,7 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask each array for its shape, unless the options give it.
-
-        Raises:
-            BusError: an array does not answer, reports an unknown shape, or must not be asked.
-        """
+        """Ask each array for its shape, unless the options give it."""
         units, shapes = self.options.units, list(self.options.shapes)
         if not shapes:
             if link.listen_only:

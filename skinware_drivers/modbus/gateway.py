@@ -48,12 +48,7 @@ class _Program(Guest):
         return (0 if is_full else select.EPOLLIN) | (select.EPOLLOUT if self._unsent else 0)
 
     def questions(self, time_ns: int) -> list[Message]:
-        """Read the questions that have come.
-
-        Raises:
-            BusNotAvailable: the program has gone.
-            ValueError: it sends no Modbus.
-        """
+        """Read the questions that have come."""
         chunk, messages = self.port.read(_CHUNK), self._messages
         if isinstance(messages, wire.TcpMessages):
             return list(messages.feed(chunk))
@@ -83,9 +78,6 @@ class Gateway:
     Args:
         places: ``PORT`` or ``HOST:PORT`` for Modbus TCP, or a path for a serial port, separated by commas.
         is_public: other machines may reach it.
-
-    Raises:
-        ConfigurationError: there is no such place, or other machines could reach it without ``is_public``.
     """
 
     def __init__(self, places: str, guests: Guests, *, is_public: bool) -> None:
@@ -98,11 +90,7 @@ class Gateway:
         self.note = ""
 
     def open(self) -> None:
-        """Begin to listen.
-
-        Raises:
-            BusNotAvailable: a place cannot be used, for example because another program listens at that port.
-        """
+        """Begin to listen."""
         self._epoll = select.epoll()
         try:
             for address in self._addresses:

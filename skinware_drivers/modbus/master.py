@@ -51,11 +51,7 @@ class Talk(ABC):
 
     @abstractmethod
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Take bytes that have come.
-
-        Raises:
-            ValueError: they are no Modbus, and bytes that follow could not be understood either.
-        """
+        """Take bytes that have come."""
 
     @abstractmethod
     def say(self, time_ns: int) -> bytes:

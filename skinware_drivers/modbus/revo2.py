@@ -244,11 +244,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand for its side and edition; while only listening, use the options.
-
-        Raises:
-            BusError: it does not answer, or has no sensors that this driver reads.
-        """
+        """Ask the hand for its side and edition; while only listening, use the options."""
         options, side = self.options, self.options.side
         if not link.listen_only:
             self._unit = await self._find_unit(link)

@@ -135,12 +135,6 @@ def places(mapping: str, side: str, pad: int, count: int) -> tuple[Grid, Sequenc
 
 
 class Revo3Options(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or ``points`` are not eleven numbers.
-    """
-
     side: Annotated[_Side | None, Meta(description="which hand it is; default: ask the hand")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
@@ -212,11 +206,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand for the form of its data, then measure how long it needs for all of them.
-
-        Raises:
-            BusError: it does not answer, sends data that this driver does not read, or must not be asked.
-        """
+        """Ask the hand for the form of its data, then measure how long it needs for all of them."""
         options, side = self.options, self.options.side
         if link.listen_only:
             if options.mapping is None:

@@ -62,11 +62,7 @@ class Message(NamedTuple):
 
 
 def question_to_read(function: int, address: int, count: int) -> bytes:
-    """Return the question for registers.
-
-    Raises:
-        ValueError: there is no such question.
-    """
+    """Return the question for registers."""
     if function not in READS or not 1 <= count <= MOST_REGISTERS or not 0 <= address <= 0xFFFF:
         raise ValueError(f"function {function}, {count} registers from {address}: there is no such question")
     return struct.pack(">BHH", function, address, count)
@@ -158,11 +154,7 @@ class TcpMessages(_Messages):
     """Find the messages in the bytes of a connection."""
 
     def feed(self, chunk: bytes) -> Iterator[Message]:
-        """Yield the messages that a chunk completes.
-
-        Raises:
-            ValueError: the bytes are no Modbus, and no later message can be found either.
-        """
+        """Yield the messages that a chunk completes."""
         self._counters.bytes_in += len(chunk)
         self._rest += chunk
         while len(self._rest) >= _MBAP.size:

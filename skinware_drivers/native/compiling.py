@@ -24,11 +24,7 @@ _SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
 
 
 def check_values(frame: Frame) -> None:
-    """Refuse values that the data path cannot read together.
-
-    Raises:
-        ConfigurationError: the message has a remedy.
-    """
+    """Refuse values that the data path cannot read together."""
     dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
     kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
     unknown = next((dtype for dtype in dtypes if dtype.str[1:] not in _TYPES), None)
@@ -44,11 +40,7 @@ def check_values(frame: Frame) -> None:
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
-    """Fill in the part of a plan that is about frames and updates.
-
-    Raises:
-        ConfigurationError: a frame has values that C does not read.
-    """
+    """Fill in the part of a plan that is about frames and updates."""
     compiled, structure, state = decoder.compiled, decoder.tables.structure, decoder.state
     addresses = compiled.addresses
     for frame in compiled.frames:

@@ -45,11 +45,7 @@ class Arrays:
         self._kept: list[object] = []
 
     def at(self, array: npt.NDArray[Any]) -> int:
-        """Return the address of an array that Python goes on using.
-
-        Raises:
-            ValueError: its elements do not lie one after the other.
-        """
+        """Return the address of an array that Python goes on using."""
         if not array.flags.c_contiguous:
             raise ValueError(f"an array of {array.shape} {array.dtype} whose elements lie apart")
         self._kept.append(array)

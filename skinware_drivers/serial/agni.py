@@ -47,12 +47,6 @@ _ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unkno
 
 
 class AgniOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     period_ms: Annotated[
         int, Meta(ge=0, le=_LONGEST_MS, description="time between two messages; 0: leave the device's own")
     ] = 0
@@ -92,11 +86,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self.dtype = np.dtype(options.values).newbyteorder("=")
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the device for its sensors; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the device for its sensors; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a device reports the length of its messages only on request: listening is not enough")
         if self._patch is not None:

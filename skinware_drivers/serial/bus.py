@@ -38,9 +38,6 @@ class SerialBus(KernelBus):
     Args:
         channel: path or URL; empty if the options name a USB device.
         payload_size: bytes of the longest body that fits into a batch; longer ones are counted as refused.
-
-    Raises:
-        ConfigurationError: an option is unknown or has a bad value.
     """
 
     medium: ClassVar[str] = "serial"
@@ -88,12 +85,7 @@ class SerialBus(KernelBus):
         self._restart()
 
     def open(self) -> None:
-        """Open the port exclusively, raw, with empty buffers.
-
-        Raises:
-            BusNotAvailable: missing, not permitted or taken; the message says what to do.
-            ConfigurationError: no such kind of port, or it has no such baud rate.
-        """
+        """Open the port exclusively, raw, with empty buffers."""
         if self._port is not None:
             return
         port = self._open_port()
@@ -115,11 +107,7 @@ class SerialBus(KernelBus):
         return -1 if self._epoll is None else self._epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that have arrived, at most ``batch.free``; if others remain, the bus stays readable.
-
-        Raises:
-            BusNotAvailable: the port went away, or must be opened again before frames can be found.
-        """
+        """Append the frames that have arrived, at most ``batch.free``; if others remain, the bus stays readable."""
         if self._port is None:
             raise BusNotAvailable(f"{self!r} is not open")
         if self._unsent:
@@ -162,21 +150,13 @@ class SerialBus(KernelBus):
         self._judge(now_ns())
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of bytes; return 0 if more may come.
-
-        Raises:
-            BusNotAvailable: the port went away.
-        """
+        """Interpret an error of the kernel in the place of bytes; return 0 if more may come."""
         if self._handed is None:
             return 0
         raise self._handed[1].gone(number)
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; bytes that the port does not take at once follow later.
-
-        Raises:
-            BusSendError: closed, opened to listen only, no such frame, or the port takes no more bytes.
-        """
+        """Send one frame; bytes that the port does not take at once follow later."""
         try:
             self._send(identifier, payload)
         except BusSendError:

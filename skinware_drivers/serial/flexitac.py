@@ -46,12 +46,6 @@ _FRAME = "pad_nominal"
 
 
 class FlexiTacOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     size: Annotated[
         str, Meta(pattern=r"^(\d{1,2}x\d{1,2})?$", description="ROWSxCOLUMNS, as 12x32; default: by listening")
     ] = ""
@@ -104,11 +98,7 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return -(-self._hearing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Listen for the number of cells.
-
-        Raises:
-            BusError: no matrix is heard, its size is unknown, or another than the option's.
-        """
+        """Listen for the number of cells."""
         self._heard = None
         self._heard = heard = await self.hear_size(link)
         rows, columns = self._agreed(link, heard)
@@ -137,11 +127,7 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return False
 
     async def hear_size(self, link: Link) -> HeardSize:
-        """Listen for a matrix and return its size.
-
-        Raises:
-            HandshakeTimeout: no matrix is heard.
-        """
+        """Listen for a matrix and return its size."""
         self.change_framing(self._hearing)
         try:
             with link.follow(Match(0, 0)) as heard:

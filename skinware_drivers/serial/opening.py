@@ -41,12 +41,7 @@ class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def find_port(channel: str, options: SerialOptions) -> str:
-    """Return the present path or URL: a USB device may have another path than the last time.
-
-    Raises:
-        BusNotAvailable: no such device is plugged in, or several are.
-        ConfigurationError: no port is named, or path and USB device are.
-    """
+    """Return the present path or URL: a USB device may have another path than the last time."""
     if not options.serial_number and not options.vid_pid:
         if not channel:
             raise ConfigurationError("which serial port? serial:/dev/ttyUSB0, or serial:?serial_number=...")
@@ -80,10 +75,6 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
 
     Args:
         baudrate: bits per second.
-
-    Raises:
-        BusNotAvailable: missing, not permitted, taken, or no serial port.
-        ConfigurationError: pyserial knows no such URL, or the port has no such setting.
     """
     is_url = "://" in path
     if is_url and not options.hang_up:

@@ -81,11 +81,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the patch for its description.
-
-        Raises:
-            BusError: it does not answer, its description is impossible, or it must not be asked.
-        """
+        """Ask the patch for its description."""
         if link.listen_only:
             raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
         greeting = await self._greet(link)
@@ -270,13 +266,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def _ask(
         self, link: Link, request: int, arguments: bytes = b"", *, timeout_s: float = _TIMEOUT_S, tries: int = _TRIES
     ) -> bytes:
-        """Send a request, again if necessary (every request can be repeated), and return the answer.
-
-        Raises:
-            HandshakeTimeout: no answer.
-            Refused: the patch refuses.
-            BusSendError: the line takes no bytes.
-        """
+        """Send a request, again if necessary (every request can be repeated), and return the answer."""
         self._number = self._number % 255 + 1
         number = bytes((self._number,))
         answer = Match(_REPLY + request, prefix=number)

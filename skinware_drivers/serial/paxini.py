@@ -53,12 +53,6 @@ _VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEA
 
 
 class PaxiniOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     board: Annotated[
         Literal["auto", "converter", "high_speed"], Meta(description="the kind of board; auto: listen and ask")
     ] = "auto"
@@ -108,11 +102,7 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return () if self._board is None else self._board.polls
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the board for its modules."""
         if link.listen_only:
             raise BusError("Paxini's boards report their modules only on request: listening is not enough")
         self._board, self._is_asking = None, True  # no other question meanwhile

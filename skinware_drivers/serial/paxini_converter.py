@@ -72,11 +72,7 @@ def _identifier(sensor: int, function: int, address: int) -> int:
 
 
 async def ask_version(link: Link, sensor: int, *, tries: int = 1) -> str:
-    """Ask a sensor for its version: ``PAXINI PXSR-STDDP03F-v1.0.5``.
-
-    Raises:
-        HandshakeTimeout: no such sensor.
-    """
+    """Ask a sensor for its version: ``PAXINI PXSR-STDDP03F-v1.0.5``."""
     question = read(sensor, _VERSION, VERSION_BYTES)
     match = answer(sensor, _READ, _VERSION)
     return version_in((await link.request(sensor, question, match, timeout_s=_TIMEOUT_S, tries=tries)).payload)
@@ -153,11 +149,7 @@ class ConverterBoard(PaxiniBoard):
         return False
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask for the sensors; each is a patch.
-
-        Raises:
-            BusError: no sensor answers, one of the options does not, or one is of an unknown model.
-        """
+        """Ask for the sensors; each is a patch."""
         found: dict[int, str] = {}
         for sensor in self._wanted or SENSORS:
             try:
@@ -203,11 +195,7 @@ class ConverterBoard(PaxiniBoard):
                     log.warning("%s: %s", link.bus_name, text)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
-        """Make sensors take the present forces as zero, one after the other.
-
-        Raises:
-            BusError: one refuses, or does not answer.
-        """
+        """Make sensors take the present forces as zero, one after the other."""
         for patch in patches:
             sensor = patch.key
             done_or_refused = Match(_identifier(sensor, _WRITE, _ZERO), IDENTIFIER.mask & ~_ERROR_MASK)

@@ -123,11 +123,7 @@ class HighSpeedBoard(PaxiniBoard):
         return any(heard.identifier == STRANGE for heard in await link.listen(duration_s))
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, no module is connected to it, or its answer is impossible.
-        """
+        """Ask the board for its modules; it may still be sending for an earlier program."""
         self.framing = UNKNOWN_SLOTS
         self.use(self.framing)
         await self.stop(link)
@@ -183,11 +179,7 @@ class HighSpeedBoard(PaxiniBoard):
                     self.report(self._patch, Notice.CHANGED)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Calibrate the board, which does not send meanwhile.
-
-        Raises:
-            BusError: it refuses, or does not answer within 10 s.
-        """
+        """Calibrate the board, which does not send meanwhile."""
         await self.stop(link)
         try:
             status = await self._exchange(
@@ -269,11 +261,7 @@ def _frame(slot: Slot) -> Frame:
 
 
 def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | None:
-    """Return the data of the reply to such a request; None if the frame is no such reply.
-
-    Raises:
-        Refused: the reply is an error.
-    """
+    """Return the data of the reply to such a request; None if the frame is no such reply."""
     if frame.identifier != _REPLY:
         return None
     said, at, size = struct.unpack_from("<BHH", frame.payload)

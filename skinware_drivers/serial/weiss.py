@@ -72,12 +72,7 @@ class WeissAdapter(SerialAdapter[OptionsT]):
     async def _ask(
         cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int | None = None
     ) -> bytes:
-        """Send a command and return the answer behind its status.
-
-        Raises:
-            Refused: the status is not 0.
-            BusError: no answer, or too short.
-        """
+        """Send a command and return the answer behind its status."""
         reply = await link.request(
             command, arguments, Match(command), timeout_s=cls.timeout_s, tries=cls.tries if tries is None else tries
         )

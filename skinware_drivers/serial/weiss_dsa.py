@@ -51,12 +51,6 @@ _WHOLE = weiss_packet(_HEADER + 2 * _MOST_CELLS, covers=(3, -2), bare_when_empty
 
 
 class WeissDsaOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     rle_offset: Annotated[
         Literal[5, 11] | None,
         Meta(description="request run-length coded data, which begin at this byte of the payload: not certain"),
@@ -100,11 +94,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         self._cells: tuple[_Matrix, ...] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the controller for its matrices; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the controller for its matrices; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a DSA controller reports its matrices only on request: listening is not enough")
         self.change_framing(_WHOLE)

@@ -44,12 +44,6 @@ _REASONS = {
 
 
 class WeissWtsOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     period_ms: Annotated[int, Meta(ge=1, le=0xFFFF, description="time between two frames, ms")] = 10
     tare_payload: Annotated[str, Meta(description="payload of the command tare, in hexadecimal")] = ""
 
@@ -69,11 +63,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
     dtype = np.uint16
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the sensor for its matrix; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the sensor for its matrix; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a sensor reports its number of cells only on request: listening is not enough")
         await self.stop(link)

@@ -43,12 +43,6 @@ _ANSWERS = Answers(
 
 
 class WujiGloveOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: leave the board's own")] = 0
 
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec.structs
 
-from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup
 from skinware.tactile.regions import Region
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
 from skinware_drivers.icub.device import PortRange
 from skinware_drivers.icub.part import DevicePart
-from skinware_drivers.icub.positions import Pose, Positions, read_text
+from skinware_drivers.icub.positions import Positions
 from skinware_drivers.icub.xml_tree import Notes
 from skinware_drivers.icub.xml_tree import number as whole_number
 
@@ -53,11 +52,8 @@ def is_drawing(text: str) -> bool:
     return _SENSORS in text and "robotPart" in text
 
 
-def read_drawing(path: Path, notes: Notes) -> Drawing:
+def read_drawing(path: Path, text: str, notes: Notes) -> Drawing:
     """Read a drawing; note lines that are not understood."""
-    text = read_text(path)
-    if not is_drawing(text):
-        raise ConfigurationError(f"{path}: not a drawing of skinGui: it has no robotPart and [SENSORS]")
     drawing = Drawing(path, "")
     in_sensors, unused = False, set[str]()
     for line_number, line in enumerate(text.splitlines(), 1):
@@ -122,15 +118,10 @@ class Body:
     drawn: dict[str, set[Place]] = field(default_factory=dict)
     groups: dict[Place, list[GeometryGroup]] = field(default_factory=dict)
 
-    def groups_of(self, patches: Sequence[int]) -> list[GeometryGroup]:
-        """Return the places on some patches, with the keys of a driver that has these buses in this order."""
-        return [
-            msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
-            for bus, patch in enumerate(patches)
-            for place, groups in self.groups.items()
-            if place[0] == patch
-            for group in groups
-        ]
+
+def on_bus(bus: int, groups: Iterable[GeometryGroup]) -> list[GeometryGroup]:
+    """Return places whose uids have no bus yet, with the keys that a driver gives its bus of this number."""
+    return [msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid)) for group in groups]
 
 
 def read_body(
@@ -158,7 +149,7 @@ def triangles_of(part: DevicePart, port: PortRange, notes: Notes) -> dict[int, P
         local = port.local_first + index - port.first
         if board >= len(order):
             text = f"goes to {port.last}, but the {len(order)} boards have {len(order) * _OF_A_BOARD} values"
-            notes.add("odd", port.element.file, text, line=port.element.line, element=port.element.label)
+            notes.at(port.element, "odd", text)
             break
         if rest % CHANNELS == 0 and local % CHANNELS == 0:
             triangles[local // CHANNELS] = (*order[board], rest // CHANNELS)
@@ -181,8 +172,18 @@ def _place(body: Body, port: PortRange, positions: Positions, triangles: Mapping
         groups = body.groups.setdefault(place, [])
         for type_name, of_type in (("pressure", set(range(CHANNELS)) - thermal), ("temperature", thermal)):
             known = {k: pose for k in sorted(of_type) if (pose := poses[k]) is not None}
+            normals = [normal for _, normal in known.values()]
             if known:
-                groups.append(_group(port, place, type_name, positions.frame, known))
+                groups.append(
+                    GeometryGroup(
+                        type=type_name,
+                        frame=positions.frame,
+                        uid=tuple(place[1] << 16 | place[2] << 8 | channel for channel in known),
+                        position_m=tuple(position for position, _ in known.values()),
+                        normal=tuple(normal or _NO_NORMAL for normal in normals) if any(normals) else None,
+                        name=f"{port.name}, board {place[1]}, triangle {place[2]}",
+                    )
+                )
         if not groups:
             without_a_place.append(place)
     if lost:
@@ -190,18 +191,6 @@ def _place(body: Body, port: PortRange, positions: Positions, triangles: Mapping
         notes.add("odd", positions.path, text)
     if without_a_place:
         notes.add("info", positions.path, f"taxels without a place: {places_text(without_a_place)}")
-
-
-def _group(port: PortRange, place: Place, type_name: str, frame: str, known: Mapping[int, Pose]) -> GeometryGroup:
-    normals = [normal for _, normal in known.values()]
-    return GeometryGroup(
-        type=type_name,
-        frame=frame,
-        uid=tuple(place[1] << 16 | place[2] << 8 | channel for channel in known),
-        position_m=tuple(position for position, _ in known.values()),
-        normal=tuple(normal or _NO_NORMAL for normal in normals) if any(normals) else None,
-        name=f"{port.name}, board {place[1]}, triangle {place[2]}",
-    )
 
 
 def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
@@ -240,11 +229,6 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
         for which, what in ((drawn - on, "drawn, but off"), (on - drawn, "on, but not drawn")):
             if which:
                 notes.add("odd", name, f"{what}: {places_text(which)}", element="skinGui's drawing")
-
-
-def places_of(part: DevicePart, ports: Sequence[PortRange]) -> dict[str, set[Place]]:
-    quiet = Notes()
-    return {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
 
 
 def places_text(places: Sequence[Place] | set[Place]) -> str:

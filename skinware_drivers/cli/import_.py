@@ -154,7 +154,8 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) 
     written = []
     for part in parts:
         files = {"config": folder / f"{part.name}.toml"}
-        geometry = part.geometry(by_port=bool(root))
+        has_places = any(port.groups for port in part.yarp) if root else part.groups
+        geometry = part.geometry(by_port=bool(root)) if has_places else ""
         regions = part.regions_text(by_port=bool(root))
         if geometry:
             files["geometry"] = folder / f"{part.name}.geometry.toml"

@@ -89,13 +89,13 @@ class ImportedPart:
         return configuration_text("roboskin", self.name, buses, lines, geometry)
 
     def geometry(self, *, by_port: bool = False) -> str:
-        """Return a file with the places of its sensors, with the keys of its ports or buses; empty if none is known."""
+        """Return a file with the places of its sensors, with the keys of its ports or buses."""
         groups, by = self.groups, ""
         if by_port:
             groups = [group for bus, port in enumerate(self.yarp) for group in on_bus(bus, port.groups)]
             by = " by their ports"
         lines = f"Places of the sensors of {self.name}{by}, made by skin-import: its driver publishes them."
-        return geometry_to_toml(groups, lines) if groups else ""
+        return geometry_to_toml(groups, lines)
 
     def regions_text(self, *, by_port: bool) -> str:
         """Return a file of regions: the ports, or the body parts; empty if no body part is known."""

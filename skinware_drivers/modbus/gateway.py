@@ -94,7 +94,14 @@ class Gateway:
         self._epoll = select.epoll()
         try:
             for address in self._addresses:
-                self._listen(address)
+                family, numbers = address.resolve(socket.SOCK_STREAM)
+                try:
+                    listener = socket.create_server(numbers, family=family, backlog=_MOST_GUESTS)
+                except OSError as error:
+                    raise BusNotAvailable(f"gateway: cannot listen on {address}: {reason_of(error)}") from None
+                listener.setblocking(False)
+                self._listeners[listener.fileno()] = listener
+                self._epoll.register(listener, select.EPOLLIN)
             for link in self._links:
                 self._welcome(_Program(PtyPort(link), wire.RtuMessages(FramerCounters())))
         except BusNotAvailable:
@@ -133,17 +140,6 @@ class Gateway:
         self._listeners.clear()
         if epoll is not None:
             epoll.close()
-
-    def _listen(self, address: Address) -> None:
-        family, numbers = address.resolve(socket.SOCK_STREAM)
-        try:
-            listener = socket.create_server(numbers, family=family, backlog=_MOST_GUESTS)
-        except OSError as error:
-            raise BusNotAvailable(f"gateway: cannot listen on {address}: {reason_of(error)}") from None
-        listener.setblocking(False)
-        self._listeners[listener.fileno()] = listener
-        if self._epoll is not None:
-            self._epoll.register(listener, select.EPOLLIN)
 
     def _accept(self, listener: socket.socket) -> None:
         with contextlib.suppress(OSError):

@@ -15,7 +15,7 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guests, Retry
-from skinware_drivers.modbus.registers import Image, Overheard, Read, Row, Wanted
+from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -23,6 +23,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 ANSWERS = 0x700
 """Identifier of the frame that answers a driver's own question: this plus the unit. Its payload is the message."""
 _BUSY_NS, _SILENCE_NS = NS_PER_S // 100, NS_PER_S // 500
+_OVERHEARD_NS = NS_PER_S
+"""Registers that another master read longer ago are not joined with newer ones."""
 _MOST_TRIES = 3
 _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
@@ -230,7 +232,12 @@ class Master(Talk):
             self._take(asked, found, time_ns)
             self._line.drop()  # no unit may speak unasked
         elif self._counters.framing.checksum_errors > damaged:
-            self._take_damaged(asked, time_ns)
+            # bytes as long as the reply, which are none: ask again, once the line is silent
+            self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
+            if asked.read == _GUEST:
+                self._answer_guest(asked, None, time_ns)
+            elif asked.tries < _MOST_TRIES:
+                self._again = asked
 
     def _take_numbered(self, message: Message, time_ns: int) -> None:
         asked, late = self._open, self._late
@@ -279,14 +286,6 @@ class Master(Talk):
         if asked.read >= 0 and is_good:
             self._take_registers(asked.read, message, time_ns)
 
-    def _take_damaged(self, asked: Open, time_ns: int) -> None:
-        """Ask again, once the line is silent, after bytes that are as long as the reply and are none."""
-        self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
-        if asked.read == _GUEST:
-            self._answer_guest(asked, None, time_ns)
-        elif asked.tries < _MOST_TRIES:
-            self._again = asked
-
     def _answer_guest(self, asked: Open, reply: bytes | None, time_ns: int) -> None:
         if asked.read == _GUEST and self._guests is not None:
             self._guests.answer(reply, time_ns)
@@ -331,13 +330,17 @@ class Master(Talk):
 class Listener(Talk):
     """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
-    A reply does not say which registers it holds, so a reply is dropped if its question was not heard.
+    A reply does not say which registers it holds, so a reply is dropped if its question was not heard. When that master
+    asks our first question, its cycle begins: replies from before are not joined with later ones.
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:
         super().__init__()
         self._counters = counters
-        self._overheard = Overheard(wanted)
+        self._image = Image(wanted)
+        reads = wanted.reads()
+        self._first = (reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
         self._line = wire.RtuMessages(counters.framing)
         self._asked: Message | None = None
 
@@ -367,7 +370,10 @@ class Listener(Talk):
         if wire.exception_of(reply.data):
             self._counters.errors += 1
         elif asked.data[0] in wire.READS and wire.is_reply(asked.data, reply.data):
-            self.rows += self._overheard.take(asked, reply.data[2:], time_ns)
+            if (asked.unit, asked.data) == self._first:
+                self._cycle_ns = time_ns
+            since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
+            self.rows += self._image.overhear(asked.unit, asked.data, reply.data[2:], time_ns, since_ns)
 
 
 def _advice(code: int, read: Read) -> str:

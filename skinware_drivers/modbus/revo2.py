@@ -23,23 +23,22 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, taxels
 from skinware_drivers.fields import AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
+from skinware_drivers.modbus.adapter import ExplainingWatch, ModbusAdapter
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
-from skinware_drivers.polling import Notice, ZeroWatch
+from skinware_drivers.polling import Notice
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -98,18 +97,7 @@ class _Content(NamedTuple):
     registers: Sequence[Registers]
 
 
-def _content(edition: EditionName, unit: int, *, kind: int = 0, with_status: bool = True) -> _Content:
-    """Return the content of an edition.
-
-    Args:
-        kind: of the values of the Pressure edition: 0 raw, 1 pressure (kPa), 2 force (mN).
-        with_status: read along the status that fingers report.
-    """
-    make = {"touch": _touch, "pressure": _pressure, "force3d": _force3d, "array_pressure": _array_pressure}[edition]
-    return make(unit, kind, with_status)
-
-
-def _touch(unit: int, _kind: int, with_status: bool) -> _Content:
+def _touch(unit: int, with_status: bool) -> _Content:
     force = FORCE_Z.measured(scale=1e-2, minimum=0)
     types = (force, _TANGENTIAL, _DIRECTION, PROXIMITY.measured(unit="counts", minimum=0))
     modules, registers = list[Module](), list[Registers]()
@@ -138,8 +126,8 @@ def _of_touch(
     return Registers(_FORCES_AT, 30, unit, READ_INPUT, patch=0, module=module, flags=flags, values=values)
 
 
-def _pressure(unit: int, kind: int, _with_status: bool) -> _Content:
-    """Nine points on each finger and 46 on the palm, and the sum of each of them."""
+def _pressure(unit: int, kind: int) -> _Content:
+    """Nine points on each finger and 46 on the palm: raw (kind 0), kPa (1) or mN (2); and the sum of each of them."""
     point = _POINTS_OF_PRESSURE[kind]
     parts = [*((f"{finger} tip", 9) for finger in FINGERS), ("palm", 46)]
     modules, registers, first = list[Module](), list[Registers](), 6010
@@ -153,7 +141,7 @@ def _pressure(unit: int, kind: int, _with_status: bool) -> _Content:
     return _Content((point, _SUM), modules, registers)
 
 
-def _force3d(unit: int, _kind: int, _with_status: bool) -> _Content:
+def _force3d(unit: int) -> _Content:
     """Three forces at 31 points of four fingers, and their sums: x and y in the bytes of a register, z in the next."""
     axes = tuple(axis.measured(unit="counts") for axis in FORCE)
     modules, registers = list[Module](), list[Registers]()
@@ -176,7 +164,7 @@ def _of_forces(unit: int, module: int, address: int, points: int) -> Registers:
     return Registers(address, 2 * points, unit, READ_INPUT, patch=0, module=module, values=values)
 
 
-def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
+def _array_pressure(unit: int) -> _Content:
     """Three forces and two moments of five fingers; suspect until the sensors are warm (8021)."""
     types = (*(axis.measured(unit="counts", minimum=0) for axis in FORCE), *_MOMENTS)
     cold = Flag(Status.SUSPECT, 2, ">u2", mask=0xFFFF, normal=1)
@@ -206,19 +194,14 @@ class Revo2Options(Options, frozen=True):
     ] = False
 
 
-class Revo2Watch(ZeroWatch):
-    """Also log, once, why there are no data."""
+_NO_DATA = (
+    "fingers have no data: touch is not switched on (--enable, or the operation enable), or the hand says that there is"
+    " no sensor (4225 to 4229)"
+)
 
-    _has_logged = False
 
-    def look(self, updates: Updates) -> None:
-        super().look(updates)
-        if not self._has_logged and (updates.status & Status.NOT_CONNECTED).any():
-            self._has_logged = True
-            log.warning(
-                "fingers have no data: touch is not switched on (--enable, or the operation enable), or the hand says"
-                " that there is no sensor (4225 to 4229)"
-            )
+class Revo2Watch(ExplainingWatch):
+    meanings = ((Status.NOT_CONNECTED, _NO_DATA),)
 
 
 class _SaidEdition(NamedTuple):
@@ -247,7 +230,8 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         """Ask the hand for its side and edition; while only listening, use the options."""
         options, side = self.options, self.options.side
         if not link.listen_only:
-            self._unit = await self._find_unit(link)
+            if self.options.unit is None and self.options.side is None:
+                self._unit = await self.find_unit(link, tuple(_UNITS.values()), _EDITION_AT)
             side = side or await self._ask_side(link)
             self._said, self._is_asked = await self._look(link), True
             names = await self._ask_names(link)
@@ -301,17 +285,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         await self.write(link, address, [1] * count, unit=self._unit)
         await asyncio.sleep(takes_s)
 
-    async def _find_unit(self, link: Link) -> int:
-        if self.options.unit is not None or self.options.side is not None:
-            return self._unit
-        try:
-            await self.read(link, _EDITION_AT, unit=_UNITS["right"])
-        except ModbusException:
-            pass
-        except HandshakeTimeout:
-            return _UNITS["left"]
-        return _UNITS["right"]
-
     async def _ask_side(self, link: Link) -> _Side:
         said = await self.read_or_none(link, _SIDE_AT, unit=self._unit)
         if said is None:
@@ -349,7 +322,12 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         return ", ".join(found)
 
     def _declare(self, said: _SaidEdition, side: _Side, *, with_status: bool) -> None:
-        what = _content(said.edition, self._unit, kind=said.kind, with_status=with_status)
+        if said.edition == "touch":
+            what = _touch(self._unit, with_status)
+        elif said.edition == "pressure":
+            what = _pressure(self._unit, said.kind)
+        else:
+            what = (_force3d if said.edition == "force3d" else _array_pressure)(self._unit)
         self.types: Sequence[SensorType] = what.types
         self.registers: Sequence[Registers] = what.registers
         self.patches: Sequence[Patch] = [Patch(f"{side} hand", what.modules)]

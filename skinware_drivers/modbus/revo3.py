@@ -32,7 +32,7 @@ from skinware_drivers.fields import Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
+from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
@@ -78,9 +78,6 @@ class Mapping:
     zero: int
     in_register: int
     types: Sequence[SensorType]
-
-    def count_fits(self, pad: int, count: int) -> bool:
-        return 1 <= count <= self.in_register * (self.pads[pad + 1] - self.pads[pad])
 
 
 _MATRIX_COUNTS = (53, 56, 22, *(22, 27) * 4)
@@ -213,11 +210,13 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
                 raise BusError("a hand must be asked for its mapping, listening is not enough: say mapping")
             said = _unasked(options.mapping)
         else:
-            self._unit = await self._find_unit(link)
+            if self.options.unit is None:
+                self._unit = await self.find_unit(link, _UNITS, _FAMILY_AT)
             side = side or await self._ask_side(link)
             self._said = said = await self._look(link)
+        pads, in_register = said.mapping.pads, said.mapping.in_register
         for pad, count in enumerate(options.points or said.counts):
-            if not said.has_sums and not said.mapping.count_fits(pad, count):
+            if not said.has_sums and not 1 <= count <= in_register * (pads[pad + 1] - pads[pad]):
                 raise BusError(f"{link.bus_name}: {count} taxels in the {_PADS[pad]} do not fit mapping {said.name}")
         log.info("%s: unit %d, %s hand, %s", link.bus_name, self._unit, side or "right", said.text)
         self._declare(said, side or "right", options.points)
@@ -253,18 +252,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
     @property
     def _mapping(self) -> Mapping:
         return (self._said or _unasked(self.options.mapping)).mapping
-
-    async def _find_unit(self, link: Link) -> int:
-        units = _UNITS if self.options.unit is None else (self.options.unit,)
-        for unit in units[:-1]:
-            try:
-                await self.read(link, _FAMILY_AT, unit=unit)
-            except ModbusException:
-                return unit
-            except HandshakeTimeout:
-                continue
-            return unit
-        return units[-1]
 
     async def _ask_side(self, link: Link) -> _Side:
         side = await self.read_or_none(link, _SIDE_AT, unit=self._unit)

@@ -203,7 +203,11 @@ class RtuMessages(_Messages):
             whole = [size for size in sizes if 0 < size <= len(here)]
             for size in whole:
                 if CRC16_MODBUS.of(here[: size - _CRC]) == int.from_bytes(here[size - _CRC : size], "little"):
-                    return self._take(place, size)
+                    self._skip(place)
+                    self._rest = rest[place + size :]
+                    self._counters.frame_bytes += size
+                    self._counters.frames += 1
+                    return Message(here[0], here[1 : size - _CRC])
             was_damaged |= bool(whole)
             if any(size > len(here) for size in sizes):
                 break
@@ -211,13 +215,6 @@ class RtuMessages(_Messages):
         self._counters.checksum_errors += was_damaged and place > 0
         self._skip(place)
         return None
-
-    def _take(self, place: int, size: int) -> Message:
-        self._skip(place)
-        frame, self._rest = self._rest[:size], self._rest[size:]
-        self._counters.frame_bytes += size
-        self._counters.frames += 1
-        return Message(frame[0], frame[1:-_CRC])
 
 
 @functools.lru_cache(256)

@@ -31,11 +31,7 @@ _NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
 
 
 class SdoAborted(BusError):
-    """The device refused to read or write an object.
-
-    Attributes:
-        code: CiA 301 abort code.
-    """
+    """The device refused to read or write an object; ``code``: CiA 301 abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         super().__init__(f"{what}: {SdoAbortedError.CODES.get(code, 'refused')} (abort code 0x{code:08X})")
@@ -43,11 +39,7 @@ class SdoAborted(BusError):
 
 
 class SdoClient:
-    """Access to one device's object dictionary; one transfer at a time.
-
-    Args:
-        node: node id, 1 to 127.
-    """
+    """Access to one device's object dictionary; one transfer at a time. ``node``: node id, 1 to 127."""
 
     def __init__(self, link: Link, node: int) -> None:
         self.node = node

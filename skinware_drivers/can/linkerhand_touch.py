@@ -56,11 +56,7 @@ class TouchQuestion(NamedTuple):
 
 
 class TouchKind(ABC):
-    """One kind of touch.
-
-    Attributes:
-        period_s: a usual time between two updates.
-    """
+    """One kind of touch; ``period_s``: a usual time between two updates."""
 
     types: Sequence[SensorType]
     period_s = 0.05

@@ -21,11 +21,7 @@ Bytes = npt.NDArray[np.uint8]
 
 
 def read_numbers(payload: Bytes, sequence: SequenceNumber) -> Indices:
-    """Return (n,) the sequence number in each of n payloads.
-
-    Args:
-        payload: (n, size) uint8.
-    """
+    """Return (n,) the sequence number in each of n payloads; ``payload``: (n, size) uint8."""
     word = _words(payload, sequence)
     if sequence.mask is not None:
         word = (word & word.dtype.type(sequence.mask)) >> word.dtype.type(sequence.shift)
@@ -38,11 +34,7 @@ def _words(payload: Bytes, where: SequenceNumber | DeviceTime) -> npt.NDArray[An
 
 
 class DeviceStamps:
-    """The clocks of all patches; a patch is one device.
-
-    Attributes:
-        clocks: by patch, of those that have sent a stamp.
-    """
+    """The clocks of all patches; a patch is one device. ``clocks``: by patch, of those that have sent a stamp."""
 
     def __init__(self, frames: Sequence[Frame], structure: Structure) -> None:
         self._times = [(number, frame.time) for number, frame in enumerate(frames) if frame.time is not None]

@@ -91,11 +91,7 @@ _BUS_COMMENT = {
 
 @dataclass(frozen=True)
 class TranslatedBus:
-    """One bus of a part.
-
-    Attributes:
-        name: for ``--bus``; empty: to fill in.
-    """
+    """One bus of a part; ``name``: for ``--bus``; empty: to fill in."""
 
     patch: int
     name: str

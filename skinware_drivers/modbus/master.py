@@ -42,11 +42,7 @@ class Timing(NamedTuple):
 
 
 class Talk(ABC):
-    """The conversation on one line.
-
-    Attributes:
-        rows: frames that have become whole; the reader removes them.
-    """
+    """The conversation on one line; ``rows``: frames that have become whole; the reader removes them."""
 
     def __init__(self) -> None:
         self.rows: deque[Row] = deque()

@@ -103,11 +103,7 @@ class Registers:
 
 @dataclass(frozen=True)
 class Read:
-    """One question of a cycle.
-
-    Attributes:
-        first: its first register in that area.
-    """
+    """One question of a cycle; ``first``: its first register in that area."""
 
     unit: int
     function: int

@@ -71,11 +71,7 @@ def find_port(channel: str, options: SerialOptions) -> str:
 
 
 def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
-    """Open a port exclusively.
-
-    Args:
-        baudrate: bits per second.
-    """
+    """Open a port exclusively; ``baudrate``: bits per second."""
     is_url = "://" in path
     if is_url and not options.hang_up:
         raise ConfigurationError(f"{path}: hang_up=no is for ports of this machine: it is the machine that hangs up")

@@ -122,13 +122,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class Tpdo:
-    """One TPDO.
+    """One TPDO, with its mapped objects in order.
 
     Attributes:
-        number: from 1.
         identifier: of its frames, with ``EXTENDED_FLAG`` if it has 29 bits.
         transmission: transmission type: 0 to 240 upon SYNC, 254 and 255 by event or event timer.
-        entries: the mapped objects, in order.
     """
 
     number: int
@@ -140,11 +138,8 @@ class Tpdo:
     def make(number: int, cob_id: int, transmission: int, entries: Iterable[int]) -> Tpdo | None:
         """Return the TPDO of numbers in the object dictionary; None if it is not in use.
 
-        Args:
-            number: from 1.
-            cob_id: 0x1800 + number - 1, subindex 1.
-            transmission: the same object, subindex 2.
-            entries: 0x1A00 + number - 1: index << 16 | subindex << 8 | bits.
+        ``cob_id`` and ``transmission`` are in 0x1800 + number - 1, subindices 1 and 2; ``entries`` (index << 16 |
+        subindex << 8 | bits) in 0x1A00 + number - 1.
         """
         mapped = tuple(Entry(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries)
         if cob_id & _NOT_IN_USE or not mapped:
@@ -176,11 +171,7 @@ def tpdo_numbers(dictionary: ObjectDictionary) -> list[int]:
 
 
 class PdoMap:
-    """The frames, types and patches of all nodes of a bus.
-
-    Args:
-        default_type: type of objects whose name contains none.
-    """
+    """The frames, types and patches of all nodes of a bus; objects whose name contains no type are of a default."""
 
     def __init__(self, dictionary: ObjectDictionary, nodes: Mapping[int, Sequence[Tpdo]], default_type: str) -> None:
         self._dictionary = dictionary

@@ -240,27 +240,26 @@ class _MessageQueue:
                     raise
                 self._counters.refused += 1
                 continue
-            if message is not None:
-                failures = 0
-                self._take(message)
-
-    def _take(self, message: can.Message) -> None:
-        if len(self.queue) >= _QUEUE_FRAMES:
-            self._counters.dropped += 1
-            return
-        identifier = message.arbitration_id
-        for is_so, flag in (
-            (message.is_extended_id and not message.is_error_frame, EXTENDED_FLAG),
-            (message.is_remote_frame, REMOTE_FLAG),
-            (message.is_error_frame, ERROR_FLAG),
-        ):
-            identifier |= flag if is_so else 0
-        payload = b"" if message.is_remote_frame else bytes(message.data)
-        flags = IS_FD if message.is_fd else 0
-        if message.is_fd:
-            flags |= (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)
-        self.queue.append((now_ns(), identifier, payload, flags))
-        os.eventfd_write(self.fd, 1)
+            if message is None:
+                continue
+            failures = 0
+            if len(self.queue) >= _QUEUE_FRAMES:
+                self._counters.dropped += 1
+                continue
+            identifier = message.arbitration_id
+            for is_so, flag in (
+                (message.is_extended_id and not message.is_error_frame, EXTENDED_FLAG),
+                (message.is_remote_frame, REMOTE_FLAG),
+                (message.is_error_frame, ERROR_FLAG),
+            ):
+                identifier |= flag if is_so else 0
+            payload = b"" if message.is_remote_frame else bytes(message.data)
+            flags = 0
+            if message.is_fd:
+                flags = IS_FD | (_SWITCHED if message.bitrate_switch else 0)
+                flags |= _PASSIVE if message.error_state_indicator else 0
+            self.queue.append((now_ns(), identifier, payload, flags))
+            os.eventfd_write(self.fd, 1)
 
 
 def _typed(text: str) -> int | float | bool | str:

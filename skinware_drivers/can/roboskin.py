@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 import numpy as np
@@ -103,7 +103,18 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         if self.options.boards:
             await self._ask_named(link)
         else:
-            self._take_found(link, {b.address: b.board_type for b in await discover(link) if not b.is_loader})
+            known = self._board_type
+            found = [b for b in await discover(link) if not b.is_loader and FIRST_BOARD <= b.address <= LAST_BOARD]
+            self._board_type = {board.address: board.board_type for board in found}
+            self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
+            for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
+                log.warning(  # START makes a strain board send
+                    "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in"
+                    " boards",
+                    link.bus_name or "bus",
+                    board,
+                    self._board_type[board],
+                )
         if not self._has_warned:
             set_ups = self._set_ups(self._boards)
             for set_up in set_ups:
@@ -243,21 +254,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 self._board_type[board] = answer[1]
         if len(missing) == len(self._boards):
             raise HandshakeTimeout(f"none of the boards {', '.join(map(str, self._boards))} answers")
-
-    def _take_found(self, link: Link, board_types: Mapping[int, int]) -> None:
-        """Take the boards that have skin; others are left alone, as START makes a strain board send."""
-        known = self._board_type
-        self._board_type = {
-            board: board_types[board] for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in board_types
-        }
-        self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
-        for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
-            log.warning(
-                "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
-                link.bus_name or "bus",
-                board,
-                self._board_type[board],
-            )
 
     def _warn(self, link: Link, set_up: BoardSetUp) -> None:
         """Log triangles that are off, and inertial sensors of another kind than the options say."""

@@ -59,11 +59,6 @@ class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shift: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
     cdc_offset: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
 
-    @property
-    def sets_triangles(self) -> bool:
-        """Whether something is sent to the board; ``kind`` and ``thermal`` are for the driver alone."""
-        return not (self.enabled is None and self.shift is None and self.cdc_offset is None)
-
 
 class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Boards that are set up in another way than the rest of the bus. Attributes that are None are as for the rest.
@@ -80,10 +75,6 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     skin_type: Annotated[int, msgspec.Meta(ge=0, le=15)] | None = None
     no_load: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
     inertial: Inertial | None = None
-
-    @property
-    def sets_board(self) -> bool:
-        return not (self.period_ms is None and self.skin_type is None and self.no_load is None)
 
 
 class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -118,11 +118,11 @@ class BoardSetUp:
                 continue
             if special.inertial is not None:
                 self.inertial = special.inertial
-            if special.sets_board:
+            if not (special.period_ms is None and special.skin_type is None and special.no_load is None):
                 self._set_board(special)
                 self.special_board.append(self._board_configuration())
         for module in modules:
-            if module.sets_triangles:
+            if not (module.enabled is None and module.shift is None and module.cdc_offset is None):
                 self._set_triangles(module)
                 wanted |= self._on
         return wanted

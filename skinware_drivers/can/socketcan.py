@@ -137,7 +137,12 @@ class SocketCanBus(KernelBus):
 
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
-        self.granted_buffer = _enlarge_buffer(sock, self._wanted.buffer)
+        wanted = self._wanted.buffer // 2  # the kernel doubles it
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)
+        except PermissionError:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
+        self.granted_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         wants_hardware = self._wanted.timestamps != "software"
         self._stamper = Stamper(wants_hardware and has_hardware_stamps(sock, self.channel))
         self._stamper.switch_on(sock)
@@ -217,7 +222,11 @@ class SocketCanBus(KernelBus):
         self.counters.frames += kept
         if self.bit_rate:
             self.wire_bits += wire_bits(batch.wire[first : first + kept], self._speed_up)
-        self._read_memory()
+        # how full the receive buffer is, and how many frames did not fit
+        data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+        words = array.array("I", data)
+        self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
+        self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
         return kept
 
     @property
@@ -232,14 +241,14 @@ class SocketCanBus(KernelBus):
         rows = rows_of(batch)
         source.fd, source.stream, source.tap = self._socket.fileno(), None, self.tap.address
         source.headers, source.control = rows.headers_address, rows.control.ctypes.data
-        source.offset_ns, source.last_poll_ns = self._stamper.state
+        source.offset_ns, source.last_poll_ns = self._stamper.offset_ns, self._stamper.last_poll_ns
         source.dropped_before, source.dropped, source.frames = self._dropped_before, self.counters.dropped, 0
         source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
         source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
         return True
 
     def take_back(self, source: Source) -> None:
-        self._stamper.state = source.offset_ns, source.last_poll_ns
+        self._stamper.offset_ns, self._stamper.last_poll_ns = source.offset_ns, source.last_poll_ns
         self.counters.frames += source.frames
         self.counters.dropped = source.dropped
         self.wire_bits += source.wire_bits
@@ -253,7 +262,12 @@ class SocketCanBus(KernelBus):
         if len(payload) <= 8:
             frame = struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")
         else:
-            frame = self._fd_frame(identifier, payload)
+            longest = _FD_LENGTHS[-1]
+            length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
+            if length is None:
+                raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {longest}")
+            flags = _CANFD_BRS if self._wanted.bitrate_switch == "on" else 0
+            frame = struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(longest, b"\0")
         sent_ns = now_ns()  # not later than an answer
         try:
             sock.send(frame)
@@ -265,13 +279,6 @@ class SocketCanBus(KernelBus):
         if self.tap.is_open:
             flags = frame[_FLAGS_AT] if len(payload) > 8 else 0
             self.tap.keep_frame(sent_ns, identifier, payload, flags=flags, is_sent=True)
-
-    def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
-        length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
-        if length is None:
-            raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {_FD_LENGTHS[-1]}")
-        flags = _CANFD_BRS if self._wanted.bitrate_switch == "on" else 0
-        return struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(_FD_LENGTHS[-1], b"\0")
 
     def close(self) -> None:
         if self._socket is not None:
@@ -325,28 +332,11 @@ class SocketCanBus(KernelBus):
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]
         return len(good)
 
-    def _read_memory(self) -> None:
-        """Read how full the receive buffer is, and how many frames did not fit."""
-        if self._socket is not None:
-            data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
-            words = array.array("I", data)
-            self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
-            self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
-
 
 def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:
     everything = (Filter(0, 0),)  # an empty list would let nothing through
     packed = b"".join(struct.pack("=II", *one) for one in filters or everything)
     sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
-
-
-def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:
-    """Request a receive buffer, by force if permitted; return the granted bytes (the kernel doubles the value)."""
-    try:
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted // 2)
-    except PermissionError:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
-    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
 def _is_up(sock: socket.socket, interface: str) -> bool:

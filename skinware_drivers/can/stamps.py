@@ -61,18 +61,14 @@ class HardwareClock:
         steps, arrived = np.diff(hardware[known]), np.diff(software[known])
         cuts = np.flatnonzero((steps < 0) | (np.abs(arrived - steps) > LONGEST_DELAY_NS)) + 1
         for rows in np.split(known, cuts):
-            stamps[rows] = self._convert_part(hardware[rows], software[rows])
-        return stamps
-
-    def _convert_part(self, hardware: Stamps, software: Stamps) -> Stamps:
-        difference = software - hardware
-        if (self._points or self._lowest is not None) and not self._goes_on(hardware, difference):
-            self._forget()
-        self._learn(hardware, difference)
-        self._last_ns = int(hardware[-1])
-        stamps: Stamps = hardware + self._line(hardware)
-        np.maximum(stamps, software - LONGEST_DELAY_NS, out=stamps)
-        np.minimum(stamps, software, out=stamps)  # a frame is on the wire before the kernel has it
+            part = hardware[rows]
+            difference = software[rows] - part
+            if (self._points or self._lowest is not None) and not self._goes_on(part, difference):
+                self._forget()
+            self._learn(part, difference)
+            self._last_ns = int(part[-1])
+            # a frame is on the wire before the kernel has it
+            stamps[rows] = np.clip(part + self._line(part), software[rows] - LONGEST_DELAY_NS, software[rows])
         return stamps
 
     def _goes_on(self, hardware: Stamps, difference: Stamps) -> bool:
@@ -151,24 +147,17 @@ class Stamper:
     of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
     it there. Hardware stamps are on the controller's clock, see :class:`HardwareClock`.
 
-    Args:
+    Attributes:
         hardware: read the controller's stamps, too.
+        offset_ns: CLOCK_MONOTONIC - CLOCK_REALTIME, ns.
+        last_poll_ns: CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, hardware: bool = False) -> None:
         self.hardware = hardware
         self._clock = HardwareClock()
-        self._last_poll_ns = now_ns()
-        self._offset_ns = _offset_now_ns()[0]
-
-    @property
-    def state(self) -> tuple[int, int]:
-        """CLOCK_MONOTONIC - CLOCK_REALTIME, ns, and the time of the last poll, CLOCK_MONOTONIC ns."""
-        return self._offset_ns, self._last_poll_ns
-
-    @state.setter
-    def state(self, state: tuple[int, int]) -> None:
-        self._offset_ns, self._last_poll_ns = state
+        self.last_poll_ns = now_ns()
+        self.offset_ns = _offset_now_ns()[0]
 
     def switch_on(self, sock: socket.socket) -> None:
         """Make the kernel stamp the frames that a socket receives."""
@@ -185,19 +174,19 @@ class Stamper:
         Args:
             control: (n, 8) int64, their ancillary data, in order of arrival.
         """
-        before_ns = self._offset_ns
-        self._offset_ns, poll_ns = _offset_now_ns()
+        before_ns = self.offset_ns
+        self.offset_ns, poll_ns = _offset_now_ns()
         software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]
-        stamps: Stamps = software + self._offset_ns
-        is_step = abs(self._offset_ns - before_ns) > _SLEW_NS
+        stamps: Stamps = software + self.offset_ns
+        is_step = abs(self.offset_ns - before_ns) > _SLEW_NS
         if is_step:
             other = software + before_ns
-            is_other = (other >= self._last_poll_ns) & (other <= poll_ns)
-            is_other &= (stamps < self._last_poll_ns) | (stamps > poll_ns)
+            is_other = (other >= self.last_poll_ns) & (other <= poll_ns)
+            is_other &= (stamps < self.last_poll_ns) | (stamps > poll_ns)
             stamps[is_other] = other[is_other]
         if self.hardware:
             stamps[software == 0] = poll_ns
-        np.maximum(stamps, self._last_poll_ns, out=stamps)
+        np.maximum(stamps, self.last_poll_ns, out=stamps)
         np.minimum(stamps, poll_ns, out=stamps)
         if is_step:
             np.maximum.accumulate(stamps, out=stamps)
@@ -205,7 +194,7 @@ class Stamper:
             # the kernel begins to stamp in the background: earlier frames have the time at which they were read
             stamps = np.minimum.accumulate(stamps[::-1])[::-1]
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
-        self._last_poll_ns = min(int(stamps[-1]), poll_ns)
+        self.last_poll_ns = min(int(stamps[-1]), poll_ns)
         if self.hardware:
             return self._clock.convert(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
         return stamps

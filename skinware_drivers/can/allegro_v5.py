@@ -175,10 +175,9 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             )
         most = max((counted[one] for one in tips | pads), default=0)
         if most > _TWICE * self.options.learn_s / self.period_s + 1:
-            log.warning(
-                "%s: a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix:"
+            link.log.warning(
+                "a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix:"
                 " give each a bus of its own; if there is one hand, set its period_ms",
-                link.bus_name,
                 1e3 * self.options.learn_s / most,
                 1e3 * self.period_s,
             )

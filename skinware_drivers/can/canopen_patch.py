@@ -137,7 +137,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
     async def revive(self, link: Link, patch: Patch) -> None:
         """Set up and start one node."""
         if await self._read_tpdos(patch.key) != self._tpdos[patch.key]:
-            log.error("%s: the TPDOs of %s have changed: start the driver again", link.bus_name, patch.name)
+            link.log.error("the TPDOs of %s have changed: start the driver again", patch.name)
             raise MappingChanged(f"{patch.name}: other TPDOs than before")
         await self._configure(link, patch.key)
         await link.send(0x000, bytes((_START, patch.key)))

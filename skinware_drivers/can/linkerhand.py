@@ -21,7 +21,6 @@ program asked for them. Usually the hand's own program asks, and this driver sen
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -39,8 +38,6 @@ from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, TouchQuestion, e
 from skinware_drivers.hand import Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 RIGHT, LEFT = 0x27, 0x28
 _KIND_OF_TOUCH, _SERIAL_NUMBER = 0xB0, 0xC0
@@ -154,10 +151,9 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
                 frame = await others.get()
                 if not has_warned and frame.payload in questions:
                     has_warned = True
-                    log.warning(
-                        "%s: another program asks %s for its touch, too: answers to both get mixed up, and questions"
+                    link.log.warning(
+                        "another program asks %s for its touch, too: answers to both get mixed up, and questions"
                         " collide with answers; leave out ask=yes, and this driver shows what the other one asks for",
-                        link.bus_name,
                         _name(frame.identifier),
                     )
 

@@ -8,7 +8,6 @@ robotology/icub-firmware embot_app_application_theSkin.cpp.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -55,8 +54,6 @@ from skinware_drivers.can.roboskin_setup import (
 )
 from skinware_drivers.description import SkinTables
 from skinware_drivers.link import Heard
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _AFTER_CONFIGURATION_S = 0.5
 _BETWEEN_SPECIALS_S = 0.01
@@ -108,10 +105,8 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             self._board_type = {board.address: board.board_type for board in found}
             self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
             for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
-                log.warning(  # START makes a strain board send
-                    "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in"
-                    " boards",
-                    link.bus_name or "bus",
+                link.log.warning(  # START makes a strain board send
+                    "board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
                     board,
                     self._board_type[board],
                 )
@@ -257,23 +252,22 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     def _warn(self, link: Link, set_up: BoardSetUp) -> None:
         """Log triangles that are off, and inertial sensors of another kind than the options say."""
-        where = f"{link.bus_name}: board {set_up.board}"
         off = set(range(TRIANGLES)) - set_up.enabled
         if set_up.wiped:
-            log.warning(
-                "%s: triangles %s are off: its special configuration switched them off,"
+            link.log.warning(
+                "board %d: triangles %s are off: its special configuration switched them off,"
                 " and nothing switches them on again",
-                where,
+                set_up.board,
                 runs_text(set_up.wiped),
             )
         if off - set_up.wiped:
-            log.info("%s: triangles %s are off, as configured", where, runs_text(off - set_up.wiped))
+            link.log.info("board %d: triangles %s are off, as configured", set_up.board, runs_text(off - set_up.wiped))
         known = self._board_type.get(set_up.board)
         kind = "mtb3" if known == MTB3_TYPE else "mtb4"
         if set_up.inertial and known is not None and kind != self.options.inertial_scale:
-            log.warning(
-                "%s: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
-                where,
+            link.log.warning(
+                "board %d: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
+                set_up.board,
                 kind.upper(),
                 self.options.inertial_scale.upper(),
             )

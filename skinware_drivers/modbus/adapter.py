@@ -249,7 +249,7 @@ class ModbusAdapter(Adapter[OptionsT]):
             if not (cycles := max(times.values(), default=0)):
                 return
         if (cycle_s := passed_s / cycles) > _TOO_SLOW * self.period_s:
-            log.info("%s: a cycle takes about %.0f ms", link.bus_name, 1e3 * cycle_s)
+            link.log.info("a cycle takes about %.0f ms", 1e3 * cycle_s)
             self.period_s = _UNHURRIED * cycle_s
             self.use_registers(self.registers)
 

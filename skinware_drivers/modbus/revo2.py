@@ -15,7 +15,6 @@ A proximity has 32 bits, the high word first, as bc_stark_sdk 2.0.8 reads it. On
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
@@ -39,8 +38,6 @@ from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _Side = Literal["right", "left"]
 _UNITS: dict[_Side, int] = {"right": 127, "left": 126}
@@ -235,7 +232,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             side = side or await self._ask_side(link)
             self._said, self._is_asked = await self._look(link), True
             names = await self._ask_names(link)
-            log.info("%s: unit %d, %s hand, edition %s, %s", link.bus_name, self._unit, side, self._said.edition, names)
+            link.log.info("unit %d, %s hand, edition %s, %s", self._unit, side, self._said.edition, names)
         self._declare(self._said, side or "right", with_status=options.status and not link.listen_only)
         self.use_registers(self.registers)
         return self.patches
@@ -251,7 +248,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             await asyncio.sleep(pause_s)
             is_off = False
             if self._is_asked and (said := await self._look(link)) != self._said:
-                log.warning("%s: the hand sends something else now: %s", link.bus_name, said)
+                link.log.warning("the hand sends something else now: %s", said)
                 self.tell(self.patches[0], Notice.CHANGED)
             elif self.options.enable and (is_off := await self._is_off(link)):
                 self.tell(self.patches[0], Notice.RESTARTED)

@@ -13,7 +13,6 @@ of zones, and whether counts or forces. Sources:
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -38,8 +37,6 @@ from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _UNITS = (1, 126, 127)
 _LOOK_S, _AGAIN_S = 1.0, 0.05
@@ -218,7 +215,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         for pad, count in enumerate(options.points or said.counts):
             if not said.has_sums and not 1 <= count <= in_register * (pads[pad + 1] - pads[pad]):
                 raise BusError(f"{link.bus_name}: {count} taxels in the {_PADS[pad]} do not fit mapping {said.name}")
-        log.info("%s: unit %d, %s hand, %s", link.bus_name, self._unit, side or "right", said.text)
+        link.log.info("unit %d, %s hand, %s", self._unit, side or "right", said.text)
         self._declare(said, side or "right", options.points)
         self.use_registers(self.registers)
         await self.learn_period(link)
@@ -236,7 +233,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
                 pause_s = _AGAIN_S  # it may have restarted: ask that first, once it answers again
                 continue
             if self._said is not None and said != self._said:
-                log.warning("%s: the hand sends something else now: %s", link.bus_name, said.text)
+                link.log.warning("the hand sends something else now: %s", said.text)
                 self.tell(self.patches[0], Notice.CHANGED)
 
     @operation(sets_up=True)

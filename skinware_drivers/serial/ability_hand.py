@@ -12,7 +12,6 @@ temperatures. Answers of kind 2 have no touch.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -29,8 +28,6 @@ from skinware_drivers.fields import Bits, Identifier, Packed, Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
 _FINGERS = ("index", "middle", "ring", "little", "thumb")
@@ -105,10 +102,7 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
     async def attend(self, link: Link) -> None:
         with link.follow(_WITHOUT_TOUCH) as heard:
             await heard.get()
-        log.warning(
-            "%s: the hand sends answers without touch: another program asks for them (its reply mode is 2)",
-            link.bus_name,
-        )
+        link.log.warning("the hand sends answers without touch: another program asks for them (its reply mode is 2)")
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003

@@ -18,7 +18,6 @@ program does not say of which unit the device's time is: option ``time_unit_us``
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -32,8 +31,6 @@ from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor
 from skinware_drivers.fields import DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _BEGIN = b"\xf0\xc4"
 _IN_A_MS = 10
@@ -115,7 +112,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
                 Frame(f"sensor {number}", [Identifier(number)], [_TIME + length], values, module=number, time=time)
             )
             first_uid += count
-        log.info("%s: device %d with %d sensors", link.bus_name, device, n_sensors)
+        link.log.info("device %d with %d sensors", device, n_sensors)
         self.layout = Layout(frames)
         totals = {number: 3 + _TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
         self.change_framing(_framing({**totals, 0: 7 + 4 * n_sensors, _ALIVE: 4, _ERROR: 5}, 2))
@@ -161,7 +158,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         with link.follow(Match(_ERROR)) as heard:
             while True:
                 error = (await heard.get()).payload[0]
-                log.warning("%s: the device received %s", link.bus_name, _ERRORS.get(error, f"error {error:#04x}"))
+                link.log.warning("the device received %s", _ERRORS.get(error, f"error {error:#04x}"))
 
     @operation()
     async def period(self, link: Link, patches: Sequence[Patch], ms: int) -> None:  # noqa: ARG002

@@ -15,7 +15,6 @@ Cells of a sound pad rest at 10 to 40 counts (PyFlexiTac), and cells with broken
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -32,8 +31,6 @@ from skinware_drivers.hand import Grid, Place
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _MARKER = b"\xaa\x55"
 _SIZES = {256: (16, 16), 384: (12, 32), 512: (16, 32), 1024: (32, 32)}
@@ -102,7 +99,7 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         self._heard = None
         self._heard = heard = await self.hear_size(link)
         rows, columns = self._agreed(link, heard)
-        log.info("%s: a matrix of %d x %d cells", link.bus_name, rows, columns)
+        link.log.info("a matrix of %d x %d cells", rows, columns)
         of_size = [Byte(0, rows), Byte(1, columns)] if self.options.firmware == "text" else []
         cells = Values(len(of_size), "u1", rows * columns)
         flags = [Sentinel(Status.OUT_OF_RANGE, 255)]

@@ -95,7 +95,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                 raise BadDescription(f"the patch was asked for item {number} and sent another")
             items.append(answer[2:])
         found = read_description(items, greeting.crc)
-        log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
+        link.log.info("%s, firmware %s", found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
         self.period_s = (self._wanted_us or found.period_us) / 1e6

@@ -14,7 +14,6 @@ the status of writes counts.
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -33,8 +32,6 @@ from skinware_drivers.serial.paxini_modules import (
     module,
     values,
 )
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 SENSORS: Sequence[int] = range(9)
 """Ids that sensors can have."""
@@ -161,7 +158,7 @@ class ConverterBoard(PaxiniBoard):
             raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
         points = {sensor: self._points_of(sensor, version) for sensor, version in found.items()}
         for sensor, version in found.items():
-            log.info("%s: sensor %d is %s, %s", link.bus_name, sensor, model_of(points[sensor]), version)
+            link.log.info("sensor %d is %s, %s", sensor, model_of(points[sensor]), version)
         self._versions, self._silent = found, set()
         return self.know(points)
 
@@ -192,7 +189,7 @@ class ConverterBoard(PaxiniBoard):
                     self._heard_who(link, sensor, version_in(reply.payload))
                 elif (text := ReplyHead.of(reply.payload).in_words(sensor)) != error:
                     error = text
-                    log.warning("%s: %s", link.bus_name, text)
+                    link.log.warning("%s", text)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
         """Make sensors take the present forces as zero, one after the other."""
@@ -211,7 +208,7 @@ class ConverterBoard(PaxiniBoard):
         if version == self._versions[sensor]:
             self._silent.discard(sensor)
         else:
-            log.warning("%s: sensor %d is another one now: %s", link.bus_name, sensor, version)
+            link.log.warning("sensor %d is another one now: %s", sensor, version)
             del self._patches[sensor]  # logged once
             self.report(patch, Notice.CHANGED)
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
@@ -43,8 +42,6 @@ from skinware_drivers.serial.paxini_modules import (
     nominal_places,
     values,
 )
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 VERSION_BYTES = 15
 STRANGE = 0x57
@@ -132,7 +129,7 @@ class HighSpeedBoard(PaxiniBoard):
         slots = await self._ask_slots(link)
         if not slots:
             raise BusError(f"the board {version} says that no module is connected to it")
-        log.info("%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in slots))
+        link.log.info("board %s with %s", version, ", ".join(f"{s.name} ({s.points})" for s in slots))
         patches = self.know(slots)
         self.use(self.framing)
         return patches
@@ -150,13 +147,13 @@ class HighSpeedBoard(PaxiniBoard):
         """Switch the stream on; not every version of the board acknowledges it."""
         self._streams = True
         if not await self._switch(link, on=True):
-            log.debug("%s: the board does not acknowledge that it streams", link.bus_name)
+            link.log.debug("the board does not acknowledge that it streams")
 
     async def stop(self, link: Link) -> None:
         """Switch the stream off, and wait for the acknowledgement."""
         self._streams = False
         if not await self._switch(link, on=False):
-            log.debug("%s: the board does not acknowledge that it is silent", link.bus_name)
+            link.log.debug("the board does not acknowledge that it is silent")
 
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Return whether a board with the same modules answers: then it was reset, and no longer sends."""
@@ -174,7 +171,7 @@ class HighSpeedBoard(PaxiniBoard):
                 times_ns = [*times_ns, reply.time_ns][-_STRANGE_IN_A_ROW:] if self._streams else []
                 enough = len(times_ns) == _STRANGE_IN_A_ROW and times_ns[-1] - times_ns[0] < _WITHIN_NS
                 if enough and self._patch is not None:
-                    log.warning("%s: the board streams other modules than before; asking which", link.bus_name)
+                    link.log.warning("the board streams other modules than before; asking which")
                     times_ns, self._streams = [], False
                     self.report(self._patch, Notice.CHANGED)
 

@@ -15,7 +15,6 @@ Not known: two programs disagree on where run-length coded data begin, so the dr
 
 from __future__ import annotations
 
-import logging
 import math
 import struct
 from collections.abc import Iterable, Sequence
@@ -36,8 +35,6 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA, _CONTROLLER, _SENSOR, _ACQUIRE, _MATRIX = 0x00, 0x01, 0x02, 0x03, 0x0B
 _ON, _RLE = 0x80, 0x01
@@ -100,7 +97,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         self.change_framing(_WHOLE)
         await self.stop(link)
         matrices = await self._ask_cells(link)
-        log.info("%s: matrices of %s cells", link.bus_name, ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
+        link.log.info("matrices of %s cells", ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
         time, frames, modules, places = DeviceTime(0, "<u4", 1e-3), [], [], []
         for number, matrix in enumerate(matrices):
             name, first = f"finger {number // 2 + 1} {_PARTS[number % 2]}", number << 12
@@ -134,7 +131,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         try:
             await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
         except Refused as error:
-            log.debug("%s: %s", link.bus_name, error)
+            link.log.debug("%s", error)
 
     @operation(looks=True)
     async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002

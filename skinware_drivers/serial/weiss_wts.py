@@ -12,7 +12,6 @@ device only, are not requested.
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Sequence
 from typing import Annotated
@@ -27,8 +26,6 @@ from skinware_drivers.fields import Byte, DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Answers, Refused
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
 _HEADER = 5
@@ -72,7 +69,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         count = columns * rows
         if not 1 <= count <= _MOST_CELLS or not full_scale:
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
-        log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
+        link.log.info("%d x %d cells of %g x %g mm", columns, rows, width / 100, height / 100)
         self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
         cells, time = Values(_HEADER, "<u2", count), DeviceTime(0, "<u4", 1e-3)
         plain = Frame("frame", [Identifier(_DATA), Byte(4, 0, _RLE)], [cells.end], cells, time=time)
@@ -92,7 +89,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         try:
             await self._ask(link, _STOP)
         except Refused as error:
-            log.debug("%s: %s", link.bus_name, error)
+            link.log.debug("%s", error)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002

@@ -93,7 +93,11 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
             for key, name in enumerate(_FINGERS)
         ]
         self.patches = (Patch(f"{options.side} hand", modules),)
-        self.geometry = _places(Hand(options.side), kind.name)
+        hand, found = Hand(options.side), []
+        for key, name in enumerate(_FINGERS):
+            [place] = hand.down(name, [_SITES])
+            found.append(_SITES.at(place, [kind.name], range(_N * key, _N * (key + 1)), _CELLS))
+        self.geometry = Geometry.joined(found)
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -110,14 +114,6 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
         address = AbilityHandOptions().address
         await link.request(address, _READ_NO_TOUCH, _WITHOUT_TOUCH, timeout_s=_IDENTIFY_S)
         return f"Ability Hand at address {address:#x}"
-
-
-def _places(hand: Hand, type_name: str) -> Geometry:
-    found = []
-    for number, finger in enumerate(_FINGERS):
-        [place] = hand.down(finger, [_SITES])
-        found.append(_SITES.at(place, [type_name], range(_N * number, _N * (number + 1)), _CELLS))
-    return Geometry.joined(found)
 
 
 def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:

@@ -104,7 +104,6 @@ class ConverterBoard(PaxiniBoard):
         sensors: ids of the sensors that must answer; none: all that answer.
         points: taxels of each; 0: by their part codes.
         is_away: returns whether the line is closed.
-        how: see :class:`PaxiniBoard`; ``period_s`` is the time between two questions to the same sensor.
     """
 
     framing = Packet(
@@ -156,7 +155,15 @@ class ConverterBoard(PaxiniBoard):
                     raise
         if not found:
             raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
-        points = {sensor: self._points_of(sensor, version) for sensor, version in found.items()}
+        points = {}
+        for sensor, version in found.items():
+            by_code = (count for code, count in POINTS_OF_PART.items() if code in version)
+            points[sensor] = self._points or next(by_code, 0)
+            if not points[sensor]:
+                raise BusError(
+                    f"sensor {sensor} says that it is {version!r}: not a part code whose number of taxels is known; say"
+                    " it with the option points"
+                )
         for sensor, version in found.items():
             link.log.info("sensor %d is %s, %s", sensor, model_of(points[sensor]), version)
         self._versions, self._silent = found, set()
@@ -164,7 +171,16 @@ class ConverterBoard(PaxiniBoard):
 
     def know(self, points: Mapping[int, int]) -> Sequence[Patch]:
         """Return the patches of sensors with these ids and numbers of taxels."""
-        self.layout = Layout([_frame(sensor, count) for sensor, count in points.items()])
+        expected = answer(0, _READ, _DATA).prefix  # the same of all sensors
+        data = [Byte(1 + at, byte) for at, byte in enumerate(expected[1:])]
+        taxels_at = _BODY_HEADER + _BEFORE_TAXELS
+        frames = []
+        for sensor, count in points.items():
+            when: list[Condition] = [Identifier(sensor), *data]
+            where = values(count, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
+            length = [taxels_at + TAXEL * count]
+            frames.append(Frame(f"sensor {sensor}", when, length, where, patch=sensor, flags=SATURATED))
+        self.layout = Layout(frames)
         sizes = {sensor: _BEFORE_TAXELS + TAXEL * count for sensor, count in points.items()}
         self._polls = {sensor: self._poll(sensor, _DATA, size) for sensor, size in sizes.items()}
         self._patches = {
@@ -186,7 +202,15 @@ class ConverterBoard(PaxiniBoard):
                 reply = await heard.get()
                 sensor = reply.identifier & _SENSOR_MASK
                 if reply.payload[1] != _ERROR:
-                    self._heard_who(link, sensor, version_in(reply.payload))
+                    version, patch = version_in(reply.payload), self._patches.get(sensor)
+                    if patch is None or sensor not in self._silent:
+                        continue
+                    if version == self._versions[sensor]:
+                        self._silent.discard(sensor)
+                    else:
+                        link.log.warning("sensor %d is another one now: %s", sensor, version)
+                        del self._patches[sensor]  # logged once
+                        self.report(patch, Notice.CHANGED)
                 elif (text := ReplyHead.of(reply.payload).in_words(sensor)) != error:
                     error = text
                     link.log.warning("%s", text)
@@ -201,34 +225,5 @@ class ConverterBoard(PaxiniBoard):
             if (head.function, head.address, head.status) != (_WRITE, _ZERO, 0):
                 raise Refused(head.in_words(sensor), head.status)
 
-    def _heard_who(self, link: Link, sensor: int, version: str) -> None:
-        patch = self._patches.get(sensor)
-        if patch is None or sensor not in self._silent:
-            return
-        if version == self._versions[sensor]:
-            self._silent.discard(sensor)
-        else:
-            link.log.warning("sensor %d is another one now: %s", sensor, version)
-            del self._patches[sensor]  # logged once
-            self.report(patch, Notice.CHANGED)
-
-    def _points_of(self, sensor: int, version: str) -> int:
-        known = (points for code, points in POINTS_OF_PART.items() if code in version)
-        points = self._points or next(known, 0)
-        if not points:
-            raise BusError(
-                f"sensor {sensor} says that it is {version!r}: not a part code whose number of taxels is known; say it"
-                " with the option points"
-            )
-        return points
-
     def _poll(self, sensor: int, address: int, size: int) -> Poll:
         return Poll(sensor, read(sensor, address, size), self.period_s, answer(sensor, _READ, address))
-
-
-def _frame(sensor: int, points: int) -> Frame:
-    expected = answer(sensor, _READ, _DATA).prefix
-    when: list[Condition] = [Identifier(sensor), *(Byte(1 + at, byte) for at, byte in enumerate(expected[1:]))]
-    taxels_at = _BODY_HEADER + _BEFORE_TAXELS
-    where = values(points, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
-    return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor, flags=SATURATED)

@@ -138,7 +138,13 @@ class HighSpeedBoard(PaxiniBoard):
         """Return the patch of a board with these slots."""
         self._slots = list(slots)
         self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
-        self.layout = Layout([_frame(slot) for slot in slots])
+        has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
+        taxels_at, frames = _LENGTH_AND_ERROR + _RESULTANT, []
+        for slot in slots:
+            where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
+            when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
+            frames.append(Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED]))
+        self.layout = Layout(frames)
         modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in slots]
         self._patch = Patch("hand", modules)
         return [self._patch]
@@ -247,14 +253,6 @@ class HighSpeedBoard(PaxiniBoard):
                         return taken
                 self.use(self.framing)
         return None
-
-
-def _frame(slot: Slot) -> Frame:
-    taxels_at = _LENGTH_AND_ERROR + _RESULTANT
-    where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
-    has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
-    when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
-    return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED])
 
 
 def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | None:

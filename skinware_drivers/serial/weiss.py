@@ -18,12 +18,7 @@ _AROUND = 8
 
 
 def weiss_packet(most_payload: int, **more: Any) -> Packet:
-    """Return the framing of a device.
-
-    Args:
-        most_payload: bytes of the longest payload.
-        more: further arguments of :class:`Packet`.
-    """
+    """Return the framing of a device whose longest payload has so many bytes; ``more``: as of :class:`Packet`."""
     return Packet(
         sync=(0xAA, 0xAA, 0xAA),
         length=Length(Field(4, 2), more=_AROUND),

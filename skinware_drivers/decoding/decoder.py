@@ -89,7 +89,7 @@ class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.
 
     The arrays have one element more than there are sensors, groups or patches, for values without a sensor: that is
-    cheaper than to sort them out.
+    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` ... are views without that element.
 
     Attributes:
         all_values: (n_sensors + 1,) of the structure's dtype.
@@ -114,38 +114,15 @@ class SkinState:
         self.all_patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
         self.group_patch = structure.group_patch.astype(np.intp)
         self.is_prompt: npt.NDArray[np.bool_] = np.ones(structure.n_groups, bool)
+        self.values, self.status, self.group_time_ns = (
+            self.all_values[:-1],
+            self.all_status[:-1],
+            self.all_group_time_ns[:-1],
+        )
+        self.updated, self.touched = self.all_updated[:-1], self.all_touched[:-1]
+        self.patch_time_ns = self.all_patch_time_ns[:-1]
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
-
-    @property
-    def values(self) -> npt.NDArray[Any]:
-        """(n_sensors,) of the structure's dtype."""
-        return self.all_values[:-1]
-
-    @property
-    def status(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8."""
-        return self.all_status[:-1]
-
-    @property
-    def group_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_groups,) int64."""
-        return self.all_group_time_ns[:-1]
-
-    @property
-    def updated(self) -> npt.NDArray[np.bool_]:
-        """(n_groups,) bool."""
-        return self.all_updated[:-1]
-
-    @property
-    def touched(self) -> npt.NDArray[np.bool_]:
-        """(n_groups,) bool."""
-        return self.all_touched[:-1]
-
-    @property
-    def patch_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_patches,) int64."""
-        return self.all_patch_time_ns[:-1]
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:

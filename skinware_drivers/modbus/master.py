@@ -6,7 +6,6 @@ Both take bytes and return bytes and rows. They read no clock and know no port, 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
@@ -39,26 +38,6 @@ class Timing(NamedTuple):
     timeout_ns: int
     turnaround_ns: int
     """From a reply to the next question."""
-
-
-class Talk(ABC):
-    """The conversation on one line; ``rows``: frames that have become whole; the reader removes them."""
-
-    def __init__(self) -> None:
-        self.rows: deque[Row] = deque()
-
-    @abstractmethod
-    def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Take bytes that have come."""
-
-    @abstractmethod
-    def say(self, time_ns: int) -> bytes:
-        """Return the bytes to be sent now; none if nothing is due."""
-
-    @property
-    @abstractmethod
-    def due_ns(self) -> int | None:
-        """Time at which ``say`` has something to do; None: not before something is heard."""
 
 
 class Open(NamedTuple):
@@ -124,7 +103,7 @@ class Schedule:
         return others and of_unit is not None and time_ns < of_unit.until_ns
 
 
-class Master(Talk):
+class Master:
     """Ask for the registers of a schedule, and in between for what the driver and other programs ask.
 
     After a timeout, nothing is asked until the late reply has come or as much time again has passed. On a serial line,
@@ -135,6 +114,9 @@ class Master(Talk):
 
     Args:
         over_tcp: the line is a connection, not a serial line.
+
+    Attributes:
+        rows: frames that have become whole; the reader removes them.
     """
 
     def __init__(
@@ -148,7 +130,7 @@ class Master(Talk):
         begun_ns: int,
         guests: Guests | None = None,
     ) -> None:
-        super().__init__()
+        self.rows: deque[Row] = deque()
         self._timing, self._counters, self._name, self._guests = timing, counters, name, guests
         self._image = Image(wanted)
         self._schedule = Schedule(wanted.reads(), timing.period_ns, begun_ns)
@@ -187,6 +169,7 @@ class Master(Talk):
         return max(self._free_ns, self._schedule.deadline_ns) if self._schedule.reads else None
 
     def say(self, time_ns: int) -> bytes:
+        """Return the bytes to be sent now; none if nothing is due."""
         if self._open is not None and time_ns >= self._open.until_ns:
             self._give_up(self._open, time_ns)
         if self._open is not None or time_ns < self._free_ns:
@@ -209,7 +192,11 @@ class Master(Talk):
         return b"" if read is None else self._ask(self._schedule.questions[read], read, time_ns)
 
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Look for the reply; see :meth:`Talk.heard`."""
+        """Take bytes that have come, and look for the reply.
+
+        Raises:
+            ValueError: they are no Modbus, and bytes that follow could not be understood either.
+        """
         if isinstance(self._line, wire.TcpMessages):
             for message in self._line.feed(chunk):
                 self._take_numbered(message, time_ns)
@@ -323,7 +310,7 @@ class Master(Talk):
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 
 
-class Listener(Talk):
+class Listener:
     """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
     A reply does not say which registers it holds, so a reply is dropped if its question was not heard. When that master
@@ -331,7 +318,7 @@ class Listener(Talk):
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:
-        super().__init__()
+        self.rows: deque[Row] = deque()
         self._counters = counters
         self._image = Image(wanted)
         reads = wanted.reads()
@@ -340,9 +327,8 @@ class Listener(Talk):
         self._line = wire.RtuMessages(counters.framing)
         self._asked: Message | None = None
 
-    @property
-    def due_ns(self) -> int | None:
-        return None
+    due_ns = None
+    """It never has something to say."""
 
     @property
     def pending(self) -> int:
@@ -370,6 +356,10 @@ class Listener(Talk):
                 self._cycle_ns = time_ns
             since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
             self.rows += self._image.overhear(asked.unit, asked.data, reply.data[2:], time_ns, since_ns)
+
+
+Talk = Master | Listener
+"""The conversation on one line."""
 
 
 def _advice(code: int, read: Read) -> str:

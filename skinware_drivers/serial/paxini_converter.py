@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers import Byte, Frame, Identifier, Layout, Link, Match, Notice, Patch, Poll
@@ -27,7 +27,6 @@ from skinware_drivers.serial.paxini_modules import (
     POINTS_OF_PART,
     SATURATED,
     TAXEL,
-    PaxiniBoard,
     model_of,
     module,
     values,
@@ -97,13 +96,15 @@ class ReplyHead(NamedTuple):
         return f"sensor {sensor} answers with function {self.function:#04x}, status {self.status}, at {self.address}"
 
 
-class ConverterBoard(PaxiniBoard):
+class ConverterBoard:
     """The sensors on one line. A sensor that fell silent is asked for its version before it is asked for data again.
 
     Args:
         sensors: ids of the sensors that must answer; none: all that answer.
         points: taxels of each; 0: by their part codes.
         is_away: returns whether the line is closed.
+        period_s: time between two questions to the same sensor.
+        report: called with the notices of patches.
     """
 
     framing = Packet(
@@ -115,8 +116,20 @@ class ConverterBoard(PaxiniBoard):
         header=5,
     )
 
-    def __init__(self, sensors: Sequence[int], points: int, is_away: Callable[[], bool], **how: Any) -> None:
-        super().__init__(**how)
+    layout: Layout  # once it was described
+    geometry = None
+
+    def __init__(
+        self,
+        sensors: Sequence[int],
+        points: int,
+        is_away: Callable[[], bool],
+        *,
+        period_s: float,
+        report: Callable[[Patch, Notice], None],
+    ) -> None:
+        self.period_s = period_s
+        self.report = report
         self._wanted, self._points = sensors, points
         self._is_away = is_away
         self._versions: dict[int, str] = {}

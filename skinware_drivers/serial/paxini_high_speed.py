@@ -22,9 +22,9 @@ import contextlib
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
-from typing import Any
 
 from skinware.errors import BusError, HandshakeTimeout
+from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers import Flag, Frame, Identifier, Layout, Link, Match, Notice, Patch
@@ -36,7 +36,6 @@ from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     SATURATED,
     TAXEL,
-    PaxiniBoard,
     Slot,
     module,
     nominal_places,
@@ -102,13 +101,23 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 """All streamed frames are strange as long as the slots are unknown."""
 
 
-class HighSpeedBoard(PaxiniBoard):
-    """One board: a patch with a module for each connected slot."""
+class HighSpeedBoard:
+    """One board: a patch with a module for each connected slot.
 
-    def __init__(self, hand: Hand, **how: Any) -> None:
-        super().__init__(1 / _USUAL_HZ, **how)
+    Args:
+        hand: with its modules.
+        use: called with a framing for the line; bytes that are no whole frame yet are dropped.
+        report: called with the notices of patches.
+    """
+
+    layout: Layout  # once it was described
+    geometry: Geometry | None = None
+    period_s = 1 / _USUAL_HZ
+
+    def __init__(self, hand: Hand, *, use: Callable[[Framing], None], report: Callable[[Patch, Notice], None]) -> None:
+        self.use, self.report = use, report
         self._hand = hand
-        self.framing = UNKNOWN_SLOTS
+        self.framing: Framing = UNKNOWN_SLOTS
         self._slots: list[Slot] = []
         self._patch: Patch | None = None
         self._streams = False

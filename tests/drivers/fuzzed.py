@@ -14,7 +14,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.serial.paxini import PaxiniDriver, PaxiniOptions
 from skinware_drivers.serial.paxini_converter import ConverterBoard
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import PaxiniBoard, Slot
+from skinware_drivers.serial.paxini_modules import Slot
 from skinware_drivers.virtual.bus import VirtualCanBus
 
 
@@ -29,7 +29,7 @@ def paxini(board: Literal["converter", "high_speed"], points: Mapping[int, int])
     """A board of Paxini's with sensors of these ids, or modules in these slots, of so many taxels."""
     adapter = PaxiniDriver(PaxiniOptions(board=board))
     how: dict[str, Any] = {"use": adapter.change_framing, "report": adapter.tell}
-    known: PaxiniBoard
+    known: ConverterBoard | HighSpeedBoard
     if board == "converter":
         known = ConverterBoard((), 0, lambda: False, period_s=0.01, **how)
         adapter.patches = known.know(points)

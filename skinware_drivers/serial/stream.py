@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,10 +12,7 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.serial.framing import Framed, Framer, Framing, fill_rows
-
-Splitting = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-"""(identifier, body) of a frame -> (identifier, body) of each frame that it becomes."""
+from skinware_drivers.serial.framing import Framed, Framer, Framing, Splitting, fill_rows
 
 
 class Part(NamedTuple):
@@ -34,7 +31,7 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Split(Framing):
-    """Frames of another framing, each split into several, which have the time and the end of the whole.
+    """Frames of another framing that is not split, each split into several with the time and the end of the whole.
 
     Attributes:
         whole: how frames lie in the stream, and how commands are sent.
@@ -49,14 +46,12 @@ class Split(Framing):
         object.__setattr__(self, "maximum_body", self.whole.maximum_body)
 
     def framer(self) -> Framer:
-        return _Splitter(self.whole.framer(), self.splitting)
+        framer = self.whole.framer()
+        framer.splitting = self.splitting
+        return framer
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a command, as a whole frame.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
+        """Return a command, as a whole frame."""
         return self.whole.encode(identifier, payload)
 
 
@@ -72,40 +67,6 @@ def by_length(known: Mapping[tuple[int, int], Sequence[Part]]) -> Splitting:
     return split
 
 
-class _Splitter(Framer):
-    def __init__(self, whole: Framer, splitting: Splitting) -> None:
-        super().__init__()
-        self._whole, self._splitting = whole, splitting
-
-    @property
-    def position(self) -> int:
-        return self._whole.position
-
-    @property
-    def pending(self) -> int:
-        return self._whole.pending
-
-    @property
-    def is_lost(self) -> bool:
-        return self._whole.is_lost
-
-    def asked(self) -> None:
-        self._whole.asked()
-
-    def feed(self, chunk: bytes) -> list[Framed]:
-        """Find whole frames, and split them; the counters count whole frames."""
-        self._whole.counters = self.counters
-        split = self._splitting
-        return [
-            Framed(identifier, body, frame.end)
-            for frame in self._whole.feed(chunk)
-            for identifier, body in split(frame.identifier, frame.body)
-        ]
-
-    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        raise NotImplementedError  # the framer of the whole frames finds
-
-
 CHUNK = 1 << 16
 """Bytes of a chunk, at most."""
 
@@ -115,10 +76,12 @@ class Stream(ABC):
 
     Attributes:
         counters: of the bus; they go on from one stream to the next.
+        is_lost: no more frames can be found, so that the bus must be opened again.
     """
 
     def __init__(self, counters: BusCounters) -> None:
         self.counters = counters
+        self.is_lost = False
 
     @property
     @abstractmethod
@@ -129,11 +92,6 @@ class Stream(ABC):
     @abstractmethod
     def pending(self) -> int:
         """Bytes that may still become part of a frame."""
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether no more frames can be found, so that the bus must be opened again."""
-        return False
 
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
         """Note that the host sends a question."""
@@ -172,12 +130,9 @@ class PythonStream(Stream):
     def pending(self) -> int:
         return self._framer.pending
 
-    @property
-    def is_lost(self) -> bool:
-        return self._framer.is_lost
-
     def asked(self) -> None:
         self._framer.asked()
+        self.is_lost = self._framer.is_lost
 
     def add(self, chunk: bytes, time_ns: int) -> None:
         framer, counters = self._framer, self.counters.framing

@@ -149,10 +149,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
             return [(identifier, body)]
         cells = body[_HEADER:]
         if body[_TIME] & _RLE:
-            # run lengths: the count in the upper four bits of each u16, the value in the lower twelve
-            coded = body[self.options.rle_offset or _HEADER :]
-            units = np.frombuffer(coded[: len(coded) // 2 * 2], "<u2")
-            cells = np.repeat(units & _FULL, units >> 12).astype("<u2").tobytes()
+            cells = _expanded(body[self.options.rle_offset or _HEADER :])
         ends = np.cumsum([2 * matrix.cells for matrix in self._cells]).tolist()
         if len(cells) != ends[-1]:
             return [(_TORN, body)]
@@ -175,3 +172,9 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         if not all(found_one.cells for found_one in found) or sum(one.cells for one in found) > _MOST_CELLS:
             raise BusError(f"the controller says it has matrices of {found}: that cannot be")
         return tuple(found)
+
+
+def _expanded(coded: bytes) -> bytes:
+    """Expand run lengths: the count in the upper four bits of each u16, the value in the lower twelve."""
+    units = np.frombuffer(coded[: len(coded) // 2 * 2], "<u2")
+    return np.repeat(units & _FULL, units >> 12).astype("<u2").tobytes()

@@ -184,10 +184,17 @@ class PdoMap:
         self.dtype: np.dtype[Any] = _common_dtype(known)
         self.types: list[SensorType] = self._types(known)
         self.layout = Layout(tuple(self._frames(nodes)))
-        self.patches: tuple[Patch, ...] = tuple(
-            Patch(f"node {node}", [self._module(node, tpdo) for tpdo in tpdos], key=node)
-            for node, tpdos in nodes.items()
-        )
+        patches = []
+        for node, tpdos in nodes.items():
+            modules = []
+            for tpdo in tpdos:
+                channels: list[Sensor | None] = []
+                for entry in tpdo.entries:
+                    variable, uid = self._sensors[entry], node << 24 | entry.index << 8 | entry.subindex
+                    channels.append(None if variable is None else Sensor(self._type_name(variable), uid))
+                modules.append(Module(channels, key=tpdo.number, kind="tpdo"))
+            patches.append(Patch(f"node {node}", modules, key=node))
+        self.patches: Sequence[Patch] = patches
 
     def _variable(self, entry: Entry) -> ODVariable | None:
         """Return the sensor behind a mapped object; None if it is no sensor."""
@@ -216,14 +223,6 @@ class PdoMap:
                 CATALOGUE[name].measured(unit=unit, scale=same[0].factor, minimum=min(ends), maximum=max(ends))
             )
         return types
-
-    def _module(self, node: int, tpdo: Tpdo) -> Module:
-        channels = []
-        for entry in tpdo.entries:
-            variable = self._sensors[entry]
-            uid = node << 24 | entry.index << 8 | entry.subindex
-            channels.append(None if variable is None else Sensor(self._type_name(variable), uid))
-        return Module(channels, key=tpdo.number, kind="tpdo")
 
     def _frames(self, nodes: Mapping[int, Sequence[Tpdo]]) -> Iterable[Frame]:
         """Yield one kind of frame for all nodes with one TPDO at predefined identifiers, else one for each node."""

@@ -115,7 +115,14 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        _check_addresses(self)
+        special = [board for entry in self.special_boards for board in entry.boards]
+        for board in (*self.boards, *special, *(m.board for m in self.modules)):
+            if not FIRST_BOARD <= board <= LAST_BOARD:
+                raise ConfigurationError(
+                    f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
+                )
+        if len(set(self.boards)) < len(self.boards):
+            raise ConfigurationError(f"boards {self.boards}: an address occurs twice")
         for kind in (self.kind, *(m.kind for m in self.modules)):
             if kind and kind not in NON_TACTILE:
                 raise ConfigurationError(f"kind {kind!r}: choose one of {', '.join(NON_TACTILE)}")
@@ -134,17 +141,6 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The sets of inertial sensors that boards send."""
         own = [special.inertial for special in self.special_boards if special.inertial is not None]
         return [inertial for inertial in (self.inertial, *own) if inertial]
-
-
-def _check_addresses(options: RoboskinOptions) -> None:
-    special = [board for entry in options.special_boards for board in entry.boards]
-    for board in (*options.boards, *special, *(m.board for m in options.modules)):
-        if not FIRST_BOARD <= board <= LAST_BOARD:
-            raise ConfigurationError(
-                f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
-            )
-    if len(set(options.boards)) < len(options.boards):
-        raise ConfigurationError(f"boards {options.boards}: an address occurs twice")
 
 
 def _check_inertial(inertial: Inertial, scale: str) -> None:

@@ -98,19 +98,15 @@ class HardwareClock:
         if int(hardware[-1]) - self._block_began_ns >= BLOCK_NS:
             self._points.append(self._lowest)
             self._lowest = None
-            self._fit()
-
-    def _fit(self) -> None:
-        """Fit the line to the lower edge: the median of all slopes between points, as low as the lowest point."""
-        at = np.array([point[0] for point in self._points], np.int64)
-        offset = np.array([point[1] for point in self._points], np.int64)
-        x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
-        first, second = np.triu_indices(len(x), 1)
-        apart = x[second] > x[first]
-        if np.count_nonzero(apart) >= LEAST_BLOCKS * (LEAST_BLOCKS - 1) // 2:
-            slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
-            self._drift = min(max(float(np.median(slopes)), -LARGEST_DRIFT), LARGEST_DRIFT)
-        self._edge = int(at[-1]), int(offset[-1] + np.floor((y - x * self._drift).min()))
+            # fit the line to the lower edge: the median of all slopes between points, as low as the lowest point
+            at, offset = np.array(self._points, np.int64).T
+            x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
+            first, second = np.triu_indices(len(x), 1)
+            apart = x[second] > x[first]
+            if np.count_nonzero(apart) >= LEAST_BLOCKS * (LEAST_BLOCKS - 1) // 2:
+                slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
+                self._drift = min(max(float(np.median(slopes)), -LARGEST_DRIFT), LARGEST_DRIFT)
+            self._edge = int(at[-1]), int(offset[-1] + np.floor((y - x * self._drift).min()))
 
 
 Stamping = Literal["auto", "hardware", "software"]

@@ -244,7 +244,13 @@ class CompiledLayouts:
         width = max((sum(len(self.kinds[number].channels) for number in members) for members in made_of), default=0)
         period_of: list[float] = [0.0 for _ in alone]
         period_of += [own_s if (own_s := cycle.period_s or 0.0) > (bus_s or 0.0) else 0.0 for cycle, _, bus_s in cycles]
-        carriers = [self._carrier(members, period_s) for members, period_s in zip(made_of, period_of, strict=True)]
+        carriers = []
+        for members, period_s in zip(made_of, period_of, strict=True):
+            modules = (self.addresses.modules_of(number, self.frames[number]) for number in members)
+            declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
+            longest_s = max([*declared_s, period_s])
+            channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
+            carriers.append(UpdateMaker(frozenset(chain.from_iterable(modules)), channels, longest_s or None))
         self.tables, groups = update_groups(self.described, carriers)
         made = [
             Assembly([self.kinds[n] for n in members], self.tables, width, own)
@@ -257,13 +263,6 @@ class CompiledLayouts:
             for cycle, members, period_s in cycles
         ]
         self.width = width
-
-    def _carrier(self, members: Sequence[int], period_s: float) -> UpdateMaker:
-        modules = (self.addresses.modules_of(number, self.frames[number]) for number in members)
-        declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
-        longest_s = max([*declared_s, period_s])
-        channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
-        return UpdateMaker(frozenset(chain.from_iterable(modules)), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """Return a payload byte and a table over it and the length, if they determine the kind (a fast case)."""

@@ -24,7 +24,7 @@ from skinware_drivers.icub.body import (
     triangles_of,
 )
 from skinware_drivers.icub.device import WRAPPER, DeviceReader, PortRange, Wrapper, read_wrapper
-from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, read_part
+from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, PartReader
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.translate import (
     PartPort,
@@ -172,7 +172,7 @@ def import_files(
     used: list[Wrapper] = []
     parts: list[ImportedPart] = []
     for device in devices:
-        part = read_part(device.name or "skin", device.attributes["type"], files.reader.group_of(device), notes)
+        part = PartReader(device.name or "skin", device.attributes["type"], files.reader.group_of(device), notes).read()
         wrapper = _wrapper_of(part, wrappers, notes)
         used += [wrapper] if wrapper else []
         ports = wrapper.ports if wrapper else ()

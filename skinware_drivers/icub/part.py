@@ -86,12 +86,9 @@ class DevicePart:
         return [(patch, board) for patch in sorted(self.boards, reverse=True) for board in self.boards[patch]]
 
 
-def read_part(name: str, device_type: str, group: Group, notes: Notes) -> DevicePart:
+class PartReader(ValueReader):
     """Read a skin device; note values that make no sense."""
-    return _PartReader(name, device_type, group, notes).read()
 
-
-class _PartReader(ValueReader):
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
         super().__init__(notes)
         self._group = group
@@ -110,7 +107,15 @@ class _PartReader(ValueReader):
             self._read_defaults()
             self._read_board_sets()
             self._read_triangle_sets()
-        self._name_the_rest(self._group)
+        groups = self._group.groups
+        for name in sorted(_GROUPS_OF_THE_ROBOT & set(groups)):
+            for element in _elements_of(groups[name]):
+                element.understood = True
+            self._unused(groups[name].element, "of the robot's computer and its Ethernet boards")
+        for element in _elements_of(self._group):
+            if not element.understood:
+                element.understood = True
+                self.notes.at(element, "unknown", f"not understood{f': {element.text!r}' if element.text else ''}")
         return self._part
 
     # Boards and buses
@@ -297,16 +302,6 @@ class _PartReader(ValueReader):
     def _unused(self, element: Element, why: str) -> None:
         element.understood = True
         self.notes.at(element, "info", why)
-
-    def _name_the_rest(self, group: Group) -> None:
-        for name in sorted(_GROUPS_OF_THE_ROBOT & set(group.groups)):
-            for element in _elements_of(group.groups[name]):
-                element.understood = True
-            self._unused(group.groups[name].element, "of the robot's computer and its Ethernet boards")
-        for element in _elements_of(group):
-            if not element.understood:
-                element.understood = True
-                self.notes.at(element, "unknown", f"not understood{f': {element.text!r}' if element.text else ''}")
 
 
 OLD_DEFAULTS = {

@@ -66,7 +66,13 @@ def read_positions(path: Path, notes: Notes) -> Positions:
     found = _REPRESENTATIVES.search(head)
     if not mark or found is None:
         raise ConfigurationError(f"{path}: not a position file: it has no taxel2Repr (...) before [calibration]")
-    representatives = _representatives(found[1], path)
+    words = found[1].replace(",", " ").split()
+    if len(words) > _MOST_TAXELS:
+        raise ConfigurationError(f"{path}: taxel2Repr has {len(words)} numbers, more than a skin has taxels")
+    try:
+        representatives = [number(word) for word in words]
+    except ValueError as error:
+        raise ConfigurationError(f"{path}: taxel2Repr: {error}") from None
     fields = {}
     for line_number, line in enumerate(_REPRESENTATIVES.sub("", head).splitlines(), 1):
         key, _, value = line.strip().partition(" ") if " " in line.strip() else line.strip().partition("\t")
@@ -81,16 +87,6 @@ def read_positions(path: Path, notes: Notes) -> Positions:
         notes.add("missing", path, "no frame is named, so the axes of these numbers are unknown", element="name")
     poses = _poses(body, head.count("\n"), path, notes)
     return _fit(path, fields.get("name", ""), representatives, poses, notes)
-
-
-def _representatives(text: str, path: Path) -> list[int]:
-    words = text.replace(",", " ").split()
-    if len(words) > _MOST_TAXELS:
-        raise ConfigurationError(f"{path}: taxel2Repr has {len(words)} numbers, more than a skin has taxels")
-    try:
-        return [number(word) for word in words]
-    except ValueError as error:
-        raise ConfigurationError(f"{path}: taxel2Repr: {error}") from None
 
 
 def _poses(body: str, line_before: int, path: Path, notes: Notes) -> list[Pose | None]:

@@ -131,7 +131,8 @@ class Master:
         guests: Guests | None = None,
     ) -> None:
         self.rows: deque[Row] = deque()
-        self._timing, self._counters, self._name, self._guests = timing, counters, name, guests
+        self._timing, self._counters, self._name = timing, counters, name
+        self._guests = guests or Guests(may_write=False, over_tcp=over_tcp)
         self._image = Image(wanted)
         self._schedule = Schedule(wanted.reads(), timing.period_ns, begun_ns)
         self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
@@ -156,15 +157,11 @@ class Master:
         return self._line.pending
 
     @property
-    def _guests_wait(self) -> bool:
-        return self._guests is not None and self._guests.are_waiting
-
-    @property
     def due_ns(self) -> int | None:
         """Time of a timeout, of the end of a pause, or of the beginning of a cycle."""
         if self._open is not None:
             return self._open.until_ns
-        if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests_wait:
+        if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests.are_waiting:
             return self._free_ns
         return max(self._free_ns, self._schedule.deadline_ns) if self._schedule.reads else None
 
@@ -182,7 +179,7 @@ class Master:
             return self._ask(again.message, again.read, time_ns, again.tries)
         if self._commands:
             return self._ask(self._commands.popleft(), _COMMAND, time_ns)
-        if self._guests is not None and not (self._schedule.is_due(time_ns) and self._was_guest):
+        if not (self._schedule.is_due(time_ns) and self._was_guest):
             question = self._guests.next(time_ns)
             if question is not None:
                 self._was_guest = True
@@ -199,7 +196,13 @@ class Master:
         """
         if isinstance(self._line, wire.TcpMessages):
             for message in self._line.feed(chunk):
-                self._take_numbered(message, time_ns)
+                asked, late = self._open, self._late
+                if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
+                    self._take(asked, message, time_ns)
+                elif late is not None and message.number == late.message.number:
+                    self._take_late(late, message, time_ns)
+                else:
+                    self._counters.refused += 1
             return
         self._line.feed(chunk)
         asked = self._late or self._open
@@ -218,18 +221,9 @@ class Master:
             # bytes as long as the reply, which are none: ask again, once the line is silent
             self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
             if asked.read == _GUEST:
-                self._answer_guest(asked, None, time_ns)
+                self._guests.answer(None, time_ns)
             elif asked.tries < _MOST_TRIES:
                 self._again = asked
-
-    def _take_numbered(self, message: Message, time_ns: int) -> None:
-        asked, late = self._open, self._late
-        if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
-            self._take(asked, message, time_ns)
-        elif late is not None and message.number == late.message.number:
-            self._take_late(late, message, time_ns)
-        else:
-            self._counters.refused += 1
 
     def _take(self, asked: Open, message: Message, time_ns: int) -> None:
         self._open = None
@@ -237,9 +231,10 @@ class Master:
         self._schedule.retries.pop(("unit", message.unit), None)
         if not wire.is_reply(asked.message.data, message.data):
             self._counters.framing.refused += 1
-            self._answer_guest(asked, None, time_ns)
+            if asked.read == _GUEST:
+                self._guests.answer(None, time_ns)
         elif asked.read == _GUEST:
-            self._answer_guest(asked, message.data, time_ns)
+            self._guests.answer(message.data, time_ns)
         elif asked.read == _COMMAND:
             self.rows.append(Row(time_ns, ANSWERS | message.unit, message.data))
         elif code := wire.exception_of(message.data):
@@ -269,10 +264,6 @@ class Master:
         if asked.read >= 0 and is_good:
             self._take_registers(asked.read, message, time_ns)
 
-    def _answer_guest(self, asked: Open, reply: bytes | None, time_ns: int) -> None:
-        if asked.read == _GUEST and self._guests is not None:
-            self._guests.answer(reply, time_ns)
-
     def _take_exception(self, asked: Open, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
@@ -290,7 +281,8 @@ class Master:
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
             self._schedule.retry("unit", asked.message.unit).failed(time_ns)
-        self._answer_guest(asked, None, time_ns)
+        if asked.read == _GUEST:
+            self._guests.answer(None, time_ns)
         self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns
         self._drop_from_line()
 

@@ -138,8 +138,11 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                         self._take_greeting(link, Greeting.read(message.payload))
                     elif message.identifier == REPORT:
                         self._take_report(link, Report.read(message.payload))
-                    else:
-                        self._take_note(link, message.payload)
+                    elif message.payload:
+                        text = message.payload[1:].decode("utf-8", "backslashreplace")
+                        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+                        matter = f"note {text}" if len(self._log) < _MOST_MATTERS else "note"
+                        self._say(link, _SEVERITIES[min(message.payload[0], 2)], matter, f"says: {text}")
                 except BadDescription as error:
                     self._say(link, logging.WARNING, "announcement", str(error))
 
@@ -180,13 +183,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
             self._say(link, logging.WARNING, "dropped", f"dropped {dropped} samples: its line is too slow for its rate")
         if bad > 0:
             self._say(link, logging.WARNING, "damaged", f"received {bad} damaged frames: look at cable and baud rate")
-
-    def _take_note(self, link: Link, payload: bytes) -> None:
-        if payload:
-            text = payload[1:].decode("utf-8", "backslashreplace")
-            text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-            matter = f"note {text}" if len(self._log) < _MOST_MATTERS else "note"
-            self._say(link, _SEVERITIES[min(payload[0], 2)], matter, f"says: {text}")
 
     def _changed(self, link: Link) -> None:
         self._say(link, logging.WARNING, "changed", "has changed: reading its description again")

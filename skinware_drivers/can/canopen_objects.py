@@ -47,7 +47,6 @@ class SdoClient:
         self._busy = asyncio.Lock()
 
     async def read(self, index: int, subindex: int = 0) -> bytes:
-        """Return the bytes of an object."""
         target = struct.pack("<HB", index, subindex)
         async with self._busy:
             answer = await self._ask(target, bytes([sdo.REQUEST_UPLOAD]) + target + bytes(4), sdo.RESPONSE_UPLOAD)
@@ -270,7 +269,6 @@ class PdoMap:
 
 
 def _capacity(variable: ODVariable) -> tuple[float, float]:
-    """Return the least and greatest raw value of a data type."""
     if variable.data_type in datatypes.FLOAT_TYPES:
         return -np.inf, np.inf
     bits = len(variable)

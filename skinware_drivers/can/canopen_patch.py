@@ -135,7 +135,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         return await self._is_there(patch.key)
 
     async def revive(self, link: Link, patch: Patch) -> None:
-        """Set up and start one node."""
         if await self._read_tpdos(patch.key) != self._tpdos[patch.key]:
             link.log.error("the TPDOs of %s have changed: start the driver again", patch.name)
             raise MappingChanged(f"{patch.name}: other TPDOs than before")
@@ -143,7 +142,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         await link.send(0x000, bytes((_START, patch.key)))
 
     async def attend(self, link: Link) -> None:
-        """Follow boot-up, heartbeat and EMCY of all nodes."""
         nodes = {patch.key: _NodeState(patch, self.tell) for patch in self.patches}
         matches = [Match(base + node) for node in nodes for base in (0x700, 0x080)]
         loss_s = max(_LOST_HEARTBEATS * self.options.heartbeat_ms / 1e3, _LEAST_HEARTBEAT_LOSS_S)
@@ -209,7 +207,6 @@ class _NodeState:
         self._errors: set[int] = set()
 
     def hear(self, frame: Reply) -> None:
-        """Take a heartbeat, a boot-up message, or an EMCY."""
         if frame.identifier < 0x700:
             self._hear_emergency(frame.payload)
             return

@@ -120,7 +120,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         ]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hands that answer, or whose touch is heard."""
         found = await self._find(link, self._wanted)
         if not found:
             names = ", ".join(map(identifier_text, self._wanted))
@@ -173,7 +172,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return self.options.ask and not link.listen_only
 
     def _take(self, found: Mapping[int, _Found]) -> None:
-        """Describe these hands."""
         if len({of.touch for of in found.values()}) > 1:
             kinds = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
             raise BusError(

@@ -51,7 +51,6 @@ class TouchQuestion(NamedTuple):
     patience_s: float = 0.02
 
     def end(self, hand: int) -> Match:
-        """Return the match for the last frame of the reply of a hand."""
         return Match(hand, prefix=self.last, shortest=self.shortest)
 
 

@@ -80,7 +80,6 @@ class PythonCanBus(Bus):
         self._echoes: deque[tuple[int, int, bytes]] = deque()  # of sent frames: time, identifier, payload
 
     def open(self) -> None:
-        """Open the interface and start taking its messages."""
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
         if self.payload_size > 8:
             keywords.setdefault("fd", True)
@@ -107,18 +106,15 @@ class PythonCanBus(Bus):
         )
 
     def check(self) -> None:
-        """Check that messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is not None and messages.failure is not None and not messages.queue:
             why = f"bus {self.interface}:{self.channel} failed: {messages.failure}"
             raise BusNotAvailable(why, reason=BusReason.FAILED)
 
     def fileno(self) -> int:
-        """An eventfd that is readable while messages wait, -1 while closed."""
         return self._messages.fd if self._messages is not None else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the queued messages; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
@@ -148,7 +144,6 @@ class PythonCanBus(Bus):
         return count
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         bus = self.may_send_by(self._bus)
         message = can.Message(
             arbitration_id=identifier & ~EXTENDED_FLAG,

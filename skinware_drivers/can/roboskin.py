@@ -226,7 +226,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 await _send(link, set_up.board, set_up.inertial_set_up())
 
     async def _switch(self, link: Link, patch: Patch, on: bool) -> None:
-        """Make the sensors of one patch send or be silent."""
         (set_up,) = self._set_ups([board_of(patch)])
         if is_inertial(patch):
             await _send(link, set_up.board, set_up.inertial_set_up() if on else ())
@@ -273,7 +272,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             )
 
     def patches_set_up(self, boards: Iterable[int]) -> list[Patch]:
-        """Return the patches of these boards, as the options set them up."""
         patches = []
         for set_up in self._set_ups(sorted(boards)):
             is_old = self.options.old_style and not self._is_mtb4(set_up.board)

@@ -78,8 +78,6 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver, for every board of a bus."""
-
     boards: Annotated[
         tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: all that answer")
     ] = ()

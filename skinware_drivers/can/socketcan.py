@@ -104,7 +104,6 @@ class SocketCanBus(KernelBus):
         self._speed_up = 1.0
 
     def open(self) -> None:
-        """Open and bind the socket."""
         try:
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -178,7 +177,6 @@ class SocketCanBus(KernelBus):
         self._filters = filters
 
     def check(self) -> None:
-        """Ask the kernel for the state of interface and controller; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None or not self._is_bound:
             return
         name = str(self._socket.getsockname()[0])
@@ -196,11 +194,9 @@ class SocketCanBus(KernelBus):
         return self._health.reason(time_ns)
 
     def fileno(self) -> int:
-        """The socket, -1 while closed."""
         return self._socket.fileno() if self._socket else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that have arrived; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
         if not batch.free:
@@ -235,7 +231,6 @@ class SocketCanBus(KernelBus):
         return not self._stamper.hardware
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)
@@ -257,7 +252,6 @@ class SocketCanBus(KernelBus):
             self._health.heard_data()
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         sock = self.may_send_by(self._socket)
         if len(payload) <= 8:
             frame = struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")
@@ -299,7 +293,6 @@ class SocketCanBus(KernelBus):
             self.counters.bus_offs = self._health.bus_offs
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of frames; return 0 if more frames may come."""
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:

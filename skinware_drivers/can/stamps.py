@@ -156,7 +156,6 @@ class Stamper:
         self.offset_ns = _offset_now_ns()[0]
 
     def switch_on(self, sock: socket.socket) -> None:
-        """Make the kernel stamp the frames that a socket receives."""
         if self.hardware:
             flags = _RX_HARDWARE | _RAW_HARDWARE | _RX_SOFTWARE | _SOFTWARE
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)

@@ -48,7 +48,6 @@ class Drawing:
 
 
 def is_drawing(text: str) -> bool:
-    """Return whether a text looks like a drawing of skinGui."""
     return _SENSORS in text and "robotPart" in text
 
 

@@ -124,8 +124,6 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """The result of an import."""
-
     parts: list[ImportedPart]
     files: list[Path]
 

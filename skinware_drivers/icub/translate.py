@@ -149,7 +149,6 @@ def enabled_places(buses: list[TranslatedBus]) -> set[Place]:
 
 
 def service_name(name: str, taken: set[str]) -> str:
-    """Return the name of a device as the name of a service."""
     safe = re.sub(r"[^A-Za-z0-9_-]", "_", name).lstrip("_-")[:40] or "skin"
     found, number = safe, 2
     while found in taken:

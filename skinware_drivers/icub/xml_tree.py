@@ -168,7 +168,6 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_xml(path: Path, notes: Notes) -> Element:
-    """Return the root element of a file."""
     return _TreeBuilder(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
 
 

@@ -39,8 +39,6 @@ _FRAME_BYTES = 3
 
 
 class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a Modbus bus, besides those of a serial line or a connection."""
-
     timeout_ms: Annotated[
         Annotated[float, Meta(gt=0)] | None, Meta(description="longest wait for a reply; default: of the driver")
     ] = None
@@ -177,7 +175,6 @@ class ModbusBus(KernelBus):
         return characters * _BITS_PER_CHARACTER / (self._serial_options.baudrate or baudrate)
 
     def open(self) -> None:
-        """Connect, or open the line for us alone."""
         if self._epoll is not None:
             return
         self._port = port = self._open_port()
@@ -222,7 +219,6 @@ class ModbusBus(KernelBus):
         self._wake()
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
         epoll = self._epoll
         return -1 if epoll is None else epoll.fileno()
 
@@ -265,7 +261,6 @@ class ModbusBus(KernelBus):
         return not self.listen_only and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
-        """Let C ask; see :class:`skinware_drivers.bus.KernelBus`."""
         talk, port = self._talk, self._port
         if not isinstance(talk, NativeMaster) or not isinstance(port, DescriptorPort):
             return False
@@ -314,7 +309,6 @@ class ModbusBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """Remarks on the port, for people."""
         notes = [] if self._port is None else [self._port.note, "" if self._gateway is None else self._gateway.note]
         return ", ".join(filter(None, notes))
 

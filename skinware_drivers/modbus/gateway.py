@@ -48,7 +48,6 @@ class _Program(Guest):
         return (0 if is_full else select.EPOLLIN) | (select.EPOLLOUT if self._unsent else 0)
 
     def questions(self, time_ns: int) -> list[Message]:
-        """Read the questions that have come."""
         chunk, messages = self.port.read(_CHUNK), self._messages
         if isinstance(messages, wire.TcpMessages):
             return list(messages.feed(chunk))
@@ -90,7 +89,6 @@ class Gateway:
         self.note = ""
 
     def open(self) -> None:
-        """Begin to listen."""
         self._epoll = select.epoll()
         try:
             for address in self._addresses:
@@ -131,7 +129,6 @@ class Gateway:
                 self._epoll.modify(fd, program.watched)
 
     def close(self) -> None:
-        """Close all connections and stop to listen. Idempotent."""
         epoll, self._epoll = self._epoll, None
         for program in list(self._programs.values()):
             self._dismiss(program)

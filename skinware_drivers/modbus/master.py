@@ -153,7 +153,6 @@ class Master:
 
     @property
     def pending(self) -> int:
-        """Bytes that may still become part of a message."""
         return self._line.pending
 
     @property
@@ -324,7 +323,6 @@ class Listener:
 
     @property
     def pending(self) -> int:
-        """Bytes that may still become part of a message."""
         return self._line.pending
 
     def say(self, time_ns: int) -> bytes:  # noqa: ARG002

@@ -66,7 +66,6 @@ class Registers:
 
     @property
     def name(self) -> str:
-        """For messages."""
         return f"registers {self.address} of unit {self.unit}"
 
     def check(self, step: int = 1) -> None:

@@ -62,7 +62,6 @@ class Message(NamedTuple):
 
 
 def question_to_read(function: int, address: int, count: int) -> bytes:
-    """Return the question for registers."""
     if function not in READS or not 1 <= count <= MOST_REGISTERS or not 0 <= address <= 0xFFFF:
         raise ValueError(f"function {function}, {count} registers from {address}: there is no such question")
     return struct.pack(">BHH", function, address, count)
@@ -113,7 +112,6 @@ def is_reply(question: bytes, reply: bytes) -> bool:
 
 
 def exception_of(reply: bytes) -> int:
-    """Return the code of an exception; 0: the reply is none."""
     return reply[1] if reply[0] & FAILED and len(reply) > 1 else 0
 
 

@@ -24,7 +24,6 @@ _classes = read_structs([Path(__file__).with_name(name) for name in _HEADERS], _
 
 
 def __getattr__(name: str) -> Any:
-    """Return the class of a struct."""
     if name not in _classes:
         raise AttributeError(f"the headers have no struct for {name}")
     return _classes[name]

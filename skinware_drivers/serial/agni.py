@@ -127,7 +127,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         return f"AGNI device {device} with {n_sensors} sensors"
 
     async def configure(self, link: Link) -> None:
-        """Set the period of all sensors, if the options want one."""
         if self._period_ms:
             each = b"".join(
                 struct.pack("<BH", sensor, _IN_A_MS * self._period_ms) for sensor in range(1, self._n_sensors + 1)
@@ -180,6 +179,5 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @staticmethod
     async def _ask(link: Link, tries: int = _TRIES) -> bytes:
-        """Return the configuration."""
         reply = await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S, tries=tries)
         return reply.payload

@@ -103,7 +103,6 @@ class SerialBus(KernelBus):
         return open_port(path, self._serial_options, self.baudrate)
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
         return -1 if self._epoll is None else self._epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
@@ -129,7 +128,6 @@ class SerialBus(KernelBus):
         return isinstance(self._stream, NativeStream) and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         stream, port = self._stream, self._port
         if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
             return False
@@ -150,7 +148,6 @@ class SerialBus(KernelBus):
         self._judge(now_ns())
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of bytes; return 0 if more may come."""
         if self._handed is None:
             return 0
         raise self._handed[1].gone(number)
@@ -179,7 +176,6 @@ class SerialBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """Advice about the port."""
         return "" if self._port is None else self._port.note
 
     def _restart(self) -> None:

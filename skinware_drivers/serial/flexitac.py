@@ -95,7 +95,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return -(-self._hearing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Listen for the number of cells."""
         self._heard = None
         self._heard = heard = await self.hear_size(link)
         rows, columns = self._agreed(link, heard)
@@ -113,7 +112,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Listen for a matrix of a known size."""
         heard = await cls(FlexiTacOptions()).hear_size(link)
         return None if heard.shape is None else f"FlexiTac with {_in_words([heard.shape])} cells"
 
@@ -124,7 +122,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return False
 
     async def hear_size(self, link: Link) -> HeardSize:
-        """Listen for a matrix and return its size."""
         self.change_framing(self._hearing)
         try:
             with link.follow(Match(0, 0)) as heard:

@@ -206,7 +206,6 @@ class NativeStream(Stream):
         return ctypes.addressof(self._stream)
 
     def count(self) -> None:
-        """Take over the counters of C."""
         counters, stream = self.counters, self._stream
         counters.frames = stream.frames
         counters.refused += stream.too_long - self._too_long  # the bus itself may refuse something, too

@@ -24,8 +24,6 @@ _READ_TIMEOUT_S = 0.1
 
 
 class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a serial bus."""
-
     baudrate: Annotated[
         Annotated[int, Meta(ge=1)] | None, Meta(description="bits per second; default: the driver's")
     ] = None

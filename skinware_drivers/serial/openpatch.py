@@ -81,7 +81,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the patch for its description."""
         if link.listen_only:
             raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
         greeting = await self._greet(link)

@@ -101,7 +101,6 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return self._board.polls if isinstance(self._board, ConverterBoard) else ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules."""
         if link.listen_only:
             raise BusError("Paxini's boards report their modules only on request: listening is not enough")
         self._board, self._is_asking = None, True  # no other question meanwhile

@@ -148,7 +148,6 @@ class ConverterBoard:
         ]
 
     async def is_there(self, link: Link) -> bool:
-        """Return whether a sensor answers."""
         for sensor in self._wanted or SENSORS:
             try:
                 await ask_version(link, sensor)
@@ -183,7 +182,6 @@ class ConverterBoard:
         return self.know(points)
 
     def know(self, points: Mapping[int, int]) -> Sequence[Patch]:
-        """Return the patches of sensors with these ids and numbers of taxels."""
         expected = answer(0, _READ, _DATA).prefix  # the same of all sensors
         data = [Byte(1 + at, byte) for at, byte in enumerate(expected[1:])]
         taxels_at = _BODY_HEADER + _BEFORE_TAXELS

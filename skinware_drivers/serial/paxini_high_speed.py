@@ -144,7 +144,6 @@ class HighSpeedBoard:
         return patches
 
     def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
-        """Return the patch of a board with these slots."""
         self._slots = list(slots)
         self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
         has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)

@@ -76,7 +76,6 @@ _FROM_THE_END = ("nail", "tip", "middle", "near")
 
 
 def model_of(points: int) -> str:
-    """Return the name of the model with this number of taxels; for an unknown model, the number."""
     return _MODELS.get(points, f"{points} taxels")
 
 

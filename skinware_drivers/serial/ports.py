@@ -131,7 +131,6 @@ class ThreadedPort(Port):
         return self._event
 
     def read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes that the thread has read."""
         with self._changed:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._event)

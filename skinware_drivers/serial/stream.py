@@ -51,7 +51,6 @@ class Split(Framing):
         return framer
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a command, as a whole frame."""
         return self.whole.encode(identifier, payload)
 
 
@@ -123,7 +122,6 @@ class PythonStream(Stream):
 
     @property
     def is_behind(self) -> bool:
-        """Whether frames did not fit into the batch."""
         return bool(self._backlog)
 
     @property

@@ -117,7 +117,13 @@ class Gateway:
             return
         for fd, events in self._epoll.poll(0):
             if fd in self._listeners:
-                self._accept(self._listeners[fd])
+                with contextlib.suppress(OSError):
+                    connection, _ = self._listeners[fd].accept()
+                    if len(self._programs) < _MOST_GUESTS:
+                        port = TcpPort("gateway", connection, _PATIENCE_S)
+                        self._welcome(_Program(port, wire.TcpMessages(FramerCounters())))
+                    else:
+                        connection.close()
             elif fd in self._programs:
                 self._attend(self._programs[fd], events, time_ns)
 
@@ -137,15 +143,6 @@ class Gateway:
         self._listeners.clear()
         if epoll is not None:
             epoll.close()
-
-    def _accept(self, listener: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            connection, _ = listener.accept()
-            if len(self._programs) < _MOST_GUESTS:
-                port = TcpPort("gateway", connection, _PATIENCE_S)
-                self._welcome(_Program(port, wire.TcpMessages(FramerCounters())))
-            else:
-                connection.close()
 
     def _welcome(self, program: _Program) -> None:
         self._programs[program.port.fileno()] = program

@@ -135,15 +135,17 @@ class Guests:
 
     def _refuse_first(self, guest: Guest) -> None:
         """Refuse the questions at the head of a guest's queue that cannot be asked."""
-        while guest.waiting and (code := self._refusal(guest.waiting[0])):
+        while guest.waiting:
+            question = guest.waiting[0]
+            if not wire.is_known(question.data) or (wire.is_write(question.data) and not self._may_write):
+                code = _NO_SUCH_FUNCTION
+            elif not wire.is_question(question.data):
+                code = _BAD_VALUE
+            elif question.unit == _EVERY_UNIT and not self._over_tcp:
+                code = _NO_WAY
+            else:
+                return
             self._refuse(guest, guest.waiting.popleft(), code)
-
-    def _refusal(self, question: Message) -> int:
-        if not wire.is_known(question.data) or (wire.is_write(question.data) and not self._may_write):
-            return _NO_SUCH_FUNCTION
-        if not wire.is_question(question.data):
-            return _BAD_VALUE
-        return _NO_WAY if question.unit == _EVERY_UNIT and not self._over_tcp else 0
 
     def _refuse(self, guest: Guest, question: Message, code: int) -> None:
         if guest in self._guests:

@@ -95,7 +95,13 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
             sensors = [Sensor("pressure", uid) for uid in _uids(each)]
             modules.append(Module(sensors, number, f"{each.rows}x{each.columns}", name))
         self.registers, self.patches = registers, [Patch(f"{options.side} hand", modules)]
-        self.geometry = _places(Hand(options.side))
+        hand, places = Hand(options.side), []  # the manual gives no lengths
+        for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
+            matrices = [matrix for matrix in _MATRICES if matrix.part == part]
+            grids = [Grid(matrix.rows, matrix.columns) for matrix in matrices]
+            for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
+                places.append(grid.at(centre, ["pressure"], _uids(matrix)))
+        self.geometry = Geometry.joined(places)
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -114,14 +120,3 @@ def _uids(matrix: _PadMatrix) -> list[int]:
     """Return the number of each taxel's register, from 3000 on, row by row."""
     first = (matrix.address - _FIRST) // _BYTES
     return [first + int(place) for place in np.argsort(_channels(matrix))]
-
-
-def _places(hand: Hand) -> Geometry:
-    """Return nominal places: the manual gives no lengths."""
-    found = []
-    for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
-        matrices = [matrix for matrix in _MATRICES if matrix.part == part]
-        grids = [Grid(matrix.rows, matrix.columns) for matrix in matrices]
-        for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
-            found.append(grid.at(centre, ["pressure"], _uids(matrix)))
-    return Geometry.joined(found)

@@ -272,7 +272,13 @@ class Master:
         if not retry.times:
             read = self._schedule.reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
-            log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), _advice(code, read))
+            advice = ""
+            if code == wire.NO_FUNCTION:
+                other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
+                advice = f"; it was asked with function {read.function}: try {other}"
+            elif code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
+                advice = "; addresses count from 0: a manual's 30001 or 40001 is 0"
+            log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), advice)
         retry.failed(time_ns)
 
     def _give_up(self, asked: Open, time_ns: int) -> None:
@@ -350,12 +356,3 @@ class Listener:
 
 Talk = Master | Listener
 """The conversation on one line."""
-
-
-def _advice(code: int, read: Read) -> str:
-    if code == wire.NO_FUNCTION:
-        other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
-        return f"; it was asked with function {read.function}: try {other}"
-    if code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
-        return "; addresses count from 0: a manual's 30001 or 40001 is 0"
-    return ""

@@ -144,7 +144,11 @@ class PythonStream(Stream):
         fitting = [frame for frame in framed if len(frame.body) <= self._payload_size]
         self.counters.refused += len(framed) - len(fitting)
         if fitting:
-            self._backlog.append((fitting, self._times(fitting, known, time_ns)))
+            time_of = np.full(len(fitting), time_ns)
+            if fitting[0].end <= known:  # frames were held back behind a false beginning
+                ends, times = zip(*self._reads, strict=True)
+                time_of = np.array(times)[np.searchsorted(ends, [frame.end for frame in fitting])]
+            self._backlog.append((fitting, time_of))
         # keep the times of the bytes that are still held back
         undecided = framer.position - framer.pending
         if not framer.pending:
@@ -172,11 +176,3 @@ class PythonStream(Stream):
     def take_damaged(self) -> bytes:
         damaged, self._damaged = self._damaged, b""
         return damaged
-
-    def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
-        """Return (n,) int64 ns: when the last byte of each frame was read."""
-        if framed[0].end > known:
-            return np.full(len(framed), time_ns)
-        ends, times = zip(*self._reads, strict=True)  # frames were held back behind a false beginning
-        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
-        return found

@@ -25,8 +25,7 @@ from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
 from skinware_drivers.can.controller import CONTROLLER_STATES, NO_CAN, ControllerHealth, read_controller, wire_bits
-from skinware_drivers.can.recvmmsg import rows_of
-from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
+from skinware_drivers.can.receiving import Stamper, Stamping, has_hardware_stamps, rows_of
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 

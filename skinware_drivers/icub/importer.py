@@ -15,17 +15,20 @@ from skinware.text import nearest_name
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import (
     Drawing,
+    Positions,
     check_drawings,
     is_drawing,
+    is_positions,
     on_bus,
     read_body,
     read_drawing,
+    read_positions,
+    read_text,
     regions_of,
     triangles_of,
 )
 from skinware_drivers.icub.device import WRAPPER, DeviceReader, PortRange, Wrapper, read_wrapper
 from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, PartReader
-from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.translate import (
     PartPort,
     TranslatedBus,

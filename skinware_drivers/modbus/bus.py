@@ -16,8 +16,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware_drivers.bus import Bus, FrameBatch, KernelBus
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.gateway import Gateway
-from skinware_drivers.modbus.guests import Guests
+from skinware_drivers.modbus.gateway import Gateway, Guests
 from skinware_drivers.modbus.master import Listener, Master, Talk, Timing
 from skinware_drivers.modbus.native_master import NativeMaster
 from skinware_drivers.modbus.registers import Order, Wanted

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.guests import Guests, Retry
+from skinware_drivers.modbus.gateway import Guests, Retry
 from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware_drivers.can import stamps
-from skinware_drivers.can.stamps import Stamper
+from skinware_drivers.can.receiving import Stamper
 
 SECOND = 10**9
 WALL_NS = 1_700_000_000 * SECOND

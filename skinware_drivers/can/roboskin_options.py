@@ -76,6 +76,10 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     no_load: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
     inertial: Inertial | None = None
 
+    @property
+    def sets_board(self) -> bool:
+        return not (self.period_ms is None and self.skin_type is None and self.no_load is None)
+
 
 class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     boards: Annotated[

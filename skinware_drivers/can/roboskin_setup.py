@@ -118,7 +118,7 @@ class BoardSetUp:
                 continue
             if special.inertial is not None:
                 self.inertial = special.inertial
-            if not (special.period_ms is None and special.skin_type is None and special.no_load is None):
+            if special.sets_board:
                 self._set_board(special)
                 self.special_board.append(self._board_configuration())
         for module in modules:

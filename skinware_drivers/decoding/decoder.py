@@ -71,6 +71,7 @@ class Updates:
         return self.groups[:, 0]
 
     def take(self, which: slice | npt.NDArray[Any]) -> Updates:
+        """Return some of the updates."""
         return Updates(
             self.module[which],
             self.groups[which],

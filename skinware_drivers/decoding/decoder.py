@@ -89,7 +89,7 @@ class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.
 
     The arrays have one element more than there are sensors, groups or patches, for values without a sensor: that is
-    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` ... are views without that element.
+    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` and ``patch_time_ns`` are views without that element.
 
     Attributes:
         all_values: (n_sensors + 1,) of the structure's dtype.
@@ -119,7 +119,6 @@ class SkinState:
             self.all_status[:-1],
             self.all_group_time_ns[:-1],
         )
-        self.updated, self.touched = self.all_updated[:-1], self.all_touched[:-1]
         self.patch_time_ns = self.all_patch_time_ns[:-1]
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)

@@ -152,7 +152,7 @@ def import_files(
     Raises:
         ConfigurationError: a file cannot be read, or there is no skin device, or none with a given name.
     """
-    files = _Files(dict(positions or {}), notes)
+    files = _Sources(dict(positions or {}), notes)
     for path in paths:
         files.add(path)
     devices = [device for device in files.devices if device.attributes.get("type") in DEVICE_TYPES]
@@ -236,7 +236,7 @@ def _name_unused(devices: Sequence[Element], wrappers: Sequence[Wrapper], notes:
         notes.at(element, "unknown" if is_skin else "info", text)
 
 
-class _Files:
+class _Sources:
     """The devices, position files and drawings in files and folders, and the position files that a person chose."""
 
     def __init__(self, chosen: Mapping[str, Path], notes: Notes) -> None:

@@ -89,7 +89,7 @@ class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.
 
     The arrays have one element more than there are sensors, groups or patches, for values without a sensor: that is
-    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` and ``patch_time_ns`` are views without that element.
+    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` ... are views without that element.
 
     Attributes:
         all_values: (n_sensors + 1,) of the structure's dtype.
@@ -122,6 +122,14 @@ class SkinState:
         self.patch_time_ns = self.all_patch_time_ns[:-1]
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
+
+    @property
+    def updated(self) -> npt.NDArray[np.bool_]:
+        return self.all_updated[:-1]
+
+    @property
+    def touched(self) -> npt.NDArray[np.bool_]:
+        return self.all_touched[:-1]
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:

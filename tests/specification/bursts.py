@@ -16,9 +16,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.decoding.decoder import Updates
+from skinware_drivers.decoding.decoder import SkinState, Updates
 from skinware_drivers.running.publisher import BurstPauses, PublishPace
-from tests.specification.decoding import SpecifiedState, join
+from tests.specification.decoding import join
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -40,7 +40,7 @@ class Bursts:
 
     def __init__(
         self,
-        state: SpecifiedState,
+        state: SkinState,
         pauses: BurstPauses,
         pace: PublishPace,
         show: Callable[[Updates], None],

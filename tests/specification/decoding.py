@@ -85,14 +85,9 @@ class SpecifiedState(SkinState):
 
     Attributes:
         newest_ns: newest stamp of all.
-        updated, touched: (n_groups,) bool, of the groups alone.
     """
 
     newest_ns: int = 0
-
-    def __init__(self, tables: SkinTables) -> None:
-        super().__init__(tables)
-        self.updated, self.touched = self.all_updated[:-1], self.all_touched[:-1]
 
     def show(self, updates: Updates) -> None:
         """Show updates; if there are several of one module, the last one stays."""

@@ -1,4 +1,4 @@
-"""Judge the health of taxels: which are stuck, noisy, clipped, dead or weak, by what they showed in use.
+"""Judge the health of taxels by what they showed in use: stuck, noisy, dead, shorted and other :class:`HealthKind`.
 
 ::
 
@@ -18,10 +18,9 @@ test finds out whether they feel anything.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Self
 
 import msgspec
@@ -34,6 +33,8 @@ from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
+from skinware.tactile.health_relations import Copies, Dropouts, Twins
+from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
@@ -45,101 +46,21 @@ _LEAST_NOISE = 0.5
 """Steps of the values: no taxel counts as quieter."""
 _FEWEST_AROUND = 3
 """Neighbours with a known share that a comparison with neighbours needs."""
+_ALIKE = 0.9
+"""Correlation with the touches of another taxel, from which a taxel shows them."""
+_SAME = 0.6
+"""Product of the shares that two taxels show of each other's touches, from which they are shorted."""
+_SQUARES, _OTHER_SQUARES = 0.003, 0.03
+"""Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
+_EXCHANGED = 0.5
+"""Share of what is due to another dead taxel, from which a dead taxel is at its place."""
+_OFTEN = 5.0
+"""Times the dropouts of three quarters of the others."""
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
-
-
-class HealthKind(enum.IntEnum):
-    """The judgement of a taxel; where several apply, the highest."""
-
-    GOOD = 0
-    """Nothing is known to be wrong."""
-    NEVER_TOUCHED = 1
-    """Nothing has touched it yet, so nothing is known."""
-    WEAK = 2
-    """It shows far less of its touches than its neighbours show of theirs."""
-    DEAD = 3
-    """It shows nothing when both its sides are pressed."""
-    NOISY = 4
-    """Its noise is far above that of the typical taxel."""
-    STUCK = 5
-    """Its value does not change, whatever happens around it."""
-    CLIPPED = 6
-    """It is at an end of the range, untouched: there is no room left for a touch, or for its drift."""
-
-
-@dataclass(frozen=True, eq=False)
-class HealthReport:
-    """The health of n taxels, with the evidence. NaN: not known (yet).
-
-    Attributes:
-        kind: (n,) uint8, :class:`HealthKind`.
-        value: (n,) float32, the newest, in the unit of the type.
-        still_s: (n,) float32, for how long it has not changed, s.
-        peak: (n,) float32, the most that a touch showed, in the unit of the type.
-        noise: (n,) float32, standard deviation, in the unit of the type.
-        noise_times: (n,) float32, the same in multiples of the typical taxel's.
-        clipped: (n,) float32, share of the time at an end of the range.
-        touches: (n,) uint32, separate touches of both its sides.
-        shown: (n,) float32, the share of its due that it showed in them.
-        shown_around: (n,) float32, the share that its neighbours showed; only where that is much more.
-    """
-
-    kind: npt.NDArray[np.uint8]
-    value: Floats
-    still_s: Floats
-    peak: Floats
-    noise: Floats
-    noise_times: Floats
-    clipped: Floats
-    touches: npt.NDArray[np.uint32]
-    shown: Floats
-    shown_around: Floats
-
-    @classmethod
-    def unknown(cls, n: int) -> Self:
-        """Make a report of n taxels about which nothing is known."""
-        return cls(**{name: np.full(n, nothing, dtype) for name, (dtype, nothing) in COLUMNS.items()})
-
-    @property
-    def faulty(self) -> Flags:
-        """(n,) bool: which taxels have a fault."""
-        faulty: Flags = self.kind > HealthKind.NEVER_TOUCHED
-        return faulty
-
-    def evidence(self, taxel: int, unit: str = "") -> str:
-        """Return the reason for the kind of a taxel, in words.
-
-        Args:
-            taxel: which of the n.
-            unit: of the values.
-        """
-        kind = HealthKind(self.kind[taxel])
-        of = {field.name: getattr(self, field.name)[taxel].item() for field in fields(self)}
-        value = f"{of['value']:.4g} {unit}".strip()
-        if kind is HealthKind.CLIPPED:
-            return f"at {value}, an end of the range, for {100 * of['clipped']:.0f} % of the time"
-        if kind is HealthKind.STUCK:
-            return f"at {value} for {of['still_s']:.0f} s, while its module was touched"
-        if kind is HealthKind.NOISY:
-            noise = f"noise {of['noise']:.3g} {unit}".strip()
-            return f"{noise}, {of['noise_times']:.1f} times that of the others"
-        share = f"shows {100 * max(of['shown'], 0):.0f} % of what presses both its sides, in {of['touches']} touches"
-        if kind is HealthKind.WEAK:
-            return f"{share}; its neighbours show {100 * of['shown_around']:.0f} %"
-        return share if kind is HealthKind.DEAD else ""
-
-
-COLUMNS: dict[str, tuple[str, float]] = {
-    "kind": ("u1", 0),
-    **dict.fromkeys(("value", "still_s", "peak", "noise", "noise_times", "clipped"), ("<f4", math.nan)),
-    "touches": ("<u4", 0),
-    **dict.fromkeys(("shown", "shown_around"), ("<f4", math.nan)),
-}
-"""Arrays of a :class:`HealthReport`: dtype of each, and its value where nothing is known."""
 
 
 class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -153,6 +74,10 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         clipped: at an end of the range for more than this share of that time.
         dead: it shows less than this share of its due.
         weak: its share is less than this part of its neighbours' shares (their median).
+        dying: its share is less than this part of the best that it showed.
+        dropouts: intermittent with this many losses of its value, half of them forgotten in ten minutes; and with five
+            times as many as three quarters of the others.
+        crosstalk: it shows at least this part of the touches of a taxel that is no neighbour.
 
     Raises:
         ConfigurationError: a value that makes no sense; the message says which.
@@ -165,11 +90,32 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
+    dying: float = 0.5
+    dropouts: float = 5.0
+    crosstalk: float = 0.05
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(f"{name} = {getattr(self, name)}: give a number above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class _Related:
+    """Which of n taxels show what presses others: the kind of fault, those others, and how much of it."""
+
+    kind: npt.NDArray[np.uint8]
+    other: npt.NDArray[np.int32]
+    shown: npt.NDArray[np.float64]
+
+    def note(
+        self,
+        kind: HealthKind,
+        taxels: npt.NDArray[np.int64],
+        others: npt.NDArray[np.int64],
+        shown: npt.NDArray[np.float64],
+    ) -> None:
+        self.kind[taxels], self.other[taxels], self.shown[taxels] = kind, others, shown
 
 
 class Health:
@@ -208,6 +154,8 @@ class Health:
         self._noise = Noise(n, self.settings.noise_s)
         self._use = Use(self._module, self.settings.touches)
         self._dues = Dues(geometry, self._neighbours)
+        self._dropouts = Dropouts(self._neighbours)
+        self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
         self._clear = _CLEAR * self._least_noise
         """A touch above it is clear."""
 
@@ -241,11 +189,19 @@ class Health:
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
         far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
         low, free = given < calm.baseline - far, calm.usable & ~calm.touched & (given <= calm.baseline + far)
-        if self._noise.add(self._now_s, given - self._use.value, self._is_at_end(given), low, free, calm):
+        at_end = self._is_at_end(given)
+        if self._noise.add(self._now_s, given - self._use.value, at_end, low, free, calm):
             self._clear = _CLEAR * self._typical_noise()
+            self._dropouts.forget(self.settings.noise_s)
+            shown = self._dues.share_shown(self.settings.touches)
+            self._dues.exchanges.watch(np.flatnonzero(shown < self.settings.weak))
+        self._dropouts.add(self._now_s, self._use.value, given, at_end, calm, far)
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
         self._dues.add(self._now_s, given, calm, hard)
+        above = given - calm.baseline
+        for relation in (self._copies, self._twins):
+            relation.add(self._now_s, above, calm, self._clear)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
@@ -261,12 +217,19 @@ class Health:
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
+        related = self._related(dead)
+        often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
+            (HealthKind.DYING, self._dues.recent < settings.dying * self._dues.best),
             (HealthKind.DEAD, dead),
+            (HealthKind.CROSSTALK, related.kind == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
+            (HealthKind.INTERMITTENT, self._dropouts.count >= often),
+            (HealthKind.SWAPPED, related.kind == HealthKind.SWAPPED),
+            (HealthKind.SHORTED, related.kind == HealthKind.SHORTED),
             (HealthKind.STUCK, stuck),
             (HealthKind.CLIPPED, is_end & (stuck | (at_end > settings.clipped))),
         ):
@@ -282,8 +245,31 @@ class Health:
             "touches": self._dues.touches,
             "shown": shown,
             "shown_around": shown_around,
+            "recent": np.where(self._dues.touches > 0, self._dues.recent, math.nan),
+            "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
+            "dropouts": self._dropouts.count,
+            "other": related.other,
+            "other_shown": related.shown,
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
+
+    def _related(self, dead: Flags) -> _Related:
+        """Find the taxels whose signals belong to others."""
+        settings, n = self.settings, len(dead)
+        related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
+        copied, other, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
+        related.note(HealthKind.CROSSTALK, copied, other, share)
+        pairs = {
+            (one, two): part for one, two, part in zip(copied.tolist(), other.tolist(), share.tolist(), strict=True)
+        }
+        same = [(one, two) for (one, two), part in pairs.items() if part * pairs.get((two, one), 0.0) >= _SAME]
+        ones, twos = np.array(same, np.int64).reshape(-1, 2).T
+        related.note(HealthKind.SHORTED, ones, twos, np.array([pairs[pair] for pair in same]))
+        taxels, others = self._twins.found(_SQUARES, _OTHER_SQUARES, 2 * settings.touches)
+        related.note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
+        taxels, others = self._dues.exchanges.found(_EXCHANGED, settings.touches)
+        related.note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
+        return related
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known, by name: arrays (n, ...), copies; times are how long ago, s."""
@@ -318,8 +304,9 @@ class Health:
     def _known(self) -> dict[str, npt.NDArray[Any]]:
         dues, use, noise = self._dues, self._use, self._noise
         of_touches = {"due": dues.due, "shown": dues.shown, "touches": dues.touches}
+        of_shares = {"recent": dues.recent, "best": dues.best}
         of_values = {"value": use.value, "peak": use.peak, "usual": use.usual}
-        return of_touches | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
+        return of_touches | of_shares | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
 
     def _typical_noise(self) -> float:
         known = self._noise.deviation[np.isfinite(self._noise.deviation)]

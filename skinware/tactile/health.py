@@ -48,9 +48,9 @@ _FEWEST_AROUND = 3
 """Neighbours with a known share that a comparison with neighbours needs."""
 _ALIKE = 0.9
 """Correlation with the touches of another taxel, from which a taxel shows them."""
-_SAME = 0.6
-"""Product of the shares that two taxels show of each other's touches, from which they are shorted."""
-_SQUARES, _OTHER_SQUARES = 0.003, 0.03
+_SAME = 0.7
+"""Part of another's touches, from which both are shorted."""
+_SQUARES, _OTHER_SQUARES = 0.0003, 0.03
 """Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
 _EXCHANGED = 0.5
 """Share of what is due to another dead taxel, from which a dead taxel is at its place."""
@@ -74,7 +74,8 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         clipped: at an end of the range for more than this share of that time.
         dead: it shows less than this share of its due.
         weak: its share is less than this part of its neighbours' shares (their median).
-        dying: its share is less than this part of the best that it showed.
+        dying: its share fell to less than this part of the best that it showed, those of its neighbours (their median)
+            set to 1.
         dropouts: intermittent with this many losses of its value, half of them forgotten in ten minutes; and with five
             times as many as three quarters of the others.
         crosstalk: it shows at least this part of the touches of a taxel that is no neighbour.
@@ -90,7 +91,7 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
-    dying: float = 0.5
+    dying: float = 0.3
     dropouts: float = 5.0
     crosstalk: float = 0.05
 
@@ -199,15 +200,15 @@ class Health:
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
         self._dues.add(self._now_s, given, calm, hard)
-        above = given - calm.baseline
-        for relation in (self._copies, self._twins):
-            relation.add(self._now_s, above, calm, self._clear)
+        self._copies.add(self._now_s, given, calm.usable, self._clear)
+        self._twins.add(self._now_s, given - calm.baseline, calm, self._clear / _CLEAR)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
         settings, use = self.settings, self._use
         shown = self._dues.share_shown(settings.touches)
-        shown_around = self._share_around(shown)
+        shown_around = self._median_around(shown, settings.weak)
+        kept = np.where(self._dues.best > 0, self._dues.recent, math.nan) / np.fmax(self._dues.best, 1e-9)
         typical = self._typical_noise()
         noise, at_end = self._noise.deviation, self._noise.at_end
         noise_times = noise / np.float32(typical or math.nan)
@@ -217,13 +218,13 @@ class Health:
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
-        related = self._related(dead)
+        related = self._related(shown)
         often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
-            (HealthKind.DYING, self._dues.recent < settings.dying * self._dues.best),
+            (HealthKind.DYING, kept < settings.dying * self._median_around(kept, settings.dying)),
             (HealthKind.DEAD, dead),
             (HealthKind.CROSSTALK, related.kind == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
@@ -245,7 +246,7 @@ class Health:
             "touches": self._dues.touches,
             "shown": shown,
             "shown_around": shown_around,
-            "recent": np.where(self._dues.touches > 0, self._dues.recent, math.nan),
+            "recent": np.where(self._dues.hard_touches > 0, self._dues.recent, math.nan),
             "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
             "dropouts": self._dropouts.count,
             "other": related.other,
@@ -253,18 +254,16 @@ class Health:
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
 
-    def _related(self, dead: Flags) -> _Related:
+    def _related(self, shown: npt.NDArray[np.float64]) -> _Related:
         """Find the taxels whose signals belong to others."""
-        settings, n = self.settings, len(dead)
+        settings, n = self.settings, len(shown)
         related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
         copied, other, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
         related.note(HealthKind.CROSSTALK, copied, other, share)
-        pairs = {
-            (one, two): part for one, two, part in zip(copied.tolist(), other.tolist(), share.tolist(), strict=True)
-        }
-        same = [(one, two) for (one, two), part in pairs.items() if part * pairs.get((two, one), 0.0) >= _SAME]
-        ones, twos = np.array(same, np.int64).reshape(-1, 2).T
-        related.note(HealthKind.SHORTED, ones, twos, np.array([pairs[pair] for pair in same]))
+        same = share >= _SAME
+        related.note(HealthKind.SHORTED, copied[same], other[same], share[same])
+        same &= ~(shown[copied] < settings.weak)  # otherwise it may be at another place
+        related.note(HealthKind.SHORTED, other[same], copied[same], share[same])
         taxels, others = self._twins.found(_SQUARES, _OTHER_SQUARES, 2 * settings.touches)
         related.note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
         taxels, others = self._dues.exchanges.found(_EXCHANGED, settings.touches)
@@ -304,7 +303,7 @@ class Health:
     def _known(self) -> dict[str, npt.NDArray[Any]]:
         dues, use, noise = self._dues, self._use, self._noise
         of_touches = {"due": dues.due, "shown": dues.shown, "touches": dues.touches}
-        of_shares = {"recent": dues.recent, "best": dues.best}
+        of_shares = {"hard_touches": dues.hard_touches, "recent": dues.recent, "best": dues.best}
         of_values = {"value": use.value, "peak": use.peak, "usual": use.usual}
         return of_touches | of_shares | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
 
@@ -333,16 +332,16 @@ class Health:
         found[rows] = touched_since & ~is_held
         return found
 
-    def _share_around(self, shown: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(n,) the median share of the neighbours, where it may be far above a taxel's own; else NaN."""
-        around = np.full(len(shown), math.nan)
-        most = np.nanmax(shown) if np.isfinite(shown).any() else 0.0
-        rows = np.flatnonzero(shown < self.settings.weak * most)
+    def _median_around(self, shares: npt.NDArray[np.float64], part: float) -> npt.NDArray[np.float64]:
+        """(n,) the median share of the neighbours, where a taxel's own may be less than a part of it; else NaN."""
+        around = np.full(len(shares), math.nan)
+        most = np.nanmax(shares) if np.isfinite(shares).any() else 0.0
+        rows = np.flatnonzero(shares < part * most)
         if len(rows):
             table = self._neighbours[rows]
-            shares = np.sort(np.where(table == NONE, math.nan, shown[table]), axis=1)  # NaN comes last
-            count = np.isfinite(shares).sum(axis=1)
+            known = np.sort(np.where(table == NONE, math.nan, shares[table]), axis=1)  # NaN comes last
+            count = np.isfinite(known).sum(axis=1)
             enough = count >= _FEWEST_AROUND
-            median = shares[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
+            median = known[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
             around[rows[enough]] = median[enough]
         return around

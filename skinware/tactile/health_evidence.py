@@ -31,6 +31,8 @@ _OPPOSITE_COSINE = -0.9
 """Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
 _SETTLED_TOUCHES = 20
 """Touches after which a share is known well."""
+_HARD_SQUARE = 0.25
+"""Part of the mean square of what was due: the share of a weaker touch says little."""
 _BEST_KEPT = 0.9995
 """Part of the best share that a touch leaves: what a taxel showed is forgotten within thousands of touches."""
 _EVEN = 1.4
@@ -183,7 +185,8 @@ class Dues:
         due: (n,) sum of the squares of what was due in the touches so far; older ones count less.
         shown: (n,) the same sum of due times shown.
         touches: (n,) int64, separate touches of both sides.
-        recent: (n,) the mean share of the last touches, each with the same weight.
+        hard_touches: (n,) int64, those to which at least half as much was due as to the mean touch.
+        recent: (n,) the mean share of the last hard touches, each with the same weight.
         best: (n,) the largest of these means so far; 0 before it is known well.
         exchanges: dead taxels that show what is due to others.
     """
@@ -192,6 +195,7 @@ class Dues:
         n = len(table)
         self.exchanges = Exchanges(n)
         self.recent, self.best = np.zeros((2, n))
+        self.hard_touches: Whole = np.zeros(n, np.int64)
         self._pairs = None if geometry is None else Pairs(geometry, table)
         self._frames = 0
         self.due, self.shown = np.zeros(n), np.zeros(n)
@@ -240,9 +244,10 @@ class Dues:
         self.touches[taxels] += due > 0
         self._hardest_due[taxels] = 0
         self.exchanges.end(taxels, due)
-        ended = taxels[due > 0]
-        count = np.minimum(self.touches[ended], _SETTLED_TOUCHES)
-        self.recent[ended] += (shown[due > 0] / due[due > 0] - self.recent[ended]) / count
+        hard = due**2 > _HARD_SQUARE * self.due[taxels] / np.clip(self.touches[taxels], 1, _SETTLED_TOUCHES)
+        ended, self.hard_touches[taxels] = taxels[hard], self.hard_touches[taxels] + hard
+        count = np.minimum(self.hard_touches[ended], _SETTLED_TOUCHES)
+        self.recent[ended] += (shown[hard] / due[hard] - self.recent[ended]) / count
         settled = ended[count == _SETTLED_TOUCHES]
         self.best[settled] = np.maximum(_BEST_KEPT * self.best[settled], self.recent[settled])
 

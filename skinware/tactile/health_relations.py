@@ -22,6 +22,8 @@ _MOST_EXCHANGED = 64
 """Weak taxels that are compared with each other."""
 _MOST_COMPARED = 1024
 """Touched taxels that are compared with their neighbours in one frame."""
+_HARD = 24.0
+"""Times the noise: weaker touches do not show whether two taxels are the same."""
 _STEADY = 0.25
 """Share of a jump: neighbours that change less have not felt it."""
 _BACK = 0.2
@@ -30,6 +32,8 @@ _LOST_S = 2.0
 """Seconds: what lasts longer is no dropout."""
 _FORGET_S = 600.0
 """Seconds in which half of the dropouts are forgotten."""
+_CHANGE_S = 0.4
+"""Seconds between values that are compared: a slow stroke changes little from one frame to the next."""
 _BELOW = 0.8
 """Part of its value that another must show, where a taxel seems to be touched alone."""
 _MOST_SHARE = 1.25
@@ -59,6 +63,7 @@ class Dropouts:
         self._table = table
         self.count: Floats = np.zeros(len(table), np.float32)
         self._lost_s = np.full(len(table), -math.inf)
+        self._is_still: Flags = np.zeros(len(table), bool)
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
     def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
@@ -73,6 +78,7 @@ class Dropouts:
             far: (n,) a difference from the baseline that is no noise.
         """
         jump = given - before
+        was_still, self._is_still = self._is_still, np.abs(jump) <= far
         moved = np.flatnonzero((np.abs(jump) > 2 * far) & calm.usable)
         if not len(moved):
             return
@@ -87,7 +93,7 @@ class Dropouts:
         self._lost_s[moved[back]] = -math.inf
         rest = calm.baseline[moved]
         drops = (given[moved] < (rest + before[moved]) / 2) & beside(self._table, moved, calm.touched)
-        lost = moved[~back & (at_end[moved] | drops | (given[moved] < rest - far[moved]))]
+        lost = moved[~back & was_still[moved] & (at_end[moved] | drops | (given[moved] < rest - far[moved]))]
         self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
 
     def forget(self, passed_s: float) -> None:
@@ -153,7 +159,7 @@ class Exchanges:
 
 
 class Copies:
-    """Finds taxels that show touches of another of their module, where nothing touches their own neighbours.
+    """Finds taxels that change with another of their module, while their own neighbours do not.
 
     Args:
         module: (n,) of each taxel.
@@ -163,39 +169,47 @@ class Copies:
     def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
         self._module, self._table = module, table
         self._is_known: Flags = (table != NONE).any(axis=1)
+        self._before: Floats = np.full(len(table), np.nan, np.float32)
+        self._before_s = -math.inf
         self._alone: dict[int, _Alone] = {}
 
-    def add(self, now_s: float, above: Floats, calm: Calm, clear: float) -> None:
+    def add(self, now_s: float, given: Floats, usable: Flags, clear: float) -> None:
         """Take the next frame in.
 
         Args:
             now_s: its time.
-            above: (n,) values above the baselines.
-            calm: what the baseline made of it.
-            clear: a touch above it is clear.
+            given: (n,) its values.
+            usable: (n,) which values are known.
+            clear: a change above it is no noise.
         """
-        touched = np.flatnonzero(calm.touched)
-        felt = touched[above[touched] > clear][:_MOST_COMPARED]
+        if now_s - self._before_s < _CHANGE_S:
+            return
+        change = given - self._before
+        self._before, self._before_s = np.where(usable, given, np.nan).astype(np.float32), now_s
+        change[np.isnan(change)] = 0
+        size = np.abs(change)
+        felt = np.flatnonzero(size > clear)[:_MOST_COMPARED]
         if not len(felt):
             return
-        for taxel in felt[self._is_known[felt] & ~beside(self._table, felt, calm.touched)].tolist():
-            if taxel not in self._alone and self._is_below_another(taxel, felt, above):
-                if len(self._alone) == _MOST_ALONE:
-                    del self._alone[min(self._alone, key=lambda one: self._alone[one].touches)]
-                others = np.flatnonzero(self._module == self._module[taxel])
-                self._alone[taxel] = _Alone(others[~np.isin(others, [taxel, *self._table[taxel]])])
-        if not self._alone:
-            return
+        for taxel in felt[self._is_known[felt] & (self._around(felt, size) <= _STEADY * size[felt])].tolist():
+            others = felt[(self._module[felt] == self._module[taxel]) & (felt != taxel)]
+            if taxel in self._alone or not (size[others] >= _BELOW * size[taxel]).any():
+                continue
+            if len(self._alone) == _MOST_ALONE:
+                del self._alone[min(self._alone, key=lambda one: self._alone[one].touches)]
+            members = np.flatnonzero(self._module == self._module[taxel])
+            self._alone[taxel] = _Alone(members[~np.isin(members, [taxel, *self._table[taxel]])])
         modules = set(self._module[felt].tolist())
-        watched = [taxel for taxel in self._alone if int(self._module[taxel]) in modules and calm.usable[taxel]]
-        apart = ~beside(self._table, np.array(watched, np.int64), calm.touched)
-        for taxel, is_apart in zip(watched, apart.tolist(), strict=True):
-            if is_apart:
-                self._alone[taxel].add(now_s, taxel, above, calm.touched[taxel] and above[taxel] > clear)
+        watched = np.array([one for one in self._alone if int(self._module[one]) in modules], np.int64)
+        steady = self._around(watched, size) <= np.maximum(_STEADY * size[watched], clear / 2)
+        for taxel in watched[steady & usable[watched]].tolist():
+            self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
 
-    def _is_below_another(self, taxel: int, felt: Whole, above: Floats) -> bool:
-        others = felt[(self._module[felt] == self._module[taxel]) & (felt != taxel)]
-        return bool((above[others] >= _BELOW * above[taxel]).any())
+    def _around(self, taxels: Whole, size: Floats) -> Floats:
+        """(m,) the largest change of the neighbours of some taxels."""
+        around = self._table[taxels]
+        largest: Floats = np.where(around == NONE, np.float32(0), size[around]).max(axis=1, initial=0)
+        return largest
 
     def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, npt.NDArray[np.float64]]:
         """Find taxels that show a part of the touches of others.
@@ -218,7 +232,7 @@ class Copies:
 
 
 class _Alone:
-    """Compares a taxel that seemed to be touched alone with some others of its module."""
+    """Compares the changes of a taxel whose neighbours are still with those of some others of its module."""
 
     def __init__(self, others: Whole) -> None:
         self._others = others
@@ -227,15 +241,15 @@ class _Alone:
         self._own = 0.0
         self._both, self._squares = np.zeros((2, len(others)))
 
-    def add(self, now_s: float, taxel: int, above: Floats, is_touched: bool) -> None:
-        if is_touched:
+    def add(self, now_s: float, own: float, change: Floats, clear: float) -> None:
+        if abs(own) > clear:
             if now_s - self._touched_s >= APART_S:
                 self.touches += 1
                 self._own *= KEPT
                 self._both *= KEPT
                 self._squares *= KEPT
             self._touched_s = now_s
-        own, others = max(float(above[taxel]), 0.0), np.maximum(above[self._others], 0)
+        others = change[self._others]
         self._own += own * own
         self._both += own * others
         self._squares += others * others
@@ -261,9 +275,16 @@ class Twins:
         self.touches: Whole = np.zeros(len(table), np.int64)
         self._compared_s = np.full(len(table), -math.inf)
 
-    def add(self, now_s: float, above: Floats, calm: Calm, clear: float) -> None:
-        """Take the next frame in; see :meth:`Copies.add`."""
-        rows = np.flatnonzero(calm.touched & (above > 3 * clear))[:_MOST_COMPARED]
+    def add(self, now_s: float, above: Floats, calm: Calm, noise: float) -> None:
+        """Take the next frame in.
+
+        Args:
+            now_s: its time.
+            above: (n,) values above the baselines.
+            calm: what the baseline made of it.
+            noise: standard deviation of the typical taxel.
+        """
+        rows = np.flatnonzero(calm.touched & (above > _HARD * noise))[:_MOST_COMPARED]
         if not len(rows) or not self._table.shape[1]:
             return
         around = self._table[rows]
@@ -274,14 +295,15 @@ class Twins:
         self.touches[rows] += new
         for sums in (self._difference, self._size):
             sums[rows[new]] *= KEPT
-        self._difference[rows] += is_there * (own - others) ** 2
+        self._difference[rows] += is_there * ((own - others) ** 2 - 2 * noise * noise)
         self._size[rows] += is_there * (own * own + others * others)
 
     def found(self, same: float, other: float, touches: int) -> tuple[Whole, Whole]:
         """Find pairs that always show the same.
 
         Args:
-            same: two are the same whose squared differences are less than this part of their squares.
+            same: two are the same whose squared differences, less those of noise, are less than this part of their
+                squares.
             other: the median of the other neighbours differs by at least this part.
             touches: that are needed.
 

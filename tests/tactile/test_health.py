@@ -24,7 +24,7 @@ SURFACE = grid(PLATES, SIDE, SIDE, patches=PLATES)
 MODULE = np.arange(PLATES * TAXELS) // 16
 INSIDE = [row * SIDE + column for row in range(1, SIDE - 1) for column in range(1, SIDE - 1)]
 CORNERS = [0, SIDE - 1, TAXELS - SIDE, TAXELS - 1]
-STROKES, PAUSE_S, END_S = 50, 60.0, 220.0
+STROKES, PAUSE_S, END_S = 60, 60.0, 250.0
 QUICK = HealthSettings(stuck_s=90.0)
 
 

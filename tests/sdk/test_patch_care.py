@@ -24,7 +24,6 @@ PATCHES = [Patch(f"patch {key}", [Module(taxels(1, first_uid=key))], key=key) fo
 
 
 def set_clock(monkeypatch: pytest.MonkeyPatch, clock: Callable[[], int]) -> None:
-    """Let patches be looked after in this time, and their set-ups be due in it."""
     for module in (guard, patch_care):
         monkeypatch.setattr(module, "now_ns", clock)
 

@@ -325,12 +325,11 @@ def taxel_faults(
 ) -> tuple[TaxelFault, ...]:
     """Return the faulty taxels of a report on the sensors at some positions of a structure."""
     units = {sensor_type.id: sensor_type.unit for sensor_type in structure.types}
-    rows = np.flatnonzero(report.faulty).tolist()
-    return tuple(
-        TaxelFault(
-            structure.sensor_name(position),
-            HealthKind(int(report.kind[row])).name.lower(),
-            report.evidence(row, units[int(structure.sensor_type[position])]),
-        )
-        for row, position in zip(rows, positions[rows].tolist(), strict=True)
-    )
+    faults = []
+    for row in np.flatnonzero(report.faulty).tolist():
+        position, other = int(positions[row]), int(report.other[row])
+        other_name = structure.sensor_name(int(positions[other])) if other >= 0 else ""
+        evidence = report.evidence(row, units[int(structure.sensor_type[position])], other_name)
+        kind = HealthKind(int(report.kind[row])).name.lower()
+        faults.append(TaxelFault(structure.sensor_name(position), kind, evidence))
+    return tuple(faults)

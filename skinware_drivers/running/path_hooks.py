@@ -113,7 +113,7 @@ class PathHooks:
             "heard": lambda: self.listeners.heard(),
             "damaged": self._on_damage,
         }
-        if self._decoder.device_stamps.are_sent:
+        if self._decoder.device_stamps.times:
             called["tell_times"] = self._on_times
         if getattr(self._publisher.watch.look, "__func__", None) is not Watch.look:
             called["look"] = self._on_look

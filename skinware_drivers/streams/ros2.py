@@ -308,7 +308,8 @@ class _Plan:
     """
 
     def __init__(self, message: Message, parts: Sequence[Part]) -> None:
-        self.parts: Sequence[Part] = [piece for part in parts for piece in part.pieces()]
+        pieces = [piece for part in parts for piece in part.pieces()]
+        self.parts: Sequence[Part] = list({(each.patch, each.name): each for each in reversed(pieces)}.values())[::-1]
         self.messages = self.listed = 0
         self._size, self._fixed = len(message.sample), message.fixed
         self._as = np.frombuffer(message.sample, np.uint8)[self._fixed]

@@ -25,7 +25,7 @@ _CATALOGUE = {each.name: each for each in vars(sensor_types).values() if isinsta
 _VENDOR = 0x20520 << 12
 """The vendor of quantities that the catalogue lacks; their numbers follow from their names."""
 _PLACEHOLDER = re.compile(r"\{([\w.]+)\}")
-_LONGEST_NAME = 48
+_LONGEST_TEXT, _LONGEST_NAME, _BEGINNING = 48, 32, 12
 
 Places = npt.NDArray[np.int64]
 """First byte of each number of a column, in a sample."""
@@ -114,18 +114,19 @@ class Part:
         return values + np.repeat(status, len(self.types)).tobytes()
 
     def pieces(self) -> list[Part]:
-        """Return this part, or parts of at most ``MOST_VALUES`` values, of whole rows if it has rows."""
+        """Return this part, or parts of at most ``MOST_VALUES`` values, of whole rows if it has any; names are cut."""
         columns = int(self.kind.partition("x")[2] or 1) if re.fullmatch(r"\d+x\d+", self.kind) else 1
         most = max(1, MOST_VALUES // len(self.types) // columns) * columns
         if self.taxels <= most:
-            return [self]
+            return [replace(self, patch=_short(self.patch), name=_short(self.name))]
         return [self._piece(first, min(first + most, self.taxels), columns) for first in range(0, self.taxels, most)]
 
     def _piece(self, first: int, end: int, columns: int) -> Part:
         rows = slice(first, end)
         return replace(
             self,
-            name=f"{self.name} {first}-{end - 1}",
+            patch=_short(self.patch),
+            name=_short(f"{self.name} {first}-{end - 1}"),
             kind=f"{(end - first) // columns}x{columns}" if columns > 1 else self.kind,
             places=tuple(each[rows] for each in self.places),
             doubt=None if self.doubt is None else (self.doubt[0][rows], *self.doubt[1:]),
@@ -276,4 +277,14 @@ def _doubt(status: str, message: Message, within: Indices, count: int) -> tuple[
 
 
 def _name(text: str) -> str:
-    return printable(text).strip().encode()[:_LONGEST_NAME].decode(errors="ignore")
+    return printable(text).strip().encode()[:_LONGEST_TEXT].decode(errors="ignore")
+
+
+def _short(name: str) -> str:
+    """Return a name of at most 32 bytes; a longer one keeps its beginning and its end."""
+    data = name.encode()
+    if len(data) <= _LONGEST_NAME:
+        return name
+    return (
+        f"{data[:_BEGINNING].decode(errors='ignore')}~{data[_BEGINNING + 1 - _LONGEST_NAME :].decode(errors='ignore')}"
+    )

@@ -497,6 +497,22 @@ def test_samples_that_are_too_long_are_refused(domain: int) -> None:
         read_until(skin.reader, lambda f: is_whole(f) and skin.reader.bus_counters(f)[0]["refused"] > 0)
 
 
+def test_names_that_are_too_long_for_a_structure(domain: int) -> None:
+    name, case = "thumb_of_the_left_hand_of_the_second_robot", case_of("tactile_msgs/msg/TactileState")
+
+    def sample(number: int) -> Any:
+        return TactileState(header(number), [Channel(name + end, ramp(number, 2)) for end in ("_a", "_b")])
+
+    topic = "/robot_2/hands/left/fingers/touch/raw"
+    with published(domain, case, f"rt{topic}", sample=sample), driven(domain, topic=(topic,)) as skin:
+        structure = read_until(skin.reader, is_whole).structure
+        assert structure.patch_name.tolist() == [b"/robot_2/han~t/fingers/touch/raw"]
+        assert structure.module_name.tolist() == [
+            b"thumb_of_the~_the_second_robot_a",
+            b"thumb_of_the~_the_second_robot_b",
+        ]
+
+
 def test_a_record_of_a_topic_that_is_not_known() -> None:
     driver = Ros2Driver(Ros2Options())
     [frame] = driver.framing.framer().feed(record(999, 0, b"\0\1\0\0abcd"))

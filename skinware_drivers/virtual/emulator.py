@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
-from skinware_drivers.virtual.device import DATA, Actor, Device
+from skinware_drivers.virtual.device import DATA, Device
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.stage import OptionsT, Stage
 
@@ -85,7 +86,7 @@ class Emulator(Stage[OptionsT]):
         swing: what a firm press adds to it.
     """
 
-    streams: ClassVar[Literal["on_command", "always", "never"]] = "on_command"
+    streams: Literal["on_command", "always", "never"] = "on_command"
     identifiers: Collection[int] = ()
     full_scale: int | Sequence[int]
     lowest: int | Sequence[int] = 0
@@ -127,8 +128,13 @@ class Emulator(Stage[OptionsT]):
         self.burst(device, time_ns)
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of frames with data that the devices send, for the option ``silence``."""
-        return [self.kind_of(identifier, b"") for identifier in sorted(self.identifiers)]
+        """Name the kinds of frames with data, for the option ``silence``; by default those in a burst of each device."""
+        values, found = self._each("rest").tolist(), dict[str, None]()
+        for device in self.devices.values():
+            trial = Device(device.number, deque(), device.ready_ns, self.options.seed)
+            trial.memory = dict(device.memory)
+            found |= dict.fromkeys(self.kind_of(*frame) for frame in self.frames(trial, values))
+        return list(found)
 
     # A subclass may use these
 
@@ -161,12 +167,12 @@ class Emulator(Stage[OptionsT]):
 
     # Within
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
+    def power_up(self, now_ns: int) -> None:
         """Make the devices and everything else on the bus."""
         places = self.places()
         self._n_values = len(places)
         self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
-        return super().power_up(now_ns)
+        super().power_up(now_ns)
 
     def check_frame(self, frame: CanFrame) -> None:
         if self.medium == "can":

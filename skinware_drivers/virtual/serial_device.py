@@ -84,8 +84,8 @@ class SerialEmulator(Emulator[OptionsT]):
         return "data"
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of messages with data; by default there is one."""
-        return ["data"]
+        """Name the kinds of messages with data: those of a burst, or ``data`` of devices that only answer."""
+        return ["data"] if self.streams == "never" else super().kinds()
 
     # Within
 
@@ -177,7 +177,7 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
 
     def kinds(self) -> Sequence[str]:
         """Name the registers with data; a question for a silent one gets no answer."""
-        device = Device(self.numbers[0], self, self.wire.attach(), 0)
+        device = next(iter(self.devices.values()))
         return [str(address) for address in sorted(self.registers(device, self._each("rest").tolist()))]
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:

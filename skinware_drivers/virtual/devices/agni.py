@@ -57,9 +57,6 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         """Return ``sensor1`` and so on; other messages are answers."""
         return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
 
-    def kinds(self) -> Sequence[str]:
-        return [f"sensor{number}" for number, _ in enumerate(self.options.sensors, 1)]
-
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         target, number = command[2:4]
         if functools.reduce(operator.xor, command):

@@ -44,9 +44,6 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(16, 4)
 
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(identifier, b"") for identifier in (0x054 << 2, 0x055 << 2)]
-
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
 
@@ -68,17 +65,10 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(4, 4)
 
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(identifier, b"") for identifier in (self._first << 2, self._first + 2 << 2)]
-
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         pascals = [value + self.options.air_pa for value in values]
-        first, second = self._first << 2, self._first + 2 << 2
-        return [(first, struct.pack("<2i", *pascals[:2])), (second, struct.pack("<2i", *pascals[2:]))]
-
-    @property
-    def _first(self) -> int:
-        return 0x050 if self.options.as_in_manual else 0x0F0
+        first = 0x050 if self.options.as_in_manual else 0x0F0
+        return [(first << 2, struct.pack("<2i", *pascals[:2])), (first + 2 << 2, struct.pack("<2i", *pascals[2:]))]
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):

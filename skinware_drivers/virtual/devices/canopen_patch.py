@@ -18,7 +18,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from skinware_drivers.virtual.device import Actor, Seconds
+from skinware_drivers.virtual.device import Seconds
 from skinware_drivers.virtual.events import Event
 
 _HEARTBEAT = "heartbeat"
@@ -61,13 +61,13 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         count = sum(_is_felt(variable) for variable in mapped)
         return on_a_grid(count, max(1, round(count**0.5)))
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
-        actors, options = super().power_up(now_ns), self.options
+    def power_up(self, now_ns: int) -> None:
+        super().power_up(now_ns)
+        options = self.options
         for number in options.faulty:
             for after_s, code in ((0, _TOO_HOT), (options.faulty_for_s, 0)):
                 at_ns = now_ns + round((options.faulty_after_s + after_s) * 1e9)
                 self.schedule(at_ns, partial(self._report, self.devices[number], code))
-        return actors
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Send the boot-up message and be pre-operational, or with ``streaming`` operational."""
@@ -97,11 +97,8 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def kinds(self) -> Sequence[str]:
         """Name the TPDOs, the answers of SDO and the heartbeats of each node."""
-        found = []
-        for number in self.numbers:
-            node = _make_node(self.options.eds, number, None)
-            found += [*(identifier for identifier, _ in _tpdos(node)), 0x580 + number, 0x700 + number]
-        return [self.kind_of(identifier, b"") for identifier in found]
+        beside = [self.kind_of(first + number, b"") for number in self.numbers for first in (0x580, 0x700)]
+        return [*super().kinds(), *beside]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         found, rest = [], list(values)

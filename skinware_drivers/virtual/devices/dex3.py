@@ -45,9 +45,6 @@ class EmulatedDex3(SerialEmulator[EmulatedDex3Options]):
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         return f"hand{payload[6]}" if len(payload) > 6 else ""
 
-    def kinds(self) -> Sequence[str]:
-        return [f"hand{number}" for number in self.numbers]
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         pads = b"".join(struct.pack("<24f2I", *values[24 * pad : 24 * pad + 24], 0, 0) for pad in range(_PADS))
         sample = b"\0\1\0\0" + struct.pack("<I", 7) + 7 * _MOTOR + struct.pack("<I", _PADS) + pads + _IMU + _POWER

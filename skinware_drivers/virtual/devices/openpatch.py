@@ -150,7 +150,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         return f"module{body[1]}" if body[0] == _DATA else {_BOOT: "boot", _REPORT: "report"}.get(body[0], "answer")
 
     def kinds(self) -> Sequence[str]:
-        return [*(f"module{module}" for module in range(self.options.modules)), "boot", "report"]
+        return [*super().kinds(), "boot", "report"]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         memory = device.memory

@@ -64,7 +64,9 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     swing = 60
 
     def __init__(self, options: EmulatedPaxiniOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.sensors if options.board == "converter" else (1,)
+        if options.board == "converter":
+            self.numbers: Sequence[int] = options.sensors
+            self.streams = "never"
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
@@ -81,11 +83,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     def points_of(self, slot: int) -> int:
         """Return the taxels of the module in a slot; those on the palm send at most nine."""
         return self.options.points if slot < 20 else min(9, self.options.points)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        """Let a high-speed board stream, if the options say so; sensors only answer."""
-        if self.options.board == "high_speed":
-            super().boot(device, now_ns)
 
     def feel(self, device: Device, time_s: float) -> Sequence[int]:
         felt = list(super().feel(device, time_s))

@@ -52,9 +52,6 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
         """Name cells by the byte for patch and cell: ``0x13``."""
         return f"0x{payload[1]:02x}"
 
-    def kinds(self) -> Sequence[str]:
-        return [f"0x{patch << 4 | cell:02x}" for patch in self.options.patches for cell in range(self.options.cells)]
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         return [
             bytes((0x55, device.number << 4 | cell)) + struct.pack(">i", value)[1:] for cell, value in enumerate(values)

@@ -38,8 +38,5 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
         """Name taxels by their first byte: ``0x3c``."""
         return f"0x{payload[0]:02x}"
 
-    def kinds(self) -> Sequence[str]:
-        return [f"0x{0x3C + taxel:02x}" for taxel in range(self.options.taxels)]
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]

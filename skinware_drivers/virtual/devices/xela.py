@@ -59,9 +59,6 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
             self.start(device, now_ns)
         return True
 
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(taxel, b"") for board in self.numbers for taxel in self._taxels(board)]
-
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         xyz = zip(values[0::3], values[1::3], values[2::3], strict=True)
         return [(i, struct.pack(">x3Hx", *axes)) for i, axes in zip(self._taxels(device.number), xyz, strict=True)]
@@ -109,9 +106,6 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         """Return ``sensor1`` and so on, or ``welcome``."""
         sent = json.loads(payload)
         return next((f"sensor{number}" for number in self.numbers if str(number) in sent), "welcome")
-
-    def kinds(self) -> Sequence[str]:
-        return [f"sensor{number}" for number in self.numbers]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         time_s = device.sampled_ns / 1e9

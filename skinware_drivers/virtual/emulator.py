@@ -24,6 +24,8 @@ from skinware_drivers.virtual.stage import OptionsT, Stage
 
 CanFrame = tuple[int, bytes]
 """Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""
+Places = npt.NDArray[np.float64]
+"""(n, 2) places of the values of a device, 0 to 1."""
 Source = Callable[[int, int], Sequence[int]]
 """(number of the device, number of its burst) -> the values that it sends, instead of felt ones."""
 
@@ -40,10 +42,10 @@ class WanderingPress:
 
     Args:
         number: of the device; devices with other numbers feel other presses.
-        places: (n, 2) of its sensors, 0 to 1.
+        places: of its sensors.
     """
 
-    def __init__(self, seed: int, number: int, places: npt.NDArray[np.float64]) -> None:
+    def __init__(self, seed: int, number: int, places: Places) -> None:
         random = np.random.default_rng([seed, number, 3])
         self._phase = random.uniform(0, 9)
         self._first_s = random.uniform(0, _PAUSE_S)
@@ -102,8 +104,8 @@ class Emulator(Stage[OptionsT]):
     # A subclass defines these
 
     @abstractmethod
-    def places(self) -> npt.NDArray[np.float64]:
-        """Return (n, 2) places of a device's n values, 0 to 1; see :func:`on_a_grid`."""
+    def places(self) -> Places:
+        """Return the places of a device's values; see :func:`on_a_grid`."""
 
     @abstractmethod
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
@@ -128,7 +130,7 @@ class Emulator(Stage[OptionsT]):
         self.burst(device, time_ns)
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of frames with data, for the option ``silence``; by default those in a burst of each device."""
+        """Name the kinds of frames with data, for the option ``silence``; by default those of a burst."""
         values, found = self._each("rest").tolist(), dict[str, None]()
         for device in self.devices.values():
             trial = Device(device.number, deque(), device.ready_ns, self.options.seed)
@@ -213,7 +215,7 @@ def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDAr
     return np.broadcast_to(numbers, n_values)
 
 
-def on_a_grid(count: int, columns: int, each: int = 1) -> npt.NDArray[np.float64]:
+def on_a_grid(count: int, columns: int, each: int = 1) -> Places:
     """Return (count * each, 2) places of sensors in rows, with ``each`` at the same place."""
     number = np.arange(count)
     rows = -(-count // columns)

@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import skinware.realtime
 from skinware.errors import PlatformError
@@ -25,16 +25,6 @@ _TFD_TIMER_ABSTIME = 1
 
 class _Itimerspec(ctypes.Structure):
     _fields_ = (("it_interval", Timespec), ("it_value", Timespec))
-
-
-class Timer(Protocol):
-    """A descriptor that becomes readable at a moment."""
-
-    def fileno(self) -> int: ...
-
-    def wake_at(self, time_ns: int | None) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class MonotonicTimer:
@@ -79,14 +69,6 @@ class MonotonicTimer:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-
-class Clock(Protocol):
-    """CLOCK_MONOTONIC, or the time of a test. A call returns ns."""
-
-    def __call__(self) -> int: ...
-
-    def timer(self) -> Timer: ...
 
 
 class MonotonicClock:
@@ -189,6 +171,12 @@ class HandTimer:
             self._clock.forget(self)
             os.close(self._fd)
             self._fd = -1
+
+
+Timer = MonotonicTimer | HandTimer
+"""A descriptor that becomes readable at a moment."""
+Clock = MonotonicClock | HandClock
+"""CLOCK_MONOTONIC, or the time of a test. A call returns ns."""
 
 
 class _PassingTime(selectors.EpollSelector):

@@ -132,7 +132,13 @@ class Stage(ABC, HasOptions[OptionsT]):
             time_ns: when they are ready, unless the option ``jitter_us`` delays them.
             usual: all have 8 bytes and 11-bit identifiers.
         """
-        ready_ns = time_ns + self._delay_ns(device, time_ns)
+        ready_ns = time_ns
+        if self.options.jitter_us:
+            delay_ns = int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
+            ready_ns += delay_ns
+            if delay_ns:
+                late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+                self.log.append(late)
         chances = [getattr(self.options, name) for name in self.frame_faults]
         lost: set[int] = set()
         if any(chances) or sum(map(len, device.queue)) + len(identifiers) > self.longest_queue:
@@ -360,15 +366,6 @@ class Stage(ABC, HasOptions[OptionsT]):
                 payload=payload.hex(),
             )
         )
-
-    def _delay_ns(self, device: Device, time_ns: int) -> int:
-        if not self.options.jitter_us:
-            return 0
-        delay_ns = int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
-        if delay_ns:
-            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
-            self.log.append(late)
-        return delay_ns
 
     def _with_faults(
         self,

@@ -9,8 +9,6 @@ import struct
 from collections.abc import Collection, Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import (
@@ -18,6 +16,7 @@ from skinware_drivers.virtual import (
     Device,
     Emulator,
     EmulatorOptions,
+    Places,
     SerialEmulator,
     SerialEmulatorOptions,
     on_a_grid,
@@ -41,7 +40,7 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     identifiers: Collection[int] = frozenset((0x150, 0x154, 0x3C0, 0x3C8, 0x140, 0x148))
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
@@ -62,7 +61,7 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     identifiers: Collection[int] = EmulatedAllegroV5.identifiers
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(4, 4)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
@@ -84,7 +83,7 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
     datagrams = True
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _PADS = 9
 _PRESSURE, _TEMPERATURE = (100_000,) * 12, (25,) * 12
@@ -38,7 +37,7 @@ class EmulatedDex3(SerialEmulator[EmulatedDex3Options]):
     streams = "always"
     numbered_by = "hands"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         cells = on_a_grid(12 * _PADS, 12).reshape(_PADS, 12, 2)
         return np.concatenate([cells, cells], axis=1).reshape(-1, 2)
 

@@ -7,14 +7,14 @@ tests/serial/test_paxini.py.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _LONGEST_COMMAND = 64
 _NO_COMMAND = 2
@@ -69,7 +69,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             self.streams = "never"
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         options = self.options
         modules = [options.points] if options.board == "converter" else [self.points_of(slot) for slot in options.slots]
         return on_a_grid(sum(modules), 8, each=3)
@@ -98,10 +98,9 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         """Answer commands with a right LRC."""
         if len(command) <= _NO_COMMAND or sum(command) & 0xFF:
             return None
-        of_board: Callable[[Device, bytes, int], bytes | None] = self._answer_of_sensor
         if self.options.board == "high_speed":
-            of_board = self._answer_of_hand
-        return of_board(device, command, now_ns)
+            return self._answer_of_hand(device, command, now_ns)
+        return self._answer_of_sensor(device, command, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         if self.options.board == "high_speed":
@@ -109,7 +108,11 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        forces = self._tared(device, values)
+        felt = np.array(values).reshape(-1, 3)
+        felt[:, 2] &= 0xFF
+        if device.memory.pop("tare", False):
+            device.memory["zero"] = felt
+        forces = _clipped(felt - device.memory.get("zero", 0))
         if self.options.board == "converter":
             address, count = device.memory["asked"]
             memory = _bytes(_resultant(forces)) + bytes(27) + _bytes(forces)  # from address 1008 on
@@ -164,8 +167,13 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         if function == 0x10 and register == 0x17:
             return self._switch(device, bool(data[0]), now_ns)
         if function == 0x17 and register == 0x02:
-            ready_ns = now_ns + round(1e9 * self.options.calibrates_s)
-            self.schedule(ready_ns, lambda time_ns: self._calibrated(device, time_ns))
+
+            def calibrated(time_ns: int) -> None:
+                if device.alive:
+                    device.memory["tare"] = True
+                    self.say(device, message(b"\xaa\x55\0\x17\x02\0\x01\0\0"), time_ns)
+
+            self.schedule(now_ns + round(1e9 * self.options.calibrates_s), calibrated)
             return b""
         return message(b"\xaa\x55\0", struct.pack("<BHH", 0x81, register, 0))
 
@@ -189,18 +197,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         if on and self.options.acknowledge == "nothing":
             return b""
         return message(b"\xaa\x55\0\x10\x17\0\x01\0\0")
-
-    def _calibrated(self, device: Device, time_ns: int) -> None:
-        if device.alive:
-            device.memory["tare"] = True
-            self.say(device, message(b"\xaa\x55\0\x17\x02\0\x01\0\0"), time_ns)
-
-    def _tared(self, device: Device, values: Sequence[int]) -> Forces:
-        felt = np.array(values).reshape(-1, 3)
-        felt[:, 2] &= 0xFF
-        if device.memory.pop("tare", False):
-            device.memory["zero"] = felt
-        return _clipped(felt - device.memory.get("zero", 0))
 
 
 def _clipped(forces: Forces) -> Forces:

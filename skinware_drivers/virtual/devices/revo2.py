@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
 from skinware_drivers.virtual.serial_device import text_registers
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
@@ -64,7 +63,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
             self.full_scale, self.rest, self.swing = (127, 3, 90) if options.edition == "force3d" else (0xFFFF, 30, 900)
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         if self.options.edition == "touch":
             return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
         return on_a_grid(_N_VALUES[self.options.edition], 12)

@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -31,7 +29,7 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
     swing = -3000
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.taxels, 8)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002

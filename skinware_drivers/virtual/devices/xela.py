@@ -8,7 +8,6 @@ from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import (
@@ -16,6 +15,7 @@ from skinware_drivers.virtual import (
     Device,
     Emulator,
     EmulatorOptions,
+    Places,
     SerialEmulator,
     SerialEmulatorOptions,
     on_a_grid,
@@ -47,7 +47,7 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         taxels = {taxel for board in options.boards for taxel in self._taxels(board)}
         self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4, each=3) if self.options.model == "4x4" else on_a_grid(24, 6, each=3)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
@@ -93,7 +93,7 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
     speed_mbit_s = 100
     numbered_by = "sensors"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         count, columns = _TAXELS[self.options.model]
         return np.repeat(on_a_grid(count, columns), 3, axis=0)
 

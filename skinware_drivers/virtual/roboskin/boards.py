@@ -197,7 +197,7 @@ class EmulatedBoard(Device):
         if first > last or last >= TRIANGLES:
             return False
         self._active[first : last + 1] = bool(enable & 1)
-        self._converters.set_triangles(first, last, shift, payload[5] | payload[6] << 8)
+        self._converters.set_triangles(first, last, shift=shift, cdc_offset=payload[5] | payload[6] << 8)
         return True
 
     def _set_address(self, address: int) -> bool:

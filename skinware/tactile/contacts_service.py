@@ -17,12 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
@@ -31,18 +30,17 @@ from skinware.tactile.source_service import (
     SourceReader,
     SourceSample,
     SourceWriter,
-    Static,
     ValueSource,
 )
 from skinware.tactile.tracking import TrackingSettings
 
 NAME = "contacts"
 
-_TEXTS = {
+_ABOUT: dict[str, tuple[str | None, str]] = {
     "id": ("", "the same as long as the contact lasts; 0: this row is empty"),
     "age_s": ("s", "since it began"),
-    "load": ("", "sum of the values of its taxels"),
-    "peak": ("", "the largest of them"),
+    "load": (None, "sum of the values of its taxels"),
+    "peak": (None, "the largest of them"),
     "area_m2": ("m2", "that its taxels stand for"),
     "force_n": ("N", "of values in N, or of pressures in Pa by area"),
     "n": ("", "number of its taxels"),
@@ -53,8 +51,8 @@ _TEXTS = {
     "kind": ("", "0: a touch, 1: a hold, 2: sliding"),
     "provisional": ("", "1: only its last frames speak for it, and its load is 0"),
     "clipped": ("", "number of its taxels that are at the end of their range"),
-    "load_whole": ("", "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
-    "uncertainty": ("", "how much of the load could be noise or drift; NaN: not known"),
+    "load_whole": (None, "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
+    "uncertainty": (None, "how much of the load could be noise or drift; NaN: not known"),
     "count": ("", "number of rows that are filled"),
     "beyond": ("", "contacts for which there was no row"),
     "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),
@@ -69,26 +67,13 @@ class ContactsSource(ValueSource):
         uid: (n,) uint64, of the n taxels.
     """
 
+    about = _ABOUT
     uid: npt.NDArray[np.uint64]
 
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        return cls(**cls.values(static), uid=static["sensor_uid"].astype(np.uint64))
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        return {"sensor_uid": self.uid, **super().static()}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
+    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """See :class:`.source_service.Source`."""
         forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
-        forms |= {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
-        units = {name: unit for name, (unit, _) in _TEXTS.items()}
-        units |= dict.fromkeys(("load", "peak", "load_whole", "uncertainty"), self.unit)
-        return {
-            name: Column(np.dtype(dtype), shape, units[name], _TEXTS[name][1]) for name, (dtype, shape) in forms.items()
-        }
+        return forms | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
 
 
 class ContactsSample(SourceSample[ContactsSource]):

@@ -17,19 +17,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import texts
 from skinware.errors import ConfigurationError
-from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.health import COLUMNS, Health, HealthReport
-from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
+from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -37,7 +35,7 @@ NAME = "health"
 RATE_HZ = 1.0
 """How often it is published."""
 
-_TEXTS = {
+_ABOUT: dict[str, tuple[str | None, str]] = {
     "kind": ("", "0: good, 1: never touched, 2: weak, 3: dead, 4: noisy, 5: stuck, 6: clipped"),
     "value": ("", "the newest, in the unit of the type"),
     "still_s": ("s", "for how long it has not changed"),
@@ -61,26 +59,18 @@ class HealthSource(Source):
         type_id: (n,) uint32, of their types.
     """
 
+    about = _ABOUT
     driver: str
     uid: npt.NDArray[np.uint64]
     type_id: npt.NDArray[np.uint32]
 
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
-        if uid.shape != type_id.shape:
-            raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
-        return cls(texts(static["driver"])[0], uid, type_id)
+    def __post_init__(self) -> None:
+        if self.uid.shape != self.type_id.shape:
+            raise ValueError(f"{len(self.uid)} uids of {len(self.type_id)} types")
 
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        driver = np.array([self.driver.encode()], "S64")
-        return {"sensor_uid": self.uid, "sensor_type": self.type_id, "driver": driver}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
-        return {name: Column(np.dtype(dtype), self.uid.shape, *_TEXTS[name]) for name, (dtype, _) in COLUMNS.items()}
+    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """See :class:`.source_service.Source`."""
+        return {name: (dtype, self.uid.shape) for name, (dtype, _) in COLUMNS.items()}
 
 
 class HealthSample(SourceSample[HealthSource]):

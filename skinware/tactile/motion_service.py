@@ -15,14 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self, Unpack
+from typing import Any, Unpack
 
-import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import texts
 from skinware.errors import ConfigurationError
-from skinware.service import Column
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.contacts import ContactSet
@@ -33,14 +30,13 @@ from skinware.tactile.source_service import (
     SourceReader,
     SourceSample,
     SourceWriter,
-    Static,
     ValueSource,
 )
 
 NAME = "motion"
 
-_TEXTS = {
-    "load": ("", "sum of the values of its touched sensors"),
+_ABOUT: dict[str, tuple[str | None, str]] = {
+    "load": (None, "sum of the values of its touched sensors"),
     "contacts": ("", "number of contacts that reach into it"),
     "velocity_m_s": ("m/s", "mean velocity of its contacts; NaN: none is known"),
     "speed_m_s": ("m/s", "length of it"),
@@ -56,24 +52,12 @@ class MotionSource(ValueSource):
         regions: names of the regions.
     """
 
+    about = _ABOUT
     regions: tuple[str, ...]
 
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        return cls(**cls.values(static), regions=tuple(texts(static["region_name"])))
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        return {"region_name": np.array([name.encode() for name in self.regions]), **super().static()}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
-        units = {name: unit for name, (unit, _) in _TEXTS.items()} | {"load": self.unit}
-        return {
-            name: Column(np.dtype(dtype), (len(self.regions), *shape), units[name], _TEXTS[name][1])
-            for name, (dtype, shape) in COLUMNS.items()
-        }
+    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """See :class:`.source_service.Source`."""
+        return {name: (dtype, (len(self.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
 
 
 class MotionSample(SourceSample[MotionSource]):

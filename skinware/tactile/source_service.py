@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, Self, TypedDict, TypeVar, Unpack, cast
 
 import numpy as np
@@ -21,7 +21,6 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
 from skinware.service import Column, ServiceReader, ServiceWriter
 
-Static = Mapping[str, npt.NDArray[Any]]
 SourceT = TypeVar("SourceT", bound="Source")
 
 
@@ -34,21 +33,66 @@ class ServiceOptions(TypedDict, total=False):
     group: str | None
 
 
+_STATIC = {
+    "driver": ("driver", "S64"),
+    "type_name": ("type_name", "S32"),
+    "unit": ("type_unit", "S16"),
+    "frames": ("frame_name", "S64"),
+    "regions": ("region_name", "S"),
+    "uid": ("sensor_uid", "<u8"),
+    "type_id": ("sensor_type", "<u4"),
+}
+"""Static column and dtype of each attribute that a source may have."""
+_LISTS = ("frames", "regions")
+
+
 class Source(ABC):
-    """The description of a service."""
+    """The description of a service: a dataclass, with these attributes among others.
+
+    Attributes:
+        about: unit of each column of a sample, None for that of the values; and its meaning.
+        driver: name of the driver of the values.
+        unit: unit of the values.
+    """
+
+    about: ClassVar[Mapping[str, tuple[str | None, str]]]
+    driver: str
+    unit: str
 
     @classmethod
-    @abstractmethod
-    def read(cls, static: Static) -> Self:
+    def read(cls, static: Mapping[str, npt.NDArray[Any]]) -> Self:
         """Read it from static columns; raises LookupError, ValueError or TypeError if they are of another form."""
+        found: dict[str, Any] = {}
+        for field in fields(cast(Any, cls)):
+            column, dtype = _STATIC[field.name]
+            if dtype.startswith("S"):
+                names = tuple(texts(static[column]))
+                found[field.name] = names if field.name in _LISTS else names[0]
+            else:
+                found[field.name] = static[column].astype(dtype)
+        return cls(**found)
 
-    @abstractmethod
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """Return the static columns."""
+        columns = {}
+        for field in fields(cast(Any, self)):
+            (column, dtype), value = _STATIC[field.name], getattr(self, field.name)
+            if dtype.startswith("S"):
+                value = [name.encode() for name in (value if field.name in _LISTS else [value])]
+            columns[column] = np.array(value, dtype)
+        return columns
 
     @abstractmethod
+    def forms(self) -> Mapping[str, tuple[str, tuple[int, ...]]]:
+        """Return dtype and shape of each column of a sample."""
+
     def columns(self) -> dict[str, Column]:
         """Return the columns of a sample."""
+        columns = {}
+        for name, (dtype, shape) in self.forms().items():
+            unit, text = self.about[name]
+            columns[name] = Column(np.dtype(dtype), shape, self.unit if unit is None else unit, text)
+        return columns
 
 
 @dataclass(frozen=True)
@@ -66,25 +110,6 @@ class ValueSource(Source):
     type_name: str
     unit: str
     frames: tuple[str, ...]
-
-    @staticmethod
-    def values(static: Static) -> dict[str, Any]:
-        """Return the attributes above from static columns."""
-        return {
-            "driver": texts(static["driver"])[0],
-            "type_name": texts(static["type_name"])[0],
-            "unit": texts(static["type_unit"])[0],
-            "frames": tuple(texts(static["frame_name"])),
-        }
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the static columns of the attributes above."""
-        return {
-            "frame_name": np.array([name.encode() for name in self.frames], "S64"),
-            "driver": np.array([self.driver.encode()], "S64"),
-            "type_name": np.array([self.type_name.encode()], "S32"),
-            "type_unit": np.array([self.unit.encode()], "S16"),
-        }
 
 
 class SourceWriter(Generic[SourceT]):

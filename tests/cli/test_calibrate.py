@@ -22,9 +22,9 @@ from skinware.tactile.calibration.state import ForceSession, PressSession, Strok
 from skinware.tactile.calibration.topology import StrokeSums
 from skinware.tactile.curves import read_curves
 from skinware.tactile.testing import Surface, triangles
-from skinware.tactile.testing.probe import Probe
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
+from tests.cli.probe import Probe
 from tests.commands import run, running
 from tests.tactile.calibrating import off_m, presses, stroked
 

@@ -210,7 +210,12 @@ class Dues:
         middle, one, other = self._pairs.around(active[self._frames % step :: step], hard)
         if not len(middle):
             return
-        self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= _APART_S]))
+        ended = np.unique(middle[now_s - self._compared_s[middle] >= _APART_S])
+        due, shown = self._hardest_due[ended], self._hardest_shown[ended]
+        self.due[ended] = _KEPT * self.due[ended] + due * due
+        self.shown[ended] = _KEPT * self.shown[ended] + due * shown
+        self.touches[ended] += due > 0
+        self._hardest_due[ended] = 0
         self._compared_s[middle] = now_s
         shown, left, right = (np.maximum(given[taxel] - calm.baseline[taxel], 0) for taxel in (middle, one, other))
         due = np.sqrt(left * right)
@@ -223,14 +228,6 @@ class Dues:
         known = (self.touches >= touches) & (self.due > 0)
         share: npt.NDArray[np.float64] = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
         return share
-
-    def _end_touches(self, taxels: Whole) -> None:
-        """Add up what some taxels showed in their last touch."""
-        due, shown = self._hardest_due[taxels], self._hardest_shown[taxels]
-        self.due[taxels] = _KEPT * self.due[taxels] + due * due
-        self.shown[taxels] = _KEPT * self.shown[taxels] + due * shown
-        self.touches[taxels] += due > 0
-        self._hardest_due[taxels] = 0
 
 
 class Pairs:

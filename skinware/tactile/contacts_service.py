@@ -16,7 +16,6 @@ columns: ``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_na
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -26,11 +25,12 @@ from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
 from skinware.tactile.source_service import (
+    ServiceForm,
     ServiceOptions,
+    Source,
     SourceReader,
     SourceSample,
     SourceWriter,
-    ValueSource,
 )
 from skinware.tactile.tracking import TrackingSettings
 
@@ -59,24 +59,15 @@ _ABOUT: dict[str, tuple[str | None, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class ContactsSource(ValueSource):
-    """The values that contacts are found in.
-
-    Attributes:
-        uid: (n,) uint64, of the n taxels.
-    """
-
-    about = _ABOUT
-    uid: npt.NDArray[np.uint64]
-
-    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """See :class:`.source_service.Source`."""
-        forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
-        return forms | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
+    return forms | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", source.uid.shape)}
 
 
-class ContactsSample(SourceSample[ContactsSource]):
+_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "uid"), _ABOUT, _columns_of)
+
+
+class ContactsSample(SourceSample):
     """The contacts of one frame; iterate over it for each of them, the oldest first."""
 
     __slots__ = ("_contacts",)
@@ -100,7 +91,7 @@ class ContactsSample(SourceSample[ContactsSource]):
         return iter(self.contacts)
 
 
-class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
+class ContactsReader(SourceReader[ContactsSample]):
     """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose samples are contacts.
 
     Args:
@@ -111,8 +102,7 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = ContactsSource
+    form = _FORM
     frame_class = ContactsSample
 
     def events(self, *, timeout_s: float | None = None) -> Iterator[ContactEvent]:
@@ -134,7 +124,7 @@ class More(TypedDict, total=False):
     uncertainty: npt.NDArray[Any] | None
 
 
-class ContactsWriter(SourceWriter[ContactsSource]):
+class ContactsWriter(SourceWriter):
     """Finds the contacts in a driver's values, and publishes them.
 
     Args:
@@ -153,7 +143,7 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         ConfigurationError: the neighbours are not of these sensors.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self,
@@ -211,6 +201,6 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         self._contacts = contacts
 
 
-def _source(structure: Structure, type_name: str, driver: str, contacts: Contacts) -> ContactsSource:
+def _source(structure: Structure, type_name: str, driver: str, contacts: Contacts) -> Source:
     unit, uid = structure.type(type_name).unit, structure.sensor_uid[structure.index(type_name)]
-    return ContactsSource(driver, type_name, unit, contacts.frames, uid)
+    return Source(driver, type_name, unit, contacts.frames, uid=uid)

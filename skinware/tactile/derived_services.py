@@ -33,7 +33,7 @@ from skinware.tactile.source_service import ServiceOptions, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
-WriterT = TypeVar("WriterT", bound=SourceWriter[Any])
+WriterT = TypeVar("WriterT", bound=SourceWriter)
 
 _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 

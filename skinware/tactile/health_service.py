@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy as np
@@ -27,7 +26,14 @@ from skinware.structure import Structure
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.health import COLUMNS, Health, HealthReport
-from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter
+from skinware.tactile.source_service import (
+    ServiceForm,
+    ServiceOptions,
+    Source,
+    SourceReader,
+    SourceSample,
+    SourceWriter,
+)
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -49,31 +55,14 @@ _ABOUT: dict[str, tuple[str | None, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class HealthSource(Source):
-    """The sensors whose health is reported.
-
-    Attributes:
-        driver: name of the driver.
-        uid: (n,) uint64, of its n sensors, in the order of its frames.
-        type_id: (n,) uint32, of their types.
-    """
-
-    about = _ABOUT
-    driver: str
-    uid: npt.NDArray[np.uint64]
-    type_id: npt.NDArray[np.uint32]
-
-    def __post_init__(self) -> None:
-        if self.uid.shape != self.type_id.shape:
-            raise ValueError(f"{len(self.uid)} uids of {len(self.type_id)} types")
-
-    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """See :class:`.source_service.Source`."""
-        return {name: (dtype, self.uid.shape) for name, (dtype, _) in COLUMNS.items()}
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    return {name: (dtype, source.uid.shape) for name, (dtype, _) in COLUMNS.items()}
 
 
-class HealthSample(SourceSample[HealthSource]):
+_FORM = ServiceForm(NAME, ("driver", "uid", "type_id"), _ABOUT, _columns_of)
+
+
+class HealthSample(SourceSample):
     """The health of all sensors at one time."""
 
     __slots__ = ()
@@ -84,7 +73,7 @@ class HealthSample(SourceSample[HealthSource]):
         return HealthReport(**{name: self.column(name) for name in COLUMNS})
 
 
-class HealthReader(SourceReader[HealthSource, HealthSample]):
+class HealthReader(SourceReader[HealthSample]):
     """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose samples are reports.
 
     Args:
@@ -95,12 +84,11 @@ class HealthReader(SourceReader[HealthSource, HealthSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = HealthSource
+    form = _FORM
     frame_class = HealthSample
 
 
-class HealthWriter(SourceWriter[HealthSource]):
+class HealthWriter(SourceWriter):
     """Publishes the health of the sensors of a driver.
 
     Args:
@@ -110,13 +98,13 @@ class HealthWriter(SourceWriter[HealthSource]):
         options: namespace and group, as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self, structure: Structure, driver: str, *, name: str = NAME, **options: Unpack[ServiceOptions]
     ) -> None:
         self._structure = structure
-        source = HealthSource(driver, structure.sensor_uid, structure.sensor_type)
+        source = Source(driver, uid=structure.sensor_uid, type_id=structure.sensor_type)
         given: ServiceOptions = {"slots": 4, "rate_hz": RATE_HZ, **options}
         super().__init__(source, name, f"health of the sensors of {driver}", **given)
 
@@ -144,7 +132,7 @@ class HealthWriter(SourceWriter[HealthSource]):
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        self._restructure(HealthSource(self.source.driver, structure.sensor_uid, structure.sensor_type))
+        self._restructure(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
         self._structure = structure
 
 

@@ -14,7 +14,6 @@ Columns of a sample: those of :data:`skinware.tactile.motion.COLUMNS`, a row for
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy.typing as npt
@@ -26,11 +25,12 @@ from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
 from skinware.tactile.source_service import (
+    ServiceForm,
     ServiceOptions,
+    Source,
     SourceReader,
     SourceSample,
     SourceWriter,
-    ValueSource,
 )
 
 NAME = "motion"
@@ -44,23 +44,14 @@ _ABOUT: dict[str, tuple[str | None, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class MotionSource(ValueSource):
-    """The values and regions that motion is computed from.
-
-    Attributes:
-        regions: names of the regions.
-    """
-
-    about = _ABOUT
-    regions: tuple[str, ...]
-
-    def forms(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """See :class:`.source_service.Source`."""
-        return {name: (dtype, (len(self.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    return {name: (dtype, (len(source.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
 
 
-class MotionSample(SourceSample[MotionSource]):
+_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "regions"), _ABOUT, _columns_of)
+
+
+class MotionSample(SourceSample):
     """The motion of all regions in one frame; iterate over it for each of them."""
 
     __slots__ = ()
@@ -75,7 +66,7 @@ class MotionSample(SourceSample[MotionSource]):
         return iter(self.motion)
 
 
-class MotionReader(SourceReader[MotionSource, MotionSample]):
+class MotionReader(SourceReader[MotionSample]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose samples are motion.
 
     Args:
@@ -86,12 +77,11 @@ class MotionReader(SourceReader[MotionSource, MotionSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = MotionSource
+    form = _FORM
     frame_class = MotionSample
 
 
-class MotionWriter(SourceWriter[MotionSource]):
+class MotionWriter(SourceWriter):
     """Publishes the motion of a driver's regions.
 
     Args:
@@ -109,7 +99,7 @@ class MotionWriter(SourceWriter[MotionSource]):
         ConfigurationError: no region may have any.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self,
@@ -125,7 +115,7 @@ class MotionWriter(SourceWriter[MotionSource]):
         self._index = regions.of(SkinLayout((driver,), (structure,)), type_name)
         if not self._index:
             raise ConfigurationError(f"no region is of {type_name} sensors")
-        source = MotionSource(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
+        source = Source(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
         super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:

@@ -6,10 +6,9 @@ refuses a service of another form.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Generic, Self, TypedDict, TypeVar, Unpack, cast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Self, TypedDict, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +19,6 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
 from skinware.service import Column, ServiceReader, ServiceWriter
-
-SourceT = TypeVar("SourceT", bound="Source")
 
 
 class ServiceOptions(TypedDict, total=False):
@@ -42,99 +39,100 @@ _STATIC = {
     "uid": ("sensor_uid", "<u8"),
     "type_id": ("sensor_type", "<u4"),
 }
-"""Static column and dtype of each attribute that a source may have."""
+"""Static column and dtype of each attribute of a source."""
 _LISTS = ("frames", "regions")
 
 
-class Source(ABC):
-    """The description of a service: a dataclass, with these attributes among others.
-
-    Attributes:
-        about: unit of each column of a sample, None for that of the values; and its meaning.
-        driver: name of the driver of the values.
-        unit: unit of the values.
-    """
-
-    about: ClassVar[Mapping[str, tuple[str | None, str]]]
-    driver: str
-    unit: str
-
-    @classmethod
-    def read(cls, static: Mapping[str, npt.NDArray[Any]]) -> Self:
-        """Read it from static columns; raises LookupError, ValueError or TypeError if they are of another form."""
-        found: dict[str, Any] = {}
-        for field in fields(cast(Any, cls)):
-            column, dtype = _STATIC[field.name]
-            if dtype.startswith("S"):
-                names = tuple(texts(static[column]))
-                found[field.name] = names if field.name in _LISTS else names[0]
-            else:
-                found[field.name] = static[column].astype(dtype)
-        return cls(**found)
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the static columns."""
-        columns = {}
-        for field in fields(cast(Any, self)):
-            (column, dtype), value = _STATIC[field.name], getattr(self, field.name)
-            if dtype.startswith("S"):
-                value = [name.encode() for name in (value if field.name in _LISTS else [value])]
-            columns[column] = np.array(value, dtype)
-        return columns
-
-    @abstractmethod
-    def forms(self) -> Mapping[str, tuple[str, tuple[int, ...]]]:
-        """Return dtype and shape of each column of a sample."""
-
-    def columns(self) -> dict[str, Column]:
-        """Return the columns of a sample."""
-        columns = {}
-        for name, (dtype, shape) in self.forms().items():
-            unit, text = self.about[name]
-            columns[name] = Column(np.dtype(dtype), shape, self.unit if unit is None else unit, text)
-        return columns
-
-
-@dataclass(frozen=True)
-class ValueSource(Source):
-    """The values that a service is computed from.
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The values that a service is computed from; each kind of service has some of these attributes.
 
     Attributes:
         driver: name of the driver of the values.
         type_name: sensor type of the values.
         unit: unit of values and loads.
         frames: names of the coordinate frames.
+        regions: names of the regions.
+        uid: (n,) uint64, of the n sensors, in the order of the values.
+        type_id: (n,) uint32, of their types.
     """
 
     driver: str
-    type_name: str
-    unit: str
-    frames: tuple[str, ...]
+    type_name: str = ""
+    unit: str = ""
+    frames: tuple[str, ...] = ()
+    regions: tuple[str, ...] = ()
+    uid: npt.NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    type_id: npt.NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
 
 
-class SourceWriter(Generic[SourceT]):
+@dataclass(frozen=True)
+class ServiceForm:
+    """The form of one kind of service.
+
+    Attributes:
+        kind: its name, and the usual name of such a service.
+        attributes: those that its source has, each in a static column.
+        about: unit of each column of a sample, None for that of the values; and its meaning.
+        columns_of: dtype and shape of each column of a sample, by the source.
+    """
+
+    kind: str
+    attributes: tuple[str, ...]
+    about: Mapping[str, tuple[str | None, str]]
+    columns_of: Callable[[Source], Mapping[str, tuple[str, tuple[int, ...]]]]
+
+    def read(self, static: Mapping[str, npt.NDArray[Any]]) -> Source:
+        """Return the source in static columns; raises LookupError, ValueError or TypeError at another form."""
+        found: dict[str, Any] = {}
+        for name in self.attributes:
+            column, dtype = _STATIC[name]
+            if dtype.startswith("S"):
+                names = tuple(texts(static[column]))
+                found[name] = names if name in _LISTS else names[0]
+            else:
+                found[name] = static[column].astype(dtype)
+        source = Source(**found)
+        if "type_id" in found and source.uid.shape != source.type_id.shape:
+            raise ValueError(f"{len(source.uid)} uids of {len(source.type_id)} types")
+        return source
+
+    def columns(self, source: Source) -> tuple[dict[str, Column], dict[str, npt.NDArray[Any]]]:
+        """Return the columns of a sample, and the static columns."""
+        columns, static = {}, {}
+        for name, (dtype, shape) in self.columns_of(source).items():
+            unit, text = self.about[name]
+            columns[name] = Column(np.dtype(dtype), shape, source.unit if unit is None else unit, text)
+        for name in self.attributes:
+            (column, dtype), value = _STATIC[name], getattr(source, name)
+            if dtype.startswith("S"):
+                value = [each.encode() for each in (value if name in _LISTS else [value])]
+            static[column] = np.array(value, dtype)
+        return columns, static
+
+
+class SourceWriter:
     """Publishes a service of one kind.
 
     Attributes:
-        kind: kind of the service.
+        form: of the service.
         source: the present source of the service.
     """
 
-    kind: ClassVar[str]
+    form: ClassVar[ServiceForm]
 
-    def __init__(self, source: SourceT, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
-        self.source: SourceT = source
-        self._service = ServiceWriter(
-            name, source.columns(), source.static(), kind=self.kind, description=description, **options
-        )
+    def __init__(self, source: Source, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
+        self.source = source
+        columns = self.form.columns(source)
+        self._service = ServiceWriter(name, *columns, kind=self.form.kind, description=description, **options)
 
     @property
     def name(self) -> str:
         """Name of the service."""
         return self._service.name
 
-    def _restructure(self, source: SourceT) -> None:
-        self._service.restructure(source.columns(), source.static())
+    def _restructure(self, source: Source) -> None:
+        self._service.restructure(*self.form.columns(source))
         self.source = source
 
     def close(self) -> None:
@@ -148,18 +146,18 @@ class SourceWriter(Generic[SourceT]):
         self.close()
 
 
-class SourceSample(Sample, Generic[SourceT]):
+class SourceSample(Sample):
     """A sample of a service that has a source."""
 
     __slots__ = ()
 
     @property
-    def source(self) -> SourceT:
+    def source(self) -> Source:
         """The source of the service."""
-        return cast(SourceT, self.context)
+        return cast(Source, self.context)
 
 
-class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
+class SourceReader(ServiceReader[SampleT]):
     """Reads a service of one kind.
 
     Args:
@@ -167,15 +165,13 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Attributes:
-        kind: kind of the service.
-        source_class: class of its source.
+        form: of the service.
 
     Raises:
         BadServiceFile: the service is of another kind, or its columns are others.
     """
 
-    kind: ClassVar[str]
-    source_class: ClassVar[type[Source]]
+    form: ClassVar[ServiceForm]
 
     def __init__(
         self,
@@ -185,20 +181,20 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
         timeout_s: float | None = 0.0,
         announce: bool = True,
     ) -> None:
-        super().__init__(name or self.kind, namespace=namespace, timeout_s=timeout_s, announce=announce)
+        super().__init__(name or self.form.kind, namespace=namespace, timeout_s=timeout_s, announce=announce)
 
     @property
-    def source(self) -> SourceT:
+    def source(self) -> Source:
         """The source of the service."""
-        return cast(SourceT, self._ring.context)
+        return cast(Source, self._ring.context)
 
     def _describe(self, attached: segments.Segment) -> Source:
-        if bytes(attached.header["kind"]) != self.kind.encode():
-            raise BadServiceFile(f"service {self.name!r} is not of kind {self.kind!r}")
+        if bytes(attached.header["kind"]) != self.form.kind.encode():
+            raise BadServiceFile(f"service {self.name!r} is not of kind {self.form.kind!r}")
         found = attached.schema.columns
         try:
-            source = self.source_class.read(attached.static_columns())
-            for name, column in source.columns().items():
+            source = self.form.read(attached.static_columns())
+            for name, column in self.form.columns(source)[0].items():
                 if found[name].dtype != column.dtype or found[name].shape != column.shape:
                     raise ValueError(f"column {name!r} is not {column.shape} of {column.dtype}")
         except (LookupError, ValueError, TypeError, AttributeError) as error:

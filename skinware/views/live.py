@@ -157,7 +157,7 @@ class LiveBridges(Drivers[BridgeReader]):
         return [sample.state for sample in samples if sample is not None and not sample.stale]
 
 
-class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
+class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
     """The services of one kind in a namespace, each of which is about one driver."""
 
     def of(self, driver: str) -> SampleT | None:
@@ -208,7 +208,7 @@ class TactileServices:
         calm = None if self._calm is None else self._calm.get(driver)
         return None if calm is None or calm.frame is None or calm.frame.stale else calm.frame
 
-    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
+    def contacts_reader(self, driver: str) -> SourceReader[ContactsSample] | None:
         found = (reader for source in self._contacts for reader in source.readers.values())
         return next((reader for reader in found if reader.source.driver == driver), None)
 

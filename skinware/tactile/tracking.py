@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.assignment import Gains, assign
 from skinware.tactile.meetings import Meetings, fit_bells, resume
 from skinware.tactile.tracks import (
     TRACK,
@@ -18,6 +17,7 @@ from skinware.tactile.tracks import (
     TouchedBlobs,
     Tracks,
     Whole,
+    assign,
     correct,
     expected_at,
     is_shared,
@@ -201,7 +201,7 @@ class Tracker:
         self._join(home, overlap, expected, blobs, size)
         return home
 
-    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Gains:
+    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Floats:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m

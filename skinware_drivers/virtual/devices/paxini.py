@@ -162,7 +162,14 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         function, register, count = struct.unpack_from("<BHH", command, 3)
         data = command[8:-1]
         if function == 0x03:
-            read = self._registers(device)[register : register + count]
+            memory = bytearray(0x80)
+            memory[0:15] = b"EMULATED V1.0\0\0"
+            for slot in self.slots():
+                memory[0x10 + slot // 8] |= 1 << slot % 8
+                at = 0x30 + 2 * slot if slot < 20 else 0x66 + 2 * (slot - 20)
+                memory[at : at + 2] = self.options.points.to_bytes(2, "little")
+            memory[0x17] = device.streams_from_ns is not None
+            read = bytes(memory[register : register + count])
             return message(b"\xaa\x55\0", command[3:8], read.ljust(count, b"\0"))
         if function == 0x10 and register == 0x17:
             return self._switch(device, bool(data[0]), now_ns)
@@ -176,16 +183,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             self.schedule(now_ns + round(1e9 * self.options.calibrates_s), calibrated)
             return b""
         return message(b"\xaa\x55\0", struct.pack("<BHH", 0x81, register, 0))
-
-    def _registers(self, device: Device) -> bytes:
-        memory = bytearray(0x80)
-        memory[0:15] = b"EMULATED V1.0\0\0"
-        for slot in self.slots():
-            memory[0x10 + slot // 8] |= 1 << slot % 8
-            at = 0x30 + 2 * slot if slot < 20 else 0x66 + 2 * (slot - 20)
-            memory[at : at + 2] = self.options.points.to_bytes(2, "little")
-        memory[0x17] = device.streams_from_ns is not None
-        return bytes(memory)
 
     def _switch(self, device: Device, on: bool, now_ns: int) -> bytes:
         if on:

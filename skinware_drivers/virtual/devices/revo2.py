@@ -72,7 +72,11 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         options = self.options
         on = options.touch and device.memory.get("on", options.enabled)
         if options.edition == "touch":
-            return self._touch(values) if on else dict.fromkeys(range(4200, 4230), 0xFFFF)
+            words = list(values[:15])
+            for proximity in values[15:]:
+                words += [proximity >> 16, proximity & 0xFFFF]
+            states = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
+            return dict(enumerate([*words, *states] if on else [0xFFFF] * 30, 4200))
         felt = values if on else [0] * len(values)
         if options.edition == "pressure":
             return (
@@ -114,12 +118,3 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
             device.memory["kind"] = value
             return True
         return address in _OTHER_COMMANDS[self.options.edition]
-
-    def _touch(self, values: Sequence[int]) -> Mapping[int, int]:
-        """Return the registers of the edition touch; the high word of a proximity comes first."""
-        words = list(values[:15])
-        for proximity in values[15:]:
-            words += [proximity >> 16, proximity & 0xFFFF]
-        options = self.options
-        status = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
-        return dict(enumerate([*words, *status], 4200))

@@ -194,7 +194,6 @@ class CalmContacts(DerivedService[ContactsWriter]):
         self._loads: Loads | None = None
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
-        """See :class:`DerivedService`."""
         super().follow(chain, rate_hz)
         if self.motion is not None:
             self.motion.contacts = self._writer
@@ -244,7 +243,6 @@ class CalmContacts(DerivedService[ContactsWriter]):
             self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
 
     def close(self) -> None:
-        """See :class:`DerivedService`."""
         super().close()
         self.count = 0
         if self.motion is not None:

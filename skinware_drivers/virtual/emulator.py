@@ -163,8 +163,9 @@ class Emulator(Stage[OptionsT]):
         """Send the values that are felt now; faults happen here."""
         device.sampled_ns = time_ns
         frames = self.frames(device, self._values(device, time_ns))
-        for frame in frames:
-            self.check_frame(frame)
+        if self.medium == "can":
+            for identifier, _ in frames:
+                check_identifier(identifier)
         self.send_burst(device, [frame[0] for frame in frames], [frame[1] for frame in frames], time_ns)
 
     # Within
@@ -175,10 +176,6 @@ class Emulator(Stage[OptionsT]):
         self._n_values = len(places)
         self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
         super().power_up(now_ns)
-
-    def check_frame(self, frame: CanFrame) -> None:
-        if self.medium == "can":
-            check_identifier(frame[0])
 
     def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:
         others = np.setdiff1d(np.arange(0x7FF), np.array(sorted(self.identifiers)))

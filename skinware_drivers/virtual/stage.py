@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.bus import check_identifier
 from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions
 from skinware_drivers.virtual.events import Event, FrameDamage
@@ -114,7 +115,8 @@ class Stage(ABC, HasOptions[OptionsT]):
 
     def reply(self, device: Device, frame: tuple[int, bytes], now_ns: int) -> None:
         """Send one frame besides the data."""
-        self.check_frame(frame)
+        if self.medium == "can":
+            check_identifier(frame[0])
         device.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
     def send_burst(
@@ -325,9 +327,6 @@ class Stage(ABC, HasOptions[OptionsT]):
     def die(self, device: Device, now_ns: int) -> None:
         self._lose_power(device, now_ns, "died")
         self.log.append(Event("board_died", now_ns, board=device.number))
-
-    def check_frame(self, frame: tuple[int, bytes]) -> None:
-        """Refuse a frame that the medium cannot carry."""
 
     def skipped(self, device: Device, name: str, times: int) -> int:
         """Count what a timer would have done ``times``; return how many frames that would have been."""

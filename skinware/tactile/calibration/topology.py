@@ -67,11 +67,6 @@ class StrokeSums:
         self.frames += len(loads)
 
     @property
-    def covered(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool: touched in at least 20 frames."""
-        return self.active >= ENOUGH_FRAMES
-
-    @property
     def known(self) -> npt.NDArray[np.bool_]:
         """(n,) bool: touched in enough frames to be compared with others."""
         return self.active >= _LEAST_FRAMES

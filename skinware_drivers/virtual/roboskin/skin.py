@@ -60,19 +60,13 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
 
     def geometry(self) -> Geometry:
-        """Return the places of the sensors: the boards cover a forearm and a hand."""
         return self.skin.geometry()
 
     def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
-        """Return place (m) and force (N) of each press."""
         return self.skin.pressing(self.run_to(now_ns))
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
-        """Press from now on, besides the wandering fingers of the option ``pattern``.
-
-        Raises:
-            ValueError: no taxel would feel it, or too many presses have not ended yet.
-        """
+        """Press from now on, besides the wandering fingers of the option ``pattern``; see :class:`.PressedSkin`."""
         return self.skin.press(press, self.run_to(now_ns))
 
     def kind_of(self, identifier: int, payload: bytes) -> str:

@@ -334,6 +334,8 @@ def _faults(namespace: Namespace, frame: HealthSample, report: HealthReport) -> 
         of_type = types[int(structure.sensor_type[position])]
         numbers = {field.name: getattr(report, field.name)[position].item() for field in fields(report)}
         named = {"name": structure.sensor_name(position), "uid": int(source.uid[position]), "type": of_type.name}
-        judged = {"kind": HealthKind(numbers["kind"]).name.lower(), "evidence": report.evidence(position, of_type.unit)}
+        other = structure.sensor_name(numbers["other"]) if numbers["other"] >= 0 else ""
+        evidence = report.evidence(position, of_type.unit, other)
+        judged = {"kind": HealthKind(numbers["kind"]).name.lower(), "evidence": evidence}
         rows.append({**named, **numbers, **judged})
     return rows

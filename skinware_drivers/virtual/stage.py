@@ -136,19 +136,18 @@ class Stage(ABC, HasOptions[OptionsT]):
         """
         ready_ns = time_ns
         if self.options.jitter_us:
-            delay_ns = int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
-            ready_ns += delay_ns
-            if delay_ns:
-                late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
-                self.log.append(late)
+            ready_ns += int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
+        if ready_ns > time_ns:
+            delay_ns = ready_ns - time_ns
+            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+            self.log.append(late)
         chances = [getattr(self.options, name) for name in self.frame_faults]
         lost: set[int] = set()
         if any(chances) or sum(map(len, device.queue)) + len(identifiers) > self.longest_queue:
             identifiers, payloads, lost = self._with_faults(device, identifiers, payloads, time_ns, chances)
             usual = usual and all(len(payload) == 8 for payload in payloads)
         if identifiers:
-            burst = Transmission(ready_ns, identifiers, payloads, lost, usual=usual, cycle=device.cycle)
-            device.queue.append(burst)
+            device.queue.append(Transmission(ready_ns, identifiers, payloads, lost, usual=usual, cycle=device.cycle))
         device.cycle += 1
         self.counts["bursts"] += 1
 
@@ -308,10 +307,8 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.schedule(silence_ns, lambda _: self.silent.update(options.silence))
         if options.foreign_hz:
             random = np.random.default_rng([options.seed, 2])
-            identifiers, queue = self.foreign_identifiers(random), self.wire.attach()
-            self._foreign = ForeignTraffic(
-                identifiers, options.foreign_hz, random, queue, self.log, self.counts, now_ns
-            )
+            others, queue = self.foreign_identifiers(random), self.wire.attach()
+            self._foreign = ForeignTraffic(others, options.foreign_hz, random, queue, self.log, self.counts, now_ns)
 
     def dying(self) -> Sequence[int]:
         """Return the devices that die at the time of the option ``dead_after_s``."""

@@ -107,7 +107,7 @@ _WIDTH = 100
 
 
 @dataclass(frozen=True)
-class How:
+class GatheringOptions:
     """The options of all commands that gather."""
 
     driver: str | None
@@ -257,7 +257,7 @@ class Gathering:
 def opened(
     file: Path,
     session_of: Callable[[int], Any],
-    how: How,
+    how: GatheringOptions,
     poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[Gathering, Any]]:
     """Yield a gathering, with driver and poses open, and its session."""

@@ -80,14 +80,14 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     """
     import numpy as np
 
-    from skinware.cli._gathering import How, opened
+    from skinware.cli._gathering import GatheringOptions, opened
     from skinware.geometry import geometry_to_toml
     from skinware.tactile.calibration.results import unrolled_comment, unrolled_groups
     from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
     from skinware.text import plural
 
-    how = How(**options)
+    how = GatheringOptions(**options)
     with opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         found = topology_of(session.sums, pitch_m)
@@ -141,11 +141,18 @@ def touch(
 
     Exit status: 0 the places can be trusted, 1 they are written, and cannot.
     """
-    from skinware.cli._gathering import How, opened, places_in_frame, read_layout, report_placed, write_places
+    from skinware.cli._gathering import (
+        GatheringOptions,
+        opened,
+        places_in_frame,
+        read_layout,
+        report_placed,
+        write_places,
+    )
     from skinware.tactile.calibration.placing import place
     from skinware.tactile.calibration.state import PressSession
 
-    how = How(**options)
+    how = GatheringOptions(**options)
     if offset_m and layout is None:
         raise click.UsageError("--offset needs --layout, which has the normals")
     session_of = partial(PressSession, wanted=touches)
@@ -200,11 +207,11 @@ def finger(
     For robots that touch themselves: the pose of the hand is known in the coordinate frame of the skin, but the tip of
     the finger is not known exactly.
     """
-    from skinware.cli._gathering import How, opened, read_layout, report_placed, write_places
+    from skinware.cli._gathering import GatheringOptions, opened, read_layout, report_placed, write_places
     from skinware.tactile.calibration.finger import place_finger
     from skinware.tactile.calibration.state import PressSession
 
-    how = How(**options)
+    how = GatheringOptions(**options)
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
     where = (service, poses_namespace, column, (4, 4))
     with opened(file, session_of, how, where) as (gathering, session):
@@ -236,14 +243,14 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 
     Exit status: 0 nothing found, 1 something is wrong.
     """
-    from skinware.cli._gathering import How, finding_data, finding_text, opened
+    from skinware.cli._gathering import GatheringOptions, finding_data, finding_text, opened
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.checking import check_file, check_strokes
     from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
 
     geometry = read_geometry(file)
-    how = How(**options)
+    how = GatheringOptions(**options)
     with opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         structure, type_name = gathering.structure, gathering.type_name
@@ -292,13 +299,13 @@ def force(
 
     Exit status: 0 the curves can be trusted, 1 they are written, and cannot.
     """
-    from skinware.cli._gathering import How, opened
+    from skinware.cli._gathering import GatheringOptions, opened
     from skinware.tactile.calibration.force import fit_force
     from skinware.tactile.calibration.sources import ForceSource
     from skinware.tactile.calibration.state import ForceSession
     from skinware.tactile.curves import curves_to_toml
 
-    how = How(**options)
+    how = GatheringOptions(**options)
     if (reference is None) == (not newtons) and how.duration_s != 0:
         raise click.UsageError("give either --reference or --newtons")
     where = None if reference is None else (reference, how.namespace, column, (int(axes),))

@@ -25,6 +25,7 @@ from skinware.tactile.testing import read_stage
 from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
+from skinware_drivers.streams.ros2_map import read_map
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.commands import COMMANDS, PATIENCE_S, parse, refused, running
 
@@ -161,6 +162,9 @@ def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
         elif found.get("format") == "skinware-regions":
             file.write_text(text)
             read_regions(file)
+        elif found.get("format") == "skinware-ros2-map":
+            file.write_text(text)
+            read_map(str(file))
         elif found.get("format") == "skinware-links":
             file.write_text(text)
             for link in found["link"]:

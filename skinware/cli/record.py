@@ -150,7 +150,7 @@ def command(
     place = Namespace(namespace)
     path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
-    beside = Viewers() if for_viewers else None
+    beside = Viewers().messages if for_viewers else None
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
     report = _Progress(recorder, target, path, as_json)
     keys = on_enter(recorder.save) if last_s is not None else contextlib.nullcontext()

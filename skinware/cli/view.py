@@ -158,9 +158,8 @@ async def _serve(
     port: int | None,
     ready: Callable[[int], None],
 ) -> None:
-    from skinware.views.advice import DoctorProgram
-    from skinware.views.recording import RecordingProgram
-    from skinware.views.server import ViewServer, show
+    from skinware.views.programs import DoctorProgram, RecordingProgram
+    from skinware.views.server import ViewServer
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -172,11 +171,11 @@ async def _serve(
     recording = RecordingProgram(program, namespace, origin.names)
     server = ViewServer(follower, access, recording, doctor=doctor, files=files, tls=tls)
     try:
-        await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
+        await server.show(host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:
         if port is not None or error.errno != errno.EADDRINUSE:
             raise
-        await show(server, host, 0, ready, stop)
+        await server.show(host, 0, ready, stop)
 
 
 def addresses(host: str) -> list[str]:

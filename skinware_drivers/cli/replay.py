@@ -27,11 +27,7 @@ _PAYLOAD = 64
 
 
 def speed(text: str) -> float:
-    """Return a factor above 0; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
+    """Return a factor above 0; for ``click.option(type=...)``."""
     factor = cli.seconds(text)
     if not factor:
         raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
@@ -136,11 +132,6 @@ def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace
 
 
 def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireTrack, Bus]]:
-    """Return recorded wires, each with the bus to send it on.
-
-    Raises:
-        ConfigurationError: a recorded bus does not exist, is ambiguous, or is named twice.
-    """
     from skinware.errors import ConfigurationError
     from skinware.wire import MOST_BYTES
     from skinware_drivers.registry import make_bus
@@ -184,11 +175,6 @@ class WireSender:
         self.failed: int = 0
 
     def open(self) -> None:
-        """Open the buses.
-
-        Raises:
-            BusNotAvailable: one does not exist.
-        """
         for _, bus in self._pairs:
             bus.open()
 

@@ -20,12 +20,7 @@ _FILES_OF_THE_ROBOT = ("general.xml", "pc104.xml", "-eln.xml")
 
 @dataclass
 class Group:
-    """Named parameters, groups and lists.
-
-    Attributes:
-        lists: by name, the elements ``elem`` of each.
-        others: elements that do not belong in a device.
-    """
+    """Named parameters, groups, and lists of elements ``elem``; ``others`` do not belong in a device."""
 
     element: Element
     params: dict[str, Element] = field(default_factory=dict)
@@ -175,12 +170,7 @@ _UNUSED = {
 
 @dataclass(frozen=True)
 class PortRange:
-    """A body part in a skin device's index.
-
-    Attributes:
-        first, last: indices of its first and last value in the device.
-        local_first: index of its first value in the body part, as position files count.
-    """
+    """A body part in a skin device's index; ``local_first`` is its first index as position files count."""
 
     name: str
     element: Element

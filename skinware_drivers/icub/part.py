@@ -54,14 +54,10 @@ class DevicePart:
     """A skin device.
 
     Attributes:
-        name: of the device.
-        element: of the device.
         device_type: one of ``DEVICE_TYPES``.
         boards: addresses by patch, in the files' order; a patch is what we call a bus.
         bus_name: of the CAN bus, if the files name it.
         period_ms, skin_type, no_load, enabled, shift, cdc_offset: of boards and triangles without a set of their own.
-        board_sets: boards that differ.
-        triangle_sets: triangles that differ.
         old: the parameters ``4C_*`` and ``4E_*`` of each board, if the files have no other set-up.
     """
 

@@ -65,12 +65,7 @@ _POINTS_OF_PRESSURE = (
 
 
 class _Edition(NamedTuple):
-    """The command registers of an edition: the first, and how many.
-
-    Attributes:
-        switches: switch its sensors on.
-        reset: set the sensors' channels up again; None: it has no such registers.
-    """
+    """The command registers of an edition: the first, and how many; None: it has no such registers."""
 
     switches: tuple[int, int]
     calibration: tuple[int, int]

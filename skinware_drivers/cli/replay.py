@@ -16,8 +16,9 @@ from skinware.cli._terminal import echo, print_json
 from skinware.cli.replay import NAMESPACE, Playback, publish_again
 
 if TYPE_CHECKING:
-    from skinware.recording import Recording, WireTrack
+    from skinware.recording import Recording
     from skinware_drivers.bus import Bus
+    from skinware_drivers.virtual.recorded import Wire
     from skinware_drivers.virtual.recorded_wire import RecordedWire
 
 _LONGEST_SLEEP_S = 0.05
@@ -135,7 +136,7 @@ def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace
         echo(f"{sender.sent.total()} frames sent{failed}")
 
 
-def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireTrack, Bus]]:
+def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[Wire, Bus]]:
     """Return recorded wires, each with the bus to send it on.
 
     Raises:
@@ -147,7 +148,7 @@ def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -
     from skinware_drivers.virtual.recorded import wire_of
 
     driver = drivers[0] if len(drivers) == 1 else ""
-    pairs: list[tuple[WireTrack, Bus]] = []
+    pairs: list[tuple[Wire, Bus]] = []
     for text in buses:
         names_one = any(text.startswith(f"{wire.bus}=") for wire in recording.wires)
         recorded, _, name = text.partition("=") if names_one else ("", "", text)
@@ -173,7 +174,7 @@ class WireSender:
 
     def __init__(
         self,
-        pairs: Sequence[tuple[WireTrack, Bus]],
+        pairs: Sequence[tuple[Wire, Bus]],
         speed: float = 1.0,
         start_s: float = 0.0,
         end_s: float | None = None,

@@ -179,7 +179,7 @@ def test_a_learning_set_for_people_and_programs(file: Path, capsys: pytest.Captu
 
 
 def test_all_options_of_learning_sets_are_known_as_such() -> None:
-    others = ["names", "format_name", "output", "types", "patches", "in_regions", "region_files"]
+    others = ["names", "format_name", "map_file", "guess", "output", "types", "patches", "in_regions", "region_files"]
     names = {each.name for each in convert.params} - {*others, "file", "start_s", "end_s", "as_json", "version"}
     assert names == set(_NAMES)
 

@@ -22,10 +22,10 @@ _TIMES = re.compile(
 _UNIT_OF_TIME = re.compile(r"[_.\s(\[](ms|us|ns|nsec|s|sec|seconds)[)\]]?$", re.I)
 _NO_TAXELS = re.compile(
     r"index|sequence|^seq$|counter|^count|joint|encoder|motor|action|state|velocit|effort|torque|orient|quat|pose"
-    r"|covariance|height|width|step|layout|offset|label|episode|frame|rgb|depth|image_raw|(^|[._])id$|^column_0$",
+    r"|covariance|height|width|step|layout|offset|label|episode|frame|rgb|depth|image_raw|slip|(^|[._])id$|^column_0$",
     re.I,
 )
-_TAXELS = re.compile(r"tactile|tact|taxel|touch|skin|press|force|shear|sens|temp|acc|gyro|mag|prox|hall|fsr", re.I)
+_TAXELS = re.compile(r"biotac|tact|taxel|touch|skin|press|force|shear|sens|temp|acc|gyro|mag|prox|hall|fsr", re.I)
 _TYPES = {
     r"temp": ("temperature", ""),
     r"acc": ("acceleration_{}", ""),

@@ -78,7 +78,7 @@ class DriverMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A table that becomes a driver.
 
     Attributes:
-        table: its name, where a source has several.
+        table: its name, where a source has several; empty: the first with that time.
         time: the column of the time of each row; empty: rows come at ``rate_hz``.
         rate_hz: nominal rows a second; 0: not known.
     """
@@ -133,6 +133,9 @@ def _mapped(driver: DriverMap, source: ColumnSource, text: TomlText, number: int
     def refuse(what: str, *keys: str | int) -> ConfigurationError:
         return ConfigurationError(f"{text.place(('driver', number, *keys))}: {what}")
 
+    if not driver.table and driver.time:
+        having = (name for name, columns in source.tables.items() if driver.time in columns)
+        driver = msgspec.structs.replace(driver, table=next(having, ""))
     if driver.table not in source.tables:
         hint = nearest_name(driver.table, source.tables)
         raise refuse(f"{source.path} has no table {driver.table!r}{hint}", "table")

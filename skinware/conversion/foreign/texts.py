@@ -78,11 +78,11 @@ class TextSource:
                 at, number = at + len(file.readline()), number + 1
             while read := file.readlines(_READ_BYTES):
                 lines = list(map(self._clean, self._lines_of(read, at)))
-                yield {
-                    name: rows.reshape(-1, *self.tables[table][name]) for name, rows in self._rows(lines, number, names)
-                }
-                at, number = at + sum(map(len, read)), number + len(read)
+                at += sum(map(len, read))
                 self.share = at / size
+                rows = self._rows(lines, number, names)
+                yield {name: each.reshape(-1, *self.tables[table][name]) for name, each in rows}
+                number += len(read)
 
     def close(self) -> None:
         """Do nothing: no file stays open."""

@@ -85,20 +85,16 @@ def parse_bus_name(text: str) -> BusName:
         raise ConfigurationError(f"bus {text!r}: write options as ?key=value&key=value") from None
     name = BusName.of(text)
     if name.interface == "modbus":
-        _check_modbus(name)
+        channel = name.channel
+        is_usb_device = not channel and name.options.keys() & {"serial_number", "vid_pid"}
+        is_port = "/" in channel and not channel.startswith("tcp:")
+        if not (is_usb_device or is_port or channel.startswith("tcp://")):
+            host = channel.removeprefix("tcp:").strip("/") or "HOST"
+            raise ConfigurationError(
+                f"bus modbus:{channel}: over TCP that is modbus:tcp://{host}, and a serial port modbus:/dev/ttyUSB0, or"
+                f" modbus:./{channel or 'port'}"
+            )
     return name
-
-
-def _check_modbus(name: BusName) -> None:
-    channel = name.channel
-    is_usb_device = not channel and name.options.keys() & {"serial_number", "vid_pid"}
-    if is_usb_device or ("/" in channel and not channel.startswith("tcp:")) or channel.startswith("tcp://"):
-        return
-    host = channel.removeprefix("tcp:").strip("/") or "HOST"
-    raise ConfigurationError(
-        f"bus modbus:{channel}: over TCP that is modbus:tcp://{host}, and a serial port modbus:/dev/ttyUSB0, or"
-        f" modbus:./{channel or 'port'}"
-    )
 
 
 def _split(address: str) -> tuple[str, str]:

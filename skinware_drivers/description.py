@@ -160,7 +160,13 @@ def assemble(
                 module_patch.append(len(patch_name))
                 module_kind.append(module.kind)
                 module_name.append(module.name)
-                period_ns.append(_period_ns(f"{patch.name}, module {module.key:#x}", module.period_s))
+                period_s = module.period_s
+                if period_s is not None and not 0 < period_s <= LONGEST_PERIOD_S:
+                    raise StructureError(
+                        f"{patch.name}, module {module.key:#x}: period_s = {period_s}: give more than 0, at most"
+                        f" {LONGEST_PERIOD_S:g}"
+                    )
+                period_ns.append(0 if period_s is None else max(1, round(period_s * NS_PER_S)))
             patch_name.append(patch.name)
             patch_bus.append(bus)
     structure = Structure(
@@ -182,9 +188,3 @@ def assemble(
         table[module_index, : len(row)] = row
     table[table < 0] = structure.n_sensors
     return SkinTables(structure, patch_key, module_key, table, structure.group_period_ns)
-
-
-def _period_ns(name: str, period_s: float | None) -> int:
-    if period_s is not None and not 0 < period_s <= LONGEST_PERIOD_S:
-        raise StructureError(f"{name}: period_s = {period_s}: give more than 0, at most {LONGEST_PERIOD_S:g}")
-    return 0 if period_s is None else max(1, round(period_s * NS_PER_S))

@@ -97,7 +97,10 @@ class DeviceClock:
         is_first = self._stamp < 0
         if is_first:
             self._begin(int(raw[0]), int(received[0]))
-        step = self._steps(raw, received)
+        # counts since the stamp before, with as many turns as fit the time that has passed
+        difference = np.diff(raw, prepend=self._stamp)
+        passed = np.diff(received, prepend=self._received_ns) / self._unit_ns
+        step = difference + np.rint((passed - difference) / self._modulo).astype(np.int64) * self._modulo
         self.repeated += int((step == 0).sum()) - is_first
         edges = [0, *np.flatnonzero(step < 0).tolist(), len(raw)]
         for number, (start, stop) in enumerate(pairwise(edges)):
@@ -116,13 +119,6 @@ class DeviceClock:
             times_ns = received.copy()
         self._last_ns = int(times_ns[-1])
         return times_ns
-
-    def _steps(self, raw: Times, received: Times) -> Times:
-        """Return (n,) counts since the stamp before, with as many turns as fit the time that has passed."""
-        difference = np.diff(raw, prepend=self._stamp)
-        passed = np.diff(received, prepend=self._received_ns) / self._unit_ns
-        turns = np.rint((passed - difference) / self._modulo).astype(np.int64)
-        return difference + turns * self._modulo
 
     def _begin(self, stamp: int, received_ns: int) -> None:
         self._points.clear()

@@ -288,25 +288,18 @@ def _check_frame(frame: Frame) -> None:
     if frame.sequence is not None and frame.sequence.wrong(min(frame.length)):
         raise refuse(frame.sequence.wrong(min(frame.length)))
     for flag in frame.flags:
-        if isinstance(flag, Flag) and not _has_bits(flag):
-            raise refuse(
-                f"a flag's `mask`, `each` and `normal` are bits of an unsigned word, not of {flag.dtype!r}: {flag}"
-            )
+        if isinstance(flag, Flag):
+            word = np.dtype(flag.dtype)
+            largest = (1 << 8 * word.itemsize) - 1
+            fits = all(0 <= shift < 8 * word.itemsize for _, shift in flag.each)
+            if word.kind != "u" or not fits or not (0 <= flag.mask <= largest and 0 <= flag.normal <= largest):
+                raise refuse(
+                    f"a flag's `mask`, `each` and `normal` are bits of an unsigned word, not of {flag.dtype!r}: {flag}"
+                )
     if frame.period_s is not None and not 0 < frame.period_s <= LONGEST_PERIOD_S:
         raise refuse(f"period_s = {frame.period_s}: give more than 0, at most {LONGEST_PERIOD_S:g}")
     if frame.time is not None and frame.time.end > min(frame.length):
         raise refuse("the device's time is not in every right payload")
-
-
-def _has_bits(flag: Flag) -> bool:
-    word = np.dtype(flag.dtype)
-    bits = 8 * word.itemsize
-    words = flag.mask, flag.normal
-    return (
-        word.kind == "u"
-        and all(0 <= one < 1 << bits for one in words)
-        and all(0 <= shift < bits for _, shift in flag.each)
-    )
 
 
 def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:

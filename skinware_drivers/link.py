@@ -157,23 +157,20 @@ class Link:
         queue: asyncio.Queue[Reply] = asyncio.Queue()
         entry = (matches, queue)
         self._waiters.append(entry)
-        self._count_questions(+is_question)
+        if is_question:
+            self._questions += 1
+            self._no_question.clear()
         self._tell_bus()
         try:
             yield queue
         finally:
             self._waiters.remove(entry)
-            self._count_questions(-is_question)
             if is_question:
+                self._questions -= 1
                 self._late.append((now_ns() + _LATE_NS, matches))
+                if not self._questions:
+                    self._no_question.set()
             self._tell_bus()
-
-    def _count_questions(self, more: int) -> None:
-        self._questions += more
-        if self._questions:
-            self._no_question.clear()
-        else:
-            self._no_question.set()
 
     async def request(
         self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
@@ -230,36 +227,27 @@ class Link:
         while True:
             await self._no_question.wait()
             async with self._data_question:
-                if not self._questions:
-                    return await self._ask(identifier, payload, answer, timeout_s, extra_s, on_late)
-
-    async def _ask(
-        self,
-        identifier: int,
-        payload: bytes,
-        answer: Match,
-        timeout_s: float,
-        extra_s: float,
-        on_late: Callable[[float], None],
-    ) -> bool:
-        came = asyncio.Event()
-        self._overdue = [one for one in self._overdue if one.answer != answer and one.until_ns > now_ns()]
-        self._expected = answer, came
-        self._tell_bus()
-        try:
-            await self._send(identifier, payload, timeout_s)
-            overdue = _Overdue(answer, now_ns() + round(timeout_s * NS_PER_S), now_ns() + _LATE_NS, on_late)
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(timeout_s + extra_s):
-                    await came.wait()
-            if not came.is_set():
-                self._overdue.append(overdue)
-            elif self._came_ns > overdue.due_ns:
-                on_late((self._came_ns - overdue.due_ns) / NS_PER_S)
-        finally:
-            self._expected = None
-            self._tell_bus()
-        return came.is_set()
+                if self._questions:
+                    continue
+                came = asyncio.Event()
+                self._overdue = [one for one in self._overdue if one.answer != answer and one.until_ns > now_ns()]
+                self._expected = answer, came
+                self._tell_bus()
+                try:
+                    await self._send(identifier, payload, timeout_s)
+                    sent_ns = now_ns()
+                    due_ns = sent_ns + round(timeout_s * NS_PER_S)
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(timeout_s + extra_s):
+                            await came.wait()
+                    if not came.is_set():
+                        self._overdue.append(_Overdue(answer, due_ns, sent_ns + _LATE_NS, on_late))
+                    elif self._came_ns > due_ns:
+                        on_late((self._came_ns - due_ns) / NS_PER_S)
+                finally:
+                    self._expected = None
+                    self._tell_bus()
+                return came.is_set()
 
     async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
         """Send one frame and return all answers that come within ``duration_s``.

@@ -66,7 +66,11 @@ def load(kind: ClassKind, name: str) -> type[Any]:
             f" ./{name}{SOURCE_SUFFIX}, or install its package: pip install -e ."
         )
     entry = known[name]
-    with _blamed(f"{kind.word} {name!r} ({entry.value})", _is_theirs):
+
+    def is_theirs(file: str) -> bool:  # neither Python's nor of this package
+        return not file.startswith(("<", *_OURS)) and (file.startswith(_INSTALLED) or not file.startswith(_PYTHONS))
+
+    with _blamed(f"{kind.word} {name!r} ({entry.value})", is_theirs):
         loaded = entry.load()
     if not (isinstance(loaded, type) and kind.fits(loaded)):
         raise ConfigurationError(f"{kind.word} {name!r}: {entry.value} is no subclass of {kind.base} or its like")
@@ -123,11 +127,6 @@ def _module_of(name: str, kind: ClassKind) -> ModuleType:
         )
     with _blamed(f"{kind.word} {name}", lambda file: os.path.dirname(file) == folder):
         return importlib.import_module(own_name)
-
-
-def _is_theirs(file: str) -> bool:
-    """Return whether a file of a traceback belongs neither to Python nor to this package."""
-    return not file.startswith(("<", *_OURS)) and (file.startswith(_INSTALLED) or not file.startswith(_PYTHONS))
 
 
 @contextmanager

@@ -182,8 +182,14 @@ class ZeroWatch(Watch):
         lit = ((updates.values != 0) & (updates.sensors < self.tables.structure.n_sensors)).any(axis=1)
         self._is_dark[updates.module[lit]] = False
         self.module_untouched[:] = self._is_dark & (self._since_ns > 0)
-        self._name(time_ns)
         self.sees_all = bool(self._is_dark.any())
+        has_waited = self.module_untouched & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
+        unnamed = np.flatnonzero(has_waited & ~self._is_named)
+        if len(unnamed) and (has_waited == self.module_untouched).all():  # not one by one
+            self._is_named[unnamed] = True
+            names = [self.tables.structure.module_names[module] for module in unnamed[:_MOST_NAMES].tolist()]
+            more = f" and {len(unnamed) - len(names)} more" if len(unnamed) > len(names) else ""
+            log.info("nothing but 0 has come from %s%s so far: not touched yet, or dead", "; ".join(names), more)
 
     def forget(self, patch: int) -> None:
         """End all doubts about a patch; its modules must show again that they live."""
@@ -192,12 +198,3 @@ class ZeroWatch(Watch):
         self._is_dark[modules], self._since_ns[modules], self._is_named[modules] = True, 0, False
         self.module_untouched[modules] = False
         self.sees_all = True
-
-    def _name(self, time_ns: int) -> None:
-        has_waited = self.module_untouched & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
-        unnamed = np.flatnonzero(has_waited & ~self._is_named)
-        if len(unnamed) and (has_waited == self.module_untouched).all():  # not one by one
-            self._is_named[unnamed] = True
-            names = [self.tables.structure.module_names[module] for module in unnamed[:_MOST_NAMES].tolist()]
-            more = f" and {len(unnamed) - len(names)} more" if len(unnamed) > len(names) else ""
-            log.info("nothing but 0 has come from %s%s so far: not touched yet, or dead", "; ".join(names), more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +23,7 @@ if TYPE_CHECKING:
 _REPORT_EVERY_S = 1.0
 
 
-@click.group("skin-regions", context_settings=cli.CONTEXT_SETTINGS)
-@cli.version_option
+@cli.group("skin-regions")
 def command() -> None:
     """Name parts of a skin: regions, which programs and skin-top use by name."""
 
@@ -157,5 +157,4 @@ class _Painter:
         say(self._as_json, {"event": event, **what, "touched": int(stroked.sum())}, text)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -1,4 +1,4 @@
-"""Judge the health of taxels: which are stuck, noisy, clipped, dead or weak, by what they showed in use.
+"""Judge the health of taxels by what they showed in use: stuck, noisy, dead, shorted and other :class:`HealthKind`.
 
 ::
 
@@ -34,6 +34,7 @@ from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
+from skinware.tactile.health_relations import Copies, Dropouts, Twins
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
@@ -45,6 +46,16 @@ _LEAST_NOISE = 0.5
 """Steps of the values: no taxel counts as quieter."""
 _FEWEST_AROUND = 3
 """Neighbours with a known share that a comparison with neighbours needs."""
+_ALIKE = 0.9
+"""Correlation with the touches of another taxel, from which a taxel shows them."""
+_SAME = 0.6
+"""Product of the shares that two taxels show of each other's touches, from which they are shorted."""
+_SQUARES, _OTHER_SQUARES = 0.003, 0.03
+"""Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
+_EXCHANGED = 0.5
+"""Share of what is due to another dead taxel, from which a dead taxel is at its place."""
+_OFTEN = 5.0
+"""Times the dropouts of three quarters of the others."""
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
 
@@ -61,13 +72,23 @@ class HealthKind(enum.IntEnum):
     """Nothing has touched it yet, so nothing is known."""
     WEAK = 2
     """It shows far less of its touches than its neighbours show of theirs."""
-    DEAD = 3
+    DYING = 3
+    """It shows far less of its touches than it did before."""
+    DEAD = 4
     """It shows nothing when both its sides are pressed."""
-    NOISY = 4
+    CROSSTALK = 5
+    """It shows a part of the touches of another taxel of its module."""
+    NOISY = 6
     """Its noise is far above that of the typical taxel."""
-    STUCK = 5
+    INTERMITTENT = 7
+    """It loses its value again and again for a moment, while its neighbours keep theirs."""
+    SWAPPED = 8
+    """It shows what presses the place of another taxel: their wires or uids are exchanged."""
+    SHORTED = 9
+    """It shows the same as another taxel."""
+    STUCK = 10
     """Its value does not change, whatever happens around it."""
-    CLIPPED = 6
+    CLIPPED = 11
     """It is at an end of the range, untouched: there is no room left for a touch, or for its drift."""
 
 
@@ -86,6 +107,11 @@ class HealthReport:
         touches: (n,) uint32, separate touches of both its sides.
         shown: (n,) float32, the share of its due that it showed in them.
         shown_around: (n,) float32, the share that its neighbours showed; only where that is much more.
+        recent: (n,) float32, the mean share of its last 20 touches.
+        best: (n,) float32, the largest of these means so far.
+        dropouts: (n,) float32, how often it lost its value; half of it is forgotten in ten minutes.
+        other: (n,) int32, the taxel whose touches it shows; -1: none.
+        other_shown: (n,) float32, the part of them that it shows.
     """
 
     kind: npt.NDArray[np.uint8]
@@ -98,6 +124,11 @@ class HealthReport:
     touches: npt.NDArray[np.uint32]
     shown: Floats
     shown_around: Floats
+    recent: Floats
+    best: Floats
+    dropouts: Floats
+    other: npt.NDArray[np.int32]
+    other_shown: Floats
 
     @classmethod
     def unknown(cls, n: int) -> Self:
@@ -110,15 +141,17 @@ class HealthReport:
         faulty: Flags = self.kind > HealthKind.NEVER_TOUCHED
         return faulty
 
-    def evidence(self, taxel: int, unit: str = "") -> str:
+    def evidence(self, taxel: int, unit: str = "", other: str = "") -> str:
         """Return the reason for the kind of a taxel, in words.
 
         Args:
             taxel: which of the n.
             unit: of the values.
+            other: name of the taxel whose touches it shows; default: its number.
         """
         kind = HealthKind(self.kind[taxel])
         of = {field.name: getattr(self, field.name)[taxel].item() for field in fields(self)}
+        other = other or f"taxel {of['other']}"
         value = f"{of['value']:.4g} {unit}".strip()
         if kind is HealthKind.CLIPPED:
             return f"at {value}, an end of the range, for {100 * of['clipped']:.0f} % of the time"
@@ -127,9 +160,19 @@ class HealthReport:
         if kind is HealthKind.NOISY:
             noise = f"noise {of['noise']:.3g} {unit}".strip()
             return f"{noise}, {of['noise_times']:.1f} times that of the others"
+        if kind is HealthKind.INTERMITTENT:
+            return f"lost its value about {of['dropouts']:.0f} times in ten minutes, while its neighbours kept theirs"
+        if kind is HealthKind.SWAPPED:
+            return f"shows what presses {other}"
+        if kind in (HealthKind.CROSSTALK, HealthKind.SHORTED):
+            return f"shows {100 * of['other_shown']:.0f} % of what presses {other}"
         share = f"shows {100 * max(of['shown'], 0):.0f} % of what presses both its sides, in {of['touches']} touches"
         if kind is HealthKind.WEAK:
             return f"{share}; its neighbours show {100 * of['shown_around']:.0f} %"
+        if kind is HealthKind.DYING:
+            return (
+                f"shows {100 * of['recent']:.0f} % of what presses both its sides; it showed {100 * of['best']:.0f} %"
+            )
         return share if kind is HealthKind.DEAD else ""
 
 
@@ -137,7 +180,10 @@ COLUMNS: dict[str, tuple[str, float]] = {
     "kind": ("u1", 0),
     **dict.fromkeys(("value", "still_s", "peak", "noise", "noise_times", "clipped"), ("<f4", math.nan)),
     "touches": ("<u4", 0),
-    **dict.fromkeys(("shown", "shown_around"), ("<f4", math.nan)),
+    **dict.fromkeys(("shown", "shown_around", "recent", "best"), ("<f4", math.nan)),
+    "dropouts": ("<f4", 0),
+    "other": ("<i4", -1),
+    "other_shown": ("<f4", math.nan),
 }
 """Arrays of a :class:`HealthReport`: dtype of each, and its value where nothing is known."""
 
@@ -153,6 +199,10 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         clipped: at an end of the range for more than this share of that time.
         dead: it shows less than this share of its due.
         weak: its share is less than this part of its neighbours' shares (their median).
+        dying: its share is less than this part of the best that it showed.
+        dropouts: intermittent with this many losses of its value, half of them forgotten in ten minutes; and with five
+            times as many as three quarters of the others.
+        crosstalk: it shows at least this part of the touches of a taxel that is no neighbour.
 
     Raises:
         ConfigurationError: a value that makes no sense; the message says which.
@@ -165,11 +215,32 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
+    dying: float = 0.5
+    dropouts: float = 5.0
+    crosstalk: float = 0.05
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(f"{name} = {getattr(self, name)}: give a number above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class _Related:
+    """Which of n taxels show what presses others: the kind of fault, those others, and how much of it."""
+
+    kind: npt.NDArray[np.uint8]
+    other: npt.NDArray[np.int32]
+    shown: npt.NDArray[np.float64]
+
+    def note(
+        self,
+        kind: HealthKind,
+        taxels: npt.NDArray[np.int64],
+        others: npt.NDArray[np.int64],
+        shown: npt.NDArray[np.float64],
+    ) -> None:
+        self.kind[taxels], self.other[taxels], self.shown[taxels] = kind, others, shown
 
 
 class Health:
@@ -208,6 +279,8 @@ class Health:
         self._noise = Noise(n, self.settings.noise_s)
         self._use = Use(self._module, self.settings.touches)
         self._dues = Dues(geometry, self._neighbours)
+        self._dropouts = Dropouts(self._neighbours)
+        self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
         self._clear = _CLEAR * self._least_noise
         """A touch above it is clear."""
 
@@ -241,11 +314,19 @@ class Health:
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
         far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
         low, free = given < calm.baseline - far, calm.usable & ~calm.touched & (given <= calm.baseline + far)
-        if self._noise.add(self._now_s, given - self._use.value, self._is_at_end(given), low, free, calm):
+        at_end = self._is_at_end(given)
+        if self._noise.add(self._now_s, given - self._use.value, at_end, low, free, calm):
             self._clear = _CLEAR * self._typical_noise()
+            self._dropouts.forget(self.settings.noise_s)
+            shown = self._dues.share_shown(self.settings.touches)
+            self._dues.exchanges.watch(np.flatnonzero(shown < self.settings.weak))
+        self._dropouts.add(self._now_s, self._use.value, given, at_end, calm, far)
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
         self._dues.add(self._now_s, given, calm, hard)
+        above = given - calm.baseline
+        for relation in (self._copies, self._twins):
+            relation.add(self._now_s, above, calm, self._clear)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
@@ -261,12 +342,19 @@ class Health:
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
+        related = self._related(dead)
+        often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
+            (HealthKind.DYING, self._dues.recent < settings.dying * self._dues.best),
             (HealthKind.DEAD, dead),
+            (HealthKind.CROSSTALK, related.kind == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
+            (HealthKind.INTERMITTENT, self._dropouts.count >= often),
+            (HealthKind.SWAPPED, related.kind == HealthKind.SWAPPED),
+            (HealthKind.SHORTED, related.kind == HealthKind.SHORTED),
             (HealthKind.STUCK, stuck),
             (HealthKind.CLIPPED, is_end & (stuck | (at_end > settings.clipped))),
         ):
@@ -282,8 +370,31 @@ class Health:
             "touches": self._dues.touches,
             "shown": shown,
             "shown_around": shown_around,
+            "recent": np.where(self._dues.touches > 0, self._dues.recent, math.nan),
+            "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
+            "dropouts": self._dropouts.count,
+            "other": related.other,
+            "other_shown": related.shown,
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
+
+    def _related(self, dead: Flags) -> _Related:
+        """Find the taxels whose signals belong to others."""
+        settings, n = self.settings, len(dead)
+        related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
+        copied, other, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
+        related.note(HealthKind.CROSSTALK, copied, other, share)
+        pairs = {
+            (one, two): part for one, two, part in zip(copied.tolist(), other.tolist(), share.tolist(), strict=True)
+        }
+        same = [(one, two) for (one, two), part in pairs.items() if part * pairs.get((two, one), 0.0) >= _SAME]
+        ones, twos = np.array(same, np.int64).reshape(-1, 2).T
+        related.note(HealthKind.SHORTED, ones, twos, np.array([pairs[pair] for pair in same]))
+        taxels, others = self._twins.found(_SQUARES, _OTHER_SQUARES, 2 * settings.touches)
+        related.note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
+        taxels, others = self._dues.exchanges.found(_EXCHANGED, settings.touches)
+        related.note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
+        return related
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known, by name: arrays (n, ...), copies; times are how long ago, s."""
@@ -318,8 +429,9 @@ class Health:
     def _known(self) -> dict[str, npt.NDArray[Any]]:
         dues, use, noise = self._dues, self._use, self._noise
         of_touches = {"due": dues.due, "shown": dues.shown, "touches": dues.touches}
+        of_shares = {"recent": dues.recent, "best": dues.best}
         of_values = {"value": use.value, "peak": use.peak, "usual": use.usual}
-        return of_touches | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
+        return of_touches | of_shares | of_values | {"noise": noise.deviation, "at_end": noise.at_end}
 
     def _typical_noise(self) -> float:
         known = self._noise.deviation[np.isfinite(self._noise.deviation)]

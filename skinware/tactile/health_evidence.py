@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.tactile.baseline import Calm
+from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
 from skinware.tactile.neighbours import NONE, Table, pitch_m
 
 Floats = npt.NDArray[np.float32]
@@ -20,18 +21,18 @@ _ENOUGH_FRAMES = 100
 """Frames away from touches that a measurement of noise needs; with fewer it goes on."""
 _GROWTH = 1.2
 """Times: a noise grows by at most this from one measurement to the next."""
-_APART_S = 1.0
-"""Seconds: touches of a taxel with less time between them count as one."""
 _MODULE_APART_S = 5.0
 """Seconds: the same for a module, of which fingers touch one part after the other."""
-_KEPT = 0.95
-"""Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
 _MOST_AT_ONCE = 2048
 """Touched taxels that are compared in one frame; if there are more, each frame takes another part."""
 _NEAR_PITCHES = 1.3
 """Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
 _OPPOSITE_COSINE = -0.9
 """Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
+_SETTLED_TOUCHES = 20
+"""Touches after which a share is known well."""
+_BEST_KEPT = 0.9995
+"""Part of the best share that a touch leaves: what a taxel showed is forgotten within thousands of touches."""
 _EVEN = 1.4
 """Times: the farther of two opposite neighbours is at most this much farther than the nearer."""
 
@@ -161,7 +162,7 @@ class Use:
         active = np.flatnonzero(touched)
         begun = active[~self.touched[active]]
         self.touched = touched
-        self.usual[begun] *= _KEPT
+        self.usual[begun] *= KEPT
         for most in (self.peak, self.usual):
             most[active] = np.maximum(most[active], calm.value[active])
         if len(begun):
@@ -182,10 +183,15 @@ class Dues:
         due: (n,) sum of the squares of what was due in the touches so far; older ones count less.
         shown: (n,) the same sum of due times shown.
         touches: (n,) int64, separate touches of both sides.
+        recent: (n,) the mean share of the last touches, each with the same weight.
+        best: (n,) the largest of these means so far; 0 before it is known well.
+        exchanges: dead taxels that show what is due to others.
     """
 
     def __init__(self, geometry: Geometry | None, table: Table) -> None:
         n = len(table)
+        self.exchanges = Exchanges(n)
+        self.recent, self.best = np.zeros((2, n))
         self._pairs = None if geometry is None else Pairs(geometry, table)
         self._frames = 0
         self.due, self.shown = np.zeros(n), np.zeros(n)
@@ -210,13 +216,15 @@ class Dues:
         middle, one, other = self._pairs.around(active[self._frames % step :: step], hard)
         if not len(middle):
             return
-        self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= _APART_S]))
+        self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= APART_S]))
         self._compared_s[middle] = now_s
-        shown, left, right = (np.maximum(given[taxel] - calm.baseline[taxel], 0) for taxel in (middle, one, other))
+        above = given - calm.baseline
+        shown, left, right = (np.maximum(above[taxel], 0) for taxel in (middle, one, other))
         due = np.sqrt(left * right)
         harder = np.flatnonzero(calm.usable[middle] & (due > self._hardest_due[middle]))
         harder = harder[np.argsort(due[harder], kind="stable")]  # of several pairs round a taxel the hardest stays
         self._hardest_due[middle[harder]], self._hardest_shown[middle[harder]] = due[harder], shown[harder]
+        self.exchanges.note(middle[harder], above)
 
     def share_shown(self, touches: int) -> npt.NDArray[np.float64]:
         """Return (n,) the share of its due that each taxel showed; NaN after fewer touches."""
@@ -227,10 +235,16 @@ class Dues:
     def _end_touches(self, taxels: Whole) -> None:
         """Add up what some taxels showed in their last touch."""
         due, shown = self._hardest_due[taxels], self._hardest_shown[taxels]
-        self.due[taxels] = _KEPT * self.due[taxels] + due * due
-        self.shown[taxels] = _KEPT * self.shown[taxels] + due * shown
+        self.due[taxels] = KEPT * self.due[taxels] + due * due
+        self.shown[taxels] = KEPT * self.shown[taxels] + due * shown
         self.touches[taxels] += due > 0
         self._hardest_due[taxels] = 0
+        self.exchanges.end(taxels, due)
+        ended = taxels[due > 0]
+        count = np.minimum(self.touches[ended], _SETTLED_TOUCHES)
+        self.recent[ended] += (shown[due > 0] / due[due > 0] - self.recent[ended]) / count
+        settled = ended[count == _SETTLED_TOUCHES]
+        self.best[settled] = np.maximum(_BEST_KEPT * self.best[settled], self.recent[settled])
 
 
 class Pairs:

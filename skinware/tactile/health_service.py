@@ -28,7 +28,7 @@ from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
-from skinware.tactile.health import COLUMNS, Health, HealthReport
+from skinware.tactile.health import COLUMNS, Health, HealthKind, HealthReport
 from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -38,7 +38,7 @@ RATE_HZ = 1.0
 """How often it is published."""
 
 _TEXTS = {
-    "kind": ("", "0: good, 1: never touched, 2: weak, 3: dead, 4: noisy, 5: stuck, 6: clipped"),
+    "kind": ("", ", ".join(f"{kind:d}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
     "value": ("", "the newest, in the unit of the type"),
     "still_s": ("s", "for how long it has not changed"),
     "peak": ("", "the most that a touch showed, in the unit of the type"),
@@ -48,6 +48,11 @@ _TEXTS = {
     "touches": ("", "separate touches of both its sides"),
     "shown": ("", "share of its due that it showed in them"),
     "shown_around": ("", "share that its neighbours showed; only where that is much more"),
+    "recent": ("", "mean share of its last 20 touches"),
+    "best": ("", "largest of these means so far"),
+    "dropouts": ("", "how often it lost its value; half of it is forgotten in ten minutes"),
+    "other": ("", "position of the sensor whose touches it shows; -1: none"),
+    "other_shown": ("", "part of them that it shows"),
 }
 
 
@@ -145,7 +150,11 @@ class HealthWriter(SourceWriter[HealthSource]):
         for name, (_, nothing) in COLUMNS.items():
             columns[name][:] = nothing
             for type_name, report in reports.items():
-                columns[name][self._structure.index(type_name)] = getattr(report, name)
+                index, values = self._structure.index(type_name), getattr(report, name)
+                if name == "other":
+                    positions = np.arange(len(self._structure.sensor_uid))[index]
+                    values = np.where(values >= 0, positions[values], values)
+                columns[name][index] = values
         self._service.commit(acquired_ns)
 
     def restructure(self, structure: Structure) -> None:

@@ -64,7 +64,7 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "age_ms": _milliseconds(report.age_ns),
         "sensors": driver.structure.n_sensors,
         "fresh": int(np.count_nonzero(driver.status == 0)),
-        "dropped": _dropped(report),
+        "dropped": report.counters.get("dropped", 0),
         "load": max(loads, default=None),
         "buses": [
             {
@@ -130,7 +130,7 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
         waiting = driver.newest.settling
         if waiting.any():
             add(SETTLING, NOTE, f"{SETTLING}, {count_text(int(np.count_nonzero(waiting)))} left")
-    dropped = _dropped(report)
+    dropped = report.counters.get("dropped", 0)
     if dropped:
         add("dropped", NOTE, f"{plural(dropped, 'frame')} dropped on its buses since it started")
     return found
@@ -160,10 +160,6 @@ def _common_patch(structure: Structure, sensors: npt.NDArray[np.intp]) -> dict[s
     if others:
         return {}
     return {"bus": structure.buses[int(structure.patch_bus[patch])], "patch": structure.patch_names[patch]}
-
-
-def _dropped(report: DriverReport) -> int:
-    return sum(bus.counters.get("dropped", 0) for bus in report.buses)
 
 
 def _rounded(rate_hz: float | None) -> float | None:

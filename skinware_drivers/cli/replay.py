@@ -48,7 +48,7 @@ def speed(text: str) -> float:
     "skin-replay walk.mcap --wire --bus vcan0      the frames on the recorded bus, for any program",
 )
 @click.argument("file", type=cli.FILE)
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,16 @@ from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import ChainHealth
-from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, HealthSeen, PatchSeen, TaxelFault
+from skinware_drivers.doctor.evidence import (
+    BusSeen,
+    Change,
+    Counted,
+    DriverSeen,
+    DriverTiming,
+    HealthSeen,
+    PatchSeen,
+    TaxelFault,
+)
 
 _HOUR_S = 3600
 _MOST_CHANGES = 500
@@ -64,32 +73,29 @@ class _Growth:
         return Counted(named(self.now), named(self.grown), by_hours)
 
 
-@dataclass
 class DriverLog:
     """Sum up the snapshots of one structure of a driver.
 
     Attributes:
         newest: the last one; None before the first.
+        longest_gap_s: longest time between two of them.
     """
 
-    structure: Structure
-    by_hour: bool = False
-    frames: int = 0
-    newest: DriverSnapshot | None = None
-    future_ns: int = 0
-    backwards: int = 0
-    longest_gap_s: float = 0.0
-    load: npt.NDArray[np.uint16] = field(init=False)
-    _buses: _Growth | None = None
-    _patches: _Growth | None = None
-    _states: dict[tuple[str, int], list[Change]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        n = self.structure.n_patches
-        self._interval, self._delay = (np.zeros((n, BUCKETS), np.int64) for _ in range(2))
-        self.load = np.zeros(len(self.structure.buses), np.uint16)
-        self._always: npt.NDArray[np.uint8] = np.full(self.structure.n_sensors, 0xFF, np.uint8)
-        self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
+    def __init__(self, structure: Structure, driver: str, *, by_hour: bool = False) -> None:
+        self.structure = structure
+        self.newest: DriverSnapshot | None = None
+        self._by_hour, self._frames = by_hour, 0
+        self._future_ns = self._backwards = 0
+        self.longest_gap_s = 0.0
+        self._buses: _Growth | None = None
+        self._patches: _Growth | None = None
+        self._states: dict[tuple[str, int], list[Change]] = {}
+        self._judge = TaxelJudge(structure, driver)
+        names = ("patch_interval_counts", "patch_age_counts")
+        self._times = {name: np.zeros((structure.n_patches, BUCKETS), np.int64) for name in names}
+        self._load = np.zeros(len(structure.buses), np.uint16)
+        self._always: npt.NDArray[np.uint8] = np.full(structure.n_sensors, 0xFF, np.uint8)
+        self._is_lit: npt.NDArray[np.bool_] = np.zeros(structure.n_sensors, bool)
 
     def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
         """Add a snapshot."""
@@ -102,21 +108,23 @@ class DriverLog:
             self._buses.follow(bus_counts, time_s)
             self._patches.follow(patch_counts, time_s)
             self._follow_times(before, frame)
-        self.load = np.maximum(self.load, np.where(frame.bus_load == 0xFFFF, 0, frame.bus_load))
+        self._load = np.maximum(self._load, np.where(frame.bus_load == 0xFFFF, 0, frame.bus_load))
         self._follow_states(frame, time_s)
         self._always &= frame.status
         self._is_lit |= frame.values != 0
-        self.frames += 1
+        self._frames += 1
         self.newest = frame
+        if not frame.stale:
+            self._judge.take(frame)
 
     def _follow_times(self, before: DriverSnapshot, frame: DriverSnapshot) -> None:
         same_writer = before.generation == frame.generation
-        for total, name in ((self._interval, "patch_interval_counts"), (self._delay, "patch_age_counts")):
+        for name, total in self._times.items():
             now, was = (getattr(one, name).astype(np.int64) for one in (frame, before))
             total += np.where((now >= was) & same_writer, now - was, now)
         times, earlier = frame.group_time_ns, before.group_time_ns
-        self.backwards += int(np.count_nonzero((times < earlier) & (times > 0))) if same_writer else 0
-        self.future_ns = max(self.future_ns, int(times.max(initial=0)) - frame.published_ns)
+        self._backwards += int(np.count_nonzero((times < earlier) & (times > 0))) if same_writer else 0
+        self._future_ns = max(self._future_ns, int(times.max(initial=0)) - frame.published_ns)
         self.longest_gap_s = max(self.longest_gap_s, (frame.published_ns - before.published_ns) / 1e9)
 
     def _follow_states(self, frame: DriverSnapshot, time_s: float) -> None:
@@ -133,7 +141,34 @@ class DriverLog:
                     del changes[1]
                 changes.append(now)
 
-    # -- the sum ------------------------------------------------------------------------------------------------
+    def seen(self, status: npt.NDArray[np.uint8], at_ns: int, timing: DriverTiming, **facts: Any) -> DriverSeen:
+        """Return the sum.
+
+        Args:
+            status: (n_sensors,) of the sensors at the end.
+            at_ns: time of the end, CLOCK_MONOTONIC.
+            facts: fields that snapshots do not tell: the name of the driver, its process, its life and restarts.
+        """
+        statuses, affected = self._affected(status)
+        suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
+        is_dark = self._dark_modules()
+        dark_sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
+        bad = ((self._always & _BAD) != 0) & ~is_dark[self.structure.sensor_module]
+        period_ns = 0 if self.newest is None else self.newest.period_ns
+        return DriverSeen(
+            data_path="not_told" if self.newest is None else self.newest.data_path.name.lower(),
+            frames=self._frames,
+            structure=self.structure,
+            statuses=statuses,
+            affected=affected,
+            lines=whole_lines(self.structure, bad) if self._frames else (),
+            dark={self.structure.module_names[row]: int(dark_sensors[row]) for row in np.flatnonzero(is_dark).tolist()},
+            buses=self.buses(),
+            patches=self.patches(status, at_ns),
+            timing=replace(timing, period_ns=period_ns, future_ns=self._future_ns, backwards=self._backwards),
+            health=self._judge.seen(),
+            **facts,
+        )
 
     def buses(self) -> tuple[BusSeen, ...]:
         """Return the buses in the newest snapshot; none before the first."""
@@ -151,8 +186,8 @@ class DriverLog:
                     state=changes[-1].state,
                     reason=changes[-1].reason,
                     since_s=(frame.published_ns - since_ns) / 1e9 if since_ns else None,
-                    load=load_report(int(self.load[row]))["load"] if self.load[row] else None,  # type: ignore[arg-type]
-                    counted=self._buses.counted(row, by_hour=self.by_hour),
+                    load=load_report(int(self._load[row]))["load"] if self._load[row] else None,  # type: ignore[arg-type]
+                    counted=self._buses.counted(row, by_hour=self._by_hour),
                     samples=tuple(f"{one['why'].replace('_', ' ')}: {sample_text(one)}" for one in samples),
                     changes=changes,
                 )
@@ -160,12 +195,7 @@ class DriverLog:
         return tuple(found)
 
     def patches(self, status: npt.NDArray[np.uint8], at_ns: int) -> tuple[PatchSeen, ...]:
-        """Return the patches in the newest snapshot; none before the first.
-
-        Args:
-            status: (n_sensors,) of the sensors at the end.
-            at_ns: time of the end, CLOCK_MONOTONIC.
-        """
+        """Return the patches in the newest snapshot, as :meth:`seen` does; none before the first."""
         frame, structure = self.newest, self.structure
         if frame is None or self._patches is None:
             return ()
@@ -185,21 +215,18 @@ class DriverLog:
                 modules=modules[row],
                 fresh=fresh[row],
                 age_ns=at_ns - int(newest_ns[row]) if newest_ns[row] else None,
-                counted=self._patches.counted(row, by_hour=self.by_hour),
-                interval=Histogram(self._interval[row].tolist()),
-                delay=Histogram(self._delay[row].tolist()),
+                counted=self._patches.counted(row, by_hour=self._by_hour),
+                interval=Histogram(self._times["patch_interval_counts"][row].tolist()),
+                delay=Histogram(self._times["patch_age_counts"][row].tolist()),
                 changes=tuple(self._states["patch", row]),
             )
             for row, name in enumerate(structure.patch_names)
         )
 
-    def affected(self, status: npt.NDArray[np.uint8]) -> tuple[dict[str, int], dict[str, tuple[str, ...]]]:
+    def _affected(self, status: npt.NDArray[np.uint8]) -> tuple[dict[str, int], dict[str, tuple[str, ...]]]:
         """Return the numbers of sensors by status, and the names of the first few with each status but ``fresh``.
 
         A sensor that was out of range for a while was pressed hard: only sensors that always were are counted.
-
-        Args:
-            status: (n_sensors,) of the sensors at the end.
         """
         shown = status & (self._always | ~np.uint8(Status.OUT_OF_RANGE))
         counts = count_statuses(shown)
@@ -215,32 +242,15 @@ class DriverLog:
         }
         return counts, names
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the names of rows and columns of matrices that were good in no snapshot, without dark modules."""
-        dark = self._dark_modules()[self.structure.sensor_module]
-        return whole_lines(self.structure, ((self._always & _BAD) != 0) & ~dark) if self.frames else ()
-
-    def dark(self) -> dict[str, int]:
-        """Return the modules that have sent nothing but 0, with the number of their sensors that are suspect."""
-        suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
-        sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
-        dark = np.flatnonzero(self._dark_modules()).tolist()
-        return {self.structure.module_names[module]: int(sensors[module]) for module in dark}
-
     def _dark_modules(self) -> npt.NDArray[np.bool_]:
-        is_dark = ((self._always & np.uint8(Status.SUSPECT)) != 0) & ~self._is_lit & (self.frames > 0)
+        is_dark = ((self._always & np.uint8(Status.SUSPECT)) != 0) & ~self._is_lit & (self._frames > 0)
         found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
         found[self.structure.sensor_module[~is_dark]] = False
         return found if self.newest is None else found | self.newest.module_untouched
 
 
 def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the names of rows, columns (counted from 0) and matrices without a good sensor.
-
-    Args:
-        structure: its modules are matrices if their kind says so: ``12x32``.
-        bad: (n_sensors,) bool.
-    """
+    """Return the names of rows, columns (counted from 0) and whole matrices (kind ``12x32``) of bad sensors."""
     found: list[str] = []
     for module, name in enumerate(structure.module_names):
         kind = structure.module_kind[module].decode()
@@ -248,18 +258,16 @@ def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, 
         for type_id in np.unique(structure.sensor_type[index]).tolist():
             of_type = bad[index[structure.sensor_type[index] == type_id]]
             shape = filled_by(kind, len(of_type))
-            if shape is not None:
-                found += [f"{line} of {name}" for line in _lines(of_type.reshape(shape))]
+            if shape is None:
+                continue
+            matrix = of_type.reshape(shape)
+            if matrix.all():
+                found.append(f"all of {name}")
+            elif 1 not in shape:
+                rows, columns = (np.flatnonzero(matrix.all(axis=axis)).tolist() for axis in (1, 0))
+                found += [f"row {row} of {name}" for row in rows]
+                found += [f"column {column} of {name}" for column in columns]
     return tuple(dict.fromkeys(found))
-
-
-def _lines(bad: npt.NDArray[np.bool_]) -> list[str]:
-    if bad.all():
-        return ["all"]
-    if 1 in bad.shape:
-        return []
-    rows, columns = (np.flatnonzero(bad.all(axis=axis)).tolist() for axis in (1, 0))
-    return [*(f"row {row}" for row in rows), *(f"column {column}" for column in columns)]
 
 
 class TaxelJudge:
@@ -317,12 +325,11 @@ def taxel_faults(
 ) -> tuple[TaxelFault, ...]:
     """Return the faulty taxels of a report on the sensors at some positions of a structure."""
     units = {sensor_type.id: sensor_type.unit for sensor_type in structure.types}
-    rows = np.flatnonzero(report.faulty).tolist()
-    return tuple(
-        TaxelFault(
-            structure.sensor_name(position),
-            HealthKind(int(report.kind[row])).name.lower(),
-            report.evidence(row, units[int(structure.sensor_type[position])]),
-        )
-        for row, position in zip(rows, positions[rows].tolist(), strict=True)
-    )
+    faults = []
+    for row in np.flatnonzero(report.faulty).tolist():
+        position, other = int(positions[row]), int(report.other[row])
+        other_name = structure.sensor_name(int(positions[other])) if other >= 0 else ""
+        evidence = report.evidence(row, units[int(structure.sensor_type[position])], other_name)
+        kind = HealthKind(int(report.kind[row])).name.lower()
+        faults.append(TaxelFault(structure.sensor_name(position), kind, evidence))
+    return tuple(faults)

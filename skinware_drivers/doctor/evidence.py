@@ -32,13 +32,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Change:
-    """A change of state.
-
-    Attributes:
-        time_s: since the look or the recording began.
-        state: from then on.
-        reason: of the state; empty: none.
-    """
+    """A change of state, so long after the look or the recording began."""
 
     time_s: float
     state: str
@@ -47,10 +41,10 @@ class Change:
 
 @dataclass(frozen=True)
 class BusSeen:
-    """A bus of a driver.
+    """A bus of a driver at the end.
 
     Attributes:
-        state, reason: at the end, in the words of ``skin-info``; reason ``""``: none.
+        state, reason: in the words of ``skin-info``; reason ``""``: none.
         since_s: age of the state; None: unknown.
         load: 0 to 1, in a recording the highest; None: unknown.
         samples: texts of the newest few frames that were not used.
@@ -69,14 +63,14 @@ class BusSeen:
 
 @dataclass(frozen=True)
 class PatchSeen:
-    """A patch of a driver.
+    """A patch of a driver at the end.
 
     Attributes:
-        state: at the end, in the words of ``skin-info``.
-        fresh: number of sensors that are fresh at the end.
-        age_ns: age of its newest data at the end; None: it never sent any.
-        interval: times between two updates of a module, during the look.
-        delay: ages of updates when they were published, during the look.
+        state: in the words of ``skin-info``.
+        sensors, modules, fresh: how many it has, and how many of its sensors are fresh.
+        age_ns: age of its newest data; None: it never sent any.
+        interval: times between two updates of a module.
+        delay: ages of updates when they were published.
         changes: of its state; the first one is the state at the beginning.
     """
 
@@ -95,11 +89,7 @@ class PatchSeen:
 
 @dataclass(frozen=True)
 class TaxelFault:
-    """A faulty taxel.
-
-    Attributes:
-        kind: ``dead``, ``stuck``, ``noisy``, ``weak`` or ``clipped``.
-    """
+    """A taxel that is ``dead``, ``stuck``, ``noisy``, ``weak`` or ``clipped``."""
 
     name: str
     kind: str
@@ -124,14 +114,14 @@ class HealthSeen:
 
 @dataclass(frozen=True)
 class DriverTiming:
-    """Times of a driver.
+    """Times of a driver during the look.
 
     Attributes:
         rate_hz: rate of its snapshots; None: unknown.
-        period_ns: its nominal period; 0: none.
-        missed, missed_before: periods that it missed during the look, and before.
-        late: delays of its periods during the look.
-        age: ages of the newest data when it was published, during the look.
+        late: delays of its periods.
+        age: ages of the newest data when it was published.
+        missed: periods that it missed.
+        period_ns: nominal; 0: none.
         future_ns: the most by which data was stamped later than it was published; 0: never.
         backwards: times that the times of a module went backwards.
         before_boot: snapshots that were stamped before the machine was started.
@@ -139,11 +129,10 @@ class DriverTiming:
     """
 
     rate_hz: float | None
-    period_ns: int
-    missed: int
-    missed_before: int
     late: Histogram
     age: Histogram
+    missed: int = 0
+    period_ns: int = 0
     future_ns: int = 0
     backwards: int = 0
     before_boot: int = 0
@@ -161,7 +150,7 @@ class DriverSeen:
         scheduling: of its process, in words; empty: unknown.
         data_path: ``native``, ``mixed``, ``python`` or ``not_told``.
         restarts: during the look, or in the recording.
-        frames_missed: number of snapshots that were published and are missing in the recording.
+        frames, frames_missed: snapshots that were seen, and those that are missing in the recording.
         statuses: number of sensors with each status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``.
         lines: names of the rows and columns of matrices that were never good.
@@ -179,7 +168,6 @@ class DriverSeen:
     data_path: str
     restarts: int
     frames: int
-    frames_missed: int
     structure: Structure
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
@@ -189,6 +177,7 @@ class DriverSeen:
     patches: tuple[PatchSeen, ...]
     timing: DriverTiming
     health: HealthSeen | None = None
+    frames_missed: int = 0
 
 
 @dataclass(frozen=True)
@@ -200,7 +189,6 @@ class NamespaceSeen:
         problem: the reason why it cannot be read; empty: it can.
         damaged: errors of files that cannot be read.
         living, dead: names of services whose writer lives, and of those whose writer was killed.
-        bytes_of_dead: size of the files of killed writers.
         idle_s: time since a service last came or went.
     """
 
@@ -216,14 +204,6 @@ class NamespaceSeen:
 
 
 @dataclass(frozen=True)
-class InterfaceSeen:
-    """A CAN interface of the kernel at the end of the look, and the counters of the kernel and of its controller."""
-
-    interface: CanInterface
-    counted: Counted
-
-
-@dataclass(frozen=True)
 class MachineSeen:
     """The machine and its software.
 
@@ -232,7 +212,7 @@ class MachineSeen:
         kernel: release and processor architecture.
         load: number of processes that are ready to run, mean of the last minute.
         governors: of the processors, each once; empty: none, or unknown.
-        memory_bytes, memory_available_bytes: of the machine; 0: unknown.
+        memory_bytes, memory_available_bytes: 0: unknown.
         shared_bytes, shared_free_bytes: of /dev/shm; 0: it is missing.
         shared_problem: the reason why files cannot be made in /dev/shm; empty: they can.
         locked_memory_bytes: the most that this user may lock; -1: unlimited.
@@ -261,28 +241,15 @@ class MachineSeen:
 
 
 @dataclass(frozen=True)
-class ClockSet:
-    """A jump of the wall clock in a recording, because it was set or the machine slept.
-
-    Attributes:
-        by_s: size of the jump, forward or back.
-    """
-
-    time_s: float
-    by_s: float
-
-
-@dataclass(frozen=True)
 class RecordingSeen:
     """A recording.
 
     Attributes:
-        size: in bytes.
         is_whole: it was closed in good order.
         services: names of the services in it that are not drivers.
         missed: number of snapshots that were published meanwhile and are missing.
         events: number of events of each kind: ``restarted``, ``dead`` ...
-        clock_sets: jumps of the wall clock.
+        clock_sets: jumps of the wall clock, because it was set or the machine slept: when, s, and by how much, s.
         boots: number of starts of the machine that it spans.
         recorded_by: program and version; empty: unknown.
     """
@@ -295,18 +262,14 @@ class RecordingSeen:
     services: tuple[str, ...]
     missed: int
     events: Counts
-    clock_sets: tuple[ClockSet, ...]
+    clock_sets: tuple[tuple[float, float], ...]
     boots: int
     recorded_by: str
 
 
 @dataclass(frozen=True)
 class ReaderSeen:
-    """A program that reads a driver snapshot by snapshot.
-
-    Attributes:
-        frames, missed: number of snapshots that it took and missed during the look.
-    """
+    """A program that reads a driver snapshot by snapshot, and how many it took and missed during the look."""
 
     program: str
     pid: int
@@ -321,8 +284,9 @@ class Evidence:
 
     Attributes:
         seconds: duration of the look, or length of the recording.
-        machine: this one; of the machine that recorded nothing is known.
+        machine: this one; nothing is known of the machine that recorded.
         recording: None: a running skin was examined.
+        interfaces: CAN interfaces of the kernel at the end, and the counters of the kernel and of their controllers.
         kernel_has_can: the kernel supports CAN.
         running: living drivers in all namespaces that may be read, without those that publish another driver's data.
         waiting: processes of ``skin-driver`` that have published nothing so far.
@@ -336,7 +300,7 @@ class Evidence:
     machine: MachineSeen
     recording: RecordingSeen | None = None
     namespaces: tuple[NamespaceSeen, ...] = ()
-    interfaces: tuple[InterfaceSeen, ...] = ()
+    interfaces: tuple[tuple[CanInterface, Counted], ...] = ()
     kernel_has_can: bool = True
     ports: tuple[SerialPort, ...] = ()
     running: tuple[RunningDriver, ...] = ()

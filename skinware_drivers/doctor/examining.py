@@ -9,7 +9,7 @@ from typing import Any
 
 from skinware.memory.namespace import Namespace
 from skinware.text import printable
-from skinware_drivers.doctor import buses, files, machine, patches, programs, taxels
+from skinware_drivers.doctor import buses, machine, patches, programs
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked
 
@@ -18,10 +18,10 @@ CHECKS: dict[str, Callable[[Evidence], Iterator[Note]]] = {
     "permissions": machine.check_permissions,
     "bridges": programs.check_bridges,
     "buses": buses.check,
-    "patches": patches.check,
+    "patches": patches.check_patches,
     "timing": programs.check_timing,
-    "taxels": taxels.check,
-    "files": files.check,
+    "taxels": patches.check_taxels,
+    "files": programs.check_files,
     "machine": machine.check_machine,
 }
 """The check of each area, in the order in which data travels."""
@@ -35,11 +35,7 @@ _FOLLOWS_NAMESPACE = (
 
 @dataclass(frozen=True)
 class Examination:
-    """The result of all checks.
-
-    Attributes:
-        findings: the worst first, then in the order in which data travels.
-    """
+    """The result of all checks: findings, the worst first, then in the order in which data travels."""
 
     findings: tuple[Finding, ...]
     looked: tuple[Looked, ...]
@@ -57,19 +53,18 @@ def examine(evidence: Evidence) -> Examination:
 
 
 def _finished(note: Note, area: str, evidence: Evidence) -> Note:
-    """Return a note with its area, printable texts, and the commands that are of use."""
+    """Return a note with its area, printable texts, and the commands that are of use.
+
+    Commands reach the namespace that was examined, even if it is not the default here.
+    """
     texts: dict[str, Any] = {name: printable(value) for name, value in vars(note).items() if isinstance(value, str)}
+    elsewhere = evidence.namespace if evidence.namespace not in ("", Namespace().name) else ""
     if not isinstance(note, Looked):
-        texts["commands"] = tuple(
-            printable(_in_namespace(command, evidence.namespace))
-            for command in note.commands
-            if evidence.is_live or command.startswith(_OF_ANY_TIME)
-        )
+        commands = []
+        for command in note.commands:
+            if evidence.is_live or command.startswith(_OF_ANY_TIME):
+                if elsewhere and "--namespace" not in command and command.startswith(_FOLLOWS_NAMESPACE):
+                    command = f"{command} --namespace {shlex.quote(elsewhere)}"
+                commands.append(printable(command))
+        texts["commands"] = tuple(commands)
     return replace(note, **{**texts, "area": area})
-
-
-def _in_namespace(command: str, namespace: str) -> str:
-    """Return a command that reaches the namespace that was examined, even if it is not the default here."""
-    if not namespace or namespace == Namespace().name or "--namespace" in command:
-        return command
-    return f"{command} --namespace {shlex.quote(namespace)}" if command.startswith(_FOLLOWS_NAMESPACE) else command

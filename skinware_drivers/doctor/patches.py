@@ -1,27 +1,19 @@
-"""Patches: those that never answered, fell silent or lose frames, and addresses that two of them share."""
+"""Patches and their taxels: silence, losses, shared addresses; status, health, and places that cannot be right."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from statistics import median
 
-from skinware.text import age_text, count_text, plural
-from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
-from skinware_drivers.doctor.finding import (
-    Finding,
-    Looked,
-    Note,
-    NotLooked,
-    Rule,
-    Severity,
-    brief,
-    has_operation,
-    loss_in_words,
-    names_of_bus,
-)
+import numpy as np
 
-_FAULTS, _MISSING = "reference/faults.md#patches", "troubleshooting.md#data-is-missing"
-_ASK = ("skin-config {configured} versions", "skin-info {driver}", "skin-find {name}")
+from skinware.tactile.calibration.checking import check_file
+from skinware.text import age_text, count_text, plural, words
+from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
+from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
+from skinware_drivers.doctor.rules import RULES, brief, has_operation, loss_seen, names_of_bus
+
 _TWICE = 1.6
 """Ratio to the updates of other patches: two boards have one address, or one has another period."""
 _NOT_USED = ("unknown", "bad_length", "bad_content", "before_boot")
@@ -35,65 +27,17 @@ _ENOUGH_UPDATES = 20
 _MOST_PATCHES = 5
 _FLAPS = 4
 
-NEVER_ANSWERED = Rule(
-    Severity.ERROR,
-    "{patch} never answered",
-    "check its power, cable and address, and that the driver's options name the right boards",
-    _ASK,
-    _FAULTS,
-)
-SILENT = Rule(
-    Severity.ERROR,
-    "{patch} fell silent",
-    "check its power and cable; the driver keeps asking it, and configures it when it answers",
-    _ASK,
-    _FAULTS,
-)
-RESTARTED = Rule(
-    Severity.WARNING,
-    "{patch} lost its power and is being configured",
-    "if it happens again: check its power",
-    _ASK,
-    _FAULTS,
-)
-NOT_FRESH = Rule(
-    Severity.ERROR,
-    "no sensor of {patch} is fresh",
-    "see the status of its sensors",
-    ("skin-info {driver}",),
-    "explanation/status.md",
-)
-CAME_BACK = Rule(Severity.WARNING, "{patch} fell silent and came back", "check its plug and power", _ASK, _FAULTS)
-TWO_BOARDS = Rule(
-    Severity.ERROR,
-    "{patch} sends {times} times as much as it should: two boards with one address?",
-    "unplug one board and see whether the address still sends; then end the driver, and give that board another"
-    " address",
-    ("skin-find {name}", "skin-config {name} set_address address=9 {only}"),
-    "how-to/find-and-set-up.md#configure-boards",
-)
 
-
-def _loss(what: str, unit: str) -> Rule:
-    action = "see whether its bus loses frames, is full or is damaged: cable, termination, load"
-    return Rule(Severity.WARNING, what, action, ("skin-info {driver}", "skin-find {name}"), _MISSING, unit)
-
-
-LOSSES = {
-    "orphans": _loss("frames came without their partners, whose update was not shown", "frame"),
-    "late": _loss("frames of a cycle came too far apart, or out of rhythm", "cycle"),
-    "sequence_lost": _loss("numbers are missing in its sequence", "frame"),
-    "sequence_repeated": _loss("numbers came twice in its sequence", "frame"),
-    "sequence_back": _loss("numbers went back in its sequence", "time"),
-}
-"""By counter of the patch. Notes once the loss is over."""
-
-
-def check(evidence: Evidence) -> Iterator[Note]:
+def check_patches(evidence: Evidence) -> Iterator[Note]:
     for driver in evidence.drivers:
         if not driver.patches:
             continue
-        yield Looked(f"driver {driver.name}", _as_seen(driver))
+        states = [patch.state for patch in driver.patches]
+        by_state = ", ".join(f"{count_text(states.count(state))} {state}" for state in sorted(set(states)))
+        updates = sum(patch.counted.grown.get("updates", 0) for patch in driver.patches)
+        lost = sum(patch.counted.grown.get(name, 0) for patch in driver.patches for name in RULES["patch-loss"])
+        counts = f"{plural(updates, 'update')}, {lost} lost or late"
+        yield Looked(f"driver {driver.name}", f"{plural(len(states), 'patch', 'patches')}: {by_state}; {counts}")
         for patch in driver.patches:
             if driver.life not in ("dead", "closed") or not evidence.is_live:
                 yield from _state(driver, patch)
@@ -103,17 +47,9 @@ def check(evidence: Evidence) -> Iterator[Note]:
                 more = " ..." if len(times) > _FLAPS else ""
                 span = age_text(evidence.seconds * 1e9)
                 seen = f"{plural(len(times), 'time')} in {span}: at {shown}{more}"
-                yield CAME_BACK.found(_where(driver, patch), seen, **_names(driver, patch))
+                yield RULES["patch"]["came-back"].found(_where(driver, patch), seen, **_names(driver, patch))
         yield from _losses(driver, evidence)
         yield from _two_boards(driver, evidence)
-
-
-def _as_seen(driver: DriverSeen) -> str:
-    states = [patch.state for patch in driver.patches]
-    by_state = ", ".join(f"{count_text(states.count(state))} {state}" for state in sorted(set(states)))
-    updates = sum(patch.counted.grown.get("updates", 0) for patch in driver.patches)
-    lost = sum(patch.counted.grown.get(name, 0) for patch in driver.patches for name in LOSSES)
-    return f"{plural(len(states), 'patch', 'patches')}: {by_state}; {plural(updates, 'update')}, {lost} lost or late"
 
 
 def _where(driver: DriverSeen, patch: PatchSeen) -> str:
@@ -132,46 +68,39 @@ def _state(driver: DriverSeen, patch: PatchSeen) -> Iterator[Finding]:
     others = f"{sum(one.state == 'live' for one in driver.patches)} of {len(driver.patches)} patches are live"
     if patch.age_ns is None or patch.state == "expected":
         seen = f"state {patch.state}, no data of its {plural(patch.sensors, 'sensor')}; {others}"
-        yield NEVER_ANSWERED.found(where, seen, **names)
+        yield RULES["patch"]["never-answered"].found(where, seen, **names)
     elif patch.state == "stale":
-        yield SILENT.found(where, f"newest data {age_text(patch.age_ns)} old; {others}", **names)
+        yield RULES["patch"]["silent"].found(where, f"newest data {age_text(patch.age_ns)} old; {others}", **names)
     elif patch.state == "restarted":
-        yield RESTARTED.found(where, f"state restarted; {others}", **names)
+        yield RULES["patch"]["restarted"].found(where, f"state restarted; {others}", **names)
     elif not patch.fresh and patch.sensors and driver.life == "live":
         seen = f"state live, newest data {age_text(patch.age_ns)} old, 0 of {count_text(patch.sensors)} fresh"
-        yield NOT_FRESH.found(where, seen, patch=patch.name, driver=driver.name)
+        yield RULES["patch"]["not-fresh"].found(where, seen, patch=patch.name, driver=driver.name)
 
 
 def _losses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
-    for name, rule in LOSSES.items():
-        losses = [
-            (loss, patch)
-            for patch in driver.patches
-            if (loss := loss_in_words(patch.counted, name, rule.unit, evidence)) is not None
-            and (loss.is_going_on or _matters(patch, name))
-        ]
+    for name, rule in RULES["patch-loss"].items():
+        losses = []
+        for patch in driver.patches:
+            grown, total = patch.counted.grown, patch.counted.total
+            beside = f" beside {plural(grown['updates'], 'update')}" if grown.get("updates") else ""
+            loss = loss_seen(patch.counted, name, rule.unit, evidence, beside)
+            # cycles are always cut when a driver begins to listen
+            is_much = total.get(name, 0) > max(patch.modules, _PAST_SHARE * total.get("updates", 0))
+            if loss is not None and (loss[0] or is_much):
+                losses.append((*loss, patch))
         if not losses:
             continue
-        losses.sort(key=lambda one: (one[0].is_going_on, one[1].counted.grown.get(name, 0)), reverse=True)
-        shown = []
-        for loss, patch in losses[:_MOST_PATCHES]:
-            updates = patch.counted.grown.get("updates", 0)
-            beside = f" beside {plural(updates, 'update')}" if updates else ""
-            shown.append(f"{patch.name}: {loss.text}{beside}{loss.hours}")
-        worst, worst_patch = losses[0]
+        losses.sort(key=lambda one: (one[0], one[2].counted.grown.get(name, 0)), reverse=True)
+        shown = [f"{patch.name}: {text}" for _, text, patch in losses[:_MOST_PATCHES]]
+        is_going_on, _, worst = losses[0]
         yield rule.found(
             f"driver {driver.name}, {plural(len(losses), 'patch', 'patches')}",
             "; ".join(shown) + (" ..." if len(losses) > len(shown) else ""),
-            None if worst.is_going_on else Severity.NOTE,
+            None if is_going_on else Severity.NOTE,
             driver=driver.name,
-            **names_of_bus(worst_patch.bus),
+            **names_of_bus(worst.bus),
         )
-
-
-def _matters(patch: PatchSeen, name: str) -> bool:
-    """Return whether a loss that is over is worth a note: cycles are always cut when a driver begins to listen."""
-    total = patch.counted.total
-    return total.get(name, 0) > max(patch.modules, _PAST_SHARE * total.get("updates", 0))
 
 
 def _two_boards(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
@@ -198,7 +127,7 @@ def _two_boards(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
             if has_operation(driver.driver_type, "set_address"):
                 names["only"] = f"patch={patch.name}"
             seen = f"data of {count:.0f} updates of a module in {span}, {usual:.0f} are due"
-            yield TWO_BOARDS.found(_where(driver, patch), seen, **names)
+            yield RULES["patch"]["two-boards"].found(_where(driver, patch), seen, **names)
 
 
 def _collides(patch: PatchSeen) -> bool:
@@ -228,3 +157,95 @@ def _sent(driver: DriverSeen) -> dict[str, float]:
             whole = counts.get("updates", 0) + counts.get("orphans", 0) / frames_of_one
             found[patch.name] = whole / patch.modules
     return found
+
+
+_MOST_NAMES = 3
+_MOST_LINES = 6
+_STROKES = (
+    "skin-calibrate topology -o skin.toml --driver {driver}",
+    "skin-calibrate check skin.toml --driver {driver}",
+)
+
+
+def check_taxels(evidence: Evidence) -> Iterator[Note]:
+    for driver in evidence.drivers:
+        where = f"driver {driver.name}"
+        statuses = ", ".join(f"{count_text(n)} {words(name)}" for name, n in driver.statuses.items() if n)
+        dark = f"{plural(len(driver.dark), 'module')} {_verbs(len(driver.dark))['have']} sent nothing but 0 so far"
+        # without suspect sensors, such modules may be good: perhaps nothing has touched them
+        untouched = f"; {dark}: {_some(list(driver.dark))}" if driver.dark and not any(driver.dark.values()) else ""
+        sensors = plural(driver.structure.n_sensors, "sensor")
+        yield Looked(where, f"{sensors}: {statuses or 'no data'}{untouched}")
+        can_rebaseline = has_operation(driver.driver_type, "rebaseline")
+        names = {"driver": driver.name, "rebaselined" if can_rebaseline else "shown": driver.name}
+        for status, rule in RULES["status"].items():
+            count = driver.statuses.get(status, 0) - (sum(driver.dark.values()) if status == "suspect" else 0)
+            if count > 0:
+                some = driver.affected.get(status, ())
+                seen = f"status {words(status)}: {'; '.join(some)}{' ...' if count > len(some) else ''}"
+                yield rule.found(where, seen, sensors=plural(count, "sensor"), **_verbs(count), **names)
+        if any(driver.dark.values()):
+            yield RULES["taxel"]["dark"].found(where, _some(list(driver.dark)), modules=dark)
+        if driver.lines:
+            yield RULES["taxel"]["lines"].found(where, _some(driver.lines))
+        yield from _health(driver)
+        yield from _places(driver)
+
+
+def _verbs(count: int) -> dict[str, str]:
+    """Return the verbs of a sentence about so many things."""
+    return {"are": "is", "do": "does", "have": "has"} if count == 1 else {"are": "are", "do": "do", "have": "have"}
+
+
+def _some(names: Sequence[str]) -> str:
+    return "; ".join(names[:_MOST_LINES]) + (" ..." if len(names) > _MOST_LINES else "")
+
+
+def _health(driver: DriverSeen) -> Iterator[Note]:
+    seen = driver.health
+    if seen is None:
+        yield NotLooked(f"health of {driver.name}", "no snapshot to judge by")
+        return
+    if seen.judged:
+        yield Looked(f"health of {driver.name}", f"{plural(seen.judged, 'taxel')}, judged by {seen.source}")
+    for kind, count in Counter(fault.kind for fault in seen.faults).items():
+        some = [fault for fault in seen.faults if fault.kind == kind][:_MOST_NAMES]
+        shown = "; ".join(f"{fault.name}: {fault.evidence}" for fault in some)
+        yield RULES["taxel"]["faulty"].found(
+            f"driver {driver.name}",
+            f"{shown}{' ...' if count > len(some) else ''} (judged by {seen.source})",
+            taxels=plural(count, "taxel"),
+            kind=kind,
+            driver=driver.name,
+            **_verbs(count),
+        )
+    for what, why in seen.missing.items():
+        is_last = what == list(seen.missing)[-1]
+        commands = (f"skin-calm {driver.name}", f"skin-wipe {driver.name}") if is_last else ()
+        yield NotLooked(f"{what} of {driver.name}", why, commands)
+
+
+def _places(driver: DriverSeen) -> Iterator[Note]:
+    structure = driver.structure
+    swapped = f"exchanged or mirrored modules of {driver.name}"
+    by_strokes = tuple(command.format(driver=driver.name) for command in _STROKES)
+    if structure.geometry is None:
+        yield NotLooked(swapped, "the driver publishes no places of its sensors", by_strokes)
+        return
+    counts: Counter[str] = Counter()
+    modules: dict[str, set[str]] = {}
+    for sensor_type in structure.types:
+        geometry = structure.geometry[structure.index(sensor_type.name)]
+        if not geometry.known.any():
+            continue  # such as temperatures, whose places are not needed
+        for problem in check_file(geometry, structure.module_of(sensor_type.name)):
+            counts[problem.kind] += len(problem.taxels)
+            modules.setdefault(problem.kind, set()).update(structure.module_names[row] for row in problem.modules)
+    yield Looked(f"places of {driver.name}", f"{int(np.count_nonzero(structure.geometry.known))} known")
+    for kind, rule in RULES["place"].items():
+        if counts[kind]:
+            names = sorted(modules[kind])
+            seen = f"modules {', '.join(names[:_MOST_NAMES])}{' ...' if len(names) > _MOST_NAMES else ''}"
+            count = plural(counts[kind], "sensor")
+            yield rule.found(f"driver {driver.name}", seen, driver=driver.name, sensors=count, **_verbs(counts[kind]))
+    yield NotLooked(swapped, "only strokes over the skin can show them", by_strokes)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,10 +16,9 @@ from skinware.memory.statistics import Histogram
 from skinware.realtime import NS_PER_S
 from skinware.recording import RecordedDriverSnapshot, Recording
 from skinware.status import Status
-from skinware_drivers.doctor.driver_log import DriverLog, TaxelJudge
+from skinware_drivers.doctor.driver_log import DriverLog
 from skinware_drivers.doctor.evidence import (
     BusSeen,
-    ClockSet,
     Counted,
     DriverSeen,
     DriverTiming,
@@ -66,6 +64,17 @@ def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: N
 
 def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> RecordingSeen:
     clock = recording.clock
+    # the wall clock against CLOCK_MONOTONIC, which cannot be set
+    offsets = [
+        (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
+        for moment in clock
+        if isinstance(moment.get("realtime_ns"), int) and isinstance(moment.get("monotonic_ns"), int)
+    ]
+    clock_sets = [
+        (time_s, now - before)
+        for (_, before, boot), (time_s, now, boot_now) in pairwise(offsets)
+        if boot == boot_now and abs(now - before) > _SET_S
+    ]
     return RecordingSeen(
         name=recording.path.name,
         size=recording.path.stat().st_size,
@@ -75,22 +84,10 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
         services=tuple(name for name in recording.services if name not in recording.drivers),
         missed=sum(_missed_in(event) for event in events),
         events=Counter(str(event.get("event")) for event in events),
-        clock_sets=tuple(_clock_sets(clock)),
+        clock_sets=tuple(clock_sets),
         boots=len({str(moment.get("boot")) for moment in clock}),
         recorded_by=recording.recorded_by,
     )
-
-
-def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
-    """Return the jumps of the wall clock against CLOCK_MONOTONIC, which cannot be set."""
-    offsets = [
-        (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
-        for moment in clock
-        if isinstance(moment.get("realtime_ns"), int) and isinstance(moment.get("monotonic_ns"), int)
-    ]
-    for (_, before, boot), (time_s, now, boot_now) in pairwise(offsets):
-        if boot == boot_now and abs(now - before) > _SET_S:
-            yield ClockSet(time_s, now - before)
 
 
 def _missed_in(event: dict[str, Any]) -> int:
@@ -103,9 +100,7 @@ class _DriverTrack:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self.log: DriverLog | None = None
-        self._judge: TaxelJudge | None = None
-        self._earlier: list[DriverLog] = []
+        self._logs: list[DriverLog] = []
         self._newest: RecordedDriverSnapshot | None = None
         self._driver_type = ""
         self._looked_ns = 0
@@ -121,94 +116,65 @@ class _DriverTrack:
         self._age.add(max(0, frame.published_ns - frame.acquired_ns))
         is_new = before is None or before.generation != frame.generation
         if is_new:
-            self._begin(frame, tables, is_restart=before is not None)
-        elif before is not None:
-            self._time(before, frame)
+            self._restarts += before is not None
+            driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1])
+            self._driver_type = driver_type.decode(errors="replace")
+            if not self._logs or self._logs[-1].structure != frame.structure:
+                self._logs.append(DriverLog(frame.structure, self._name, by_hour=True))
+        elif before is not None and frame.sequence == before.sequence + 1:  # without a loss between them
+            interval_ns = frame.published_ns - before.published_ns
+            self._live_ns += interval_ns
+            self._intervals += 1
+            self._longest_gap_ns = max(self._longest_gap_ns, interval_ns)
+            if frame.period_ns:
+                self._late.add(max(0, interval_ns - frame.period_ns))
         if is_new or abs(frame.published_ns - self._looked_ns) >= _LOOK_EVERY_NS:
             self._looked_ns = frame.published_ns
-            if self.log is not None and self._judge is not None:
-                self.log.take(frame, tables, time_s)
-                self._judge.take(frame)
-
-    def _begin(self, frame: RecordedDriverSnapshot, tables: Any, *, is_restart: bool) -> None:
-        """Begin a generation. If its sensors are the same, their log continues."""
-        self._restarts += is_restart
-        self._driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1]).decode(errors="replace")
-        if self.log is not None and self.log.structure == frame.structure:
-            return
-        if self.log is not None:
-            self._earlier.append(self.log)
-        self.log = DriverLog(frame.structure, by_hour=True)
-        self._judge = TaxelJudge(frame.structure, self._name)
-
-    def _time(self, before: RecordedDriverSnapshot, frame: RecordedDriverSnapshot) -> None:
-        """Time two snapshots that follow each other, without a loss between them."""
-        if frame.sequence != before.sequence + 1:
-            return
-        interval_ns, period_ns = frame.published_ns - before.published_ns, frame.period_ns
-        self._live_ns += interval_ns
-        self._intervals += 1
-        self._longest_gap_ns = max(self._longest_gap_ns, interval_ns)
-        if period_ns:
-            self._late.add(max(0, interval_ns - period_ns))
+            self._logs[-1].take(frame, tables, time_s)
 
     def seen(self, events: Sequence[dict[str, Any]]) -> DriverSeen | None:
         """Return the sum, with the events of the recording; None if it has no snapshot."""
-        log, newest, judge = self.log, self._newest, self._judge
-        if log is None or newest is None or judge is None:
+        newest = self._newest
+        if newest is None:
             return None
         own = [event for event in events if event.get("service") == self._name]
         last = str(own[-1].get("event")) if own else ""
-        status = newest.status
-        statuses, affected = log.affected(status)
-        return DriverSeen(
+        *earlier, log = self._logs
+        status, at_ns = newest.status, newest.published_ns
+        buses, patches = log.buses(), log.patches(status, at_ns)
+        for before in reversed(earlier):
+            never_seen = np.full(before.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
+            buses = _continued(buses, before.buses())
+            patches = _continued(patches, before.patches(never_seen, at_ns))
+        timing = DriverTiming(
+            rate_hz=self._intervals * NS_PER_S / self._live_ns if self._live_ns > 0 else None,
+            late=self._late,
+            age=self._age,
+            longest_gap_s=self._longest_gap_ns / NS_PER_S,
+        )
+        seen = log.seen(
+            status,
+            at_ns,
+            timing,
             name=self._name,
             namespace="",
             driver_type=self._driver_type,
             life=last if last in (_CLOSED, _DEAD, "paused") else "live",
             pid=0,
             scheduling="",
-            data_path=newest.data_path.name.lower(),
             restarts=self._restarts,
-            frames=self._frames,
-            frames_missed=sum(_missed_in(event) for event in own),
-            structure=log.structure,
-            statuses=statuses,
-            affected=affected,
-            lines=log.lines(),
-            dark=log.dark(),
-            buses=_joined(log.buses(), [one.buses() for one in self._earlier]),
-            patches=_joined(
-                log.patches(status, newest.published_ns),
-                [
-                    one.patches(np.full(one.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8), newest.published_ns)
-                    for one in self._earlier
-                ],
-            ),
-            timing=DriverTiming(
-                rate_hz=self._intervals * NS_PER_S / self._live_ns if self._live_ns > 0 else None,
-                period_ns=newest.period_ns,
-                missed=0,
-                missed_before=0,
-                late=self._late,
-                age=self._age,
-                future_ns=log.future_ns,
-                backwards=log.backwards,
-                longest_gap_s=self._longest_gap_ns / NS_PER_S,
-            ),
-            health=judge.seen(),
         )
+        missed = sum(_missed_in(event) for event in own)
+        return replace(seen, frames=self._frames, frames_missed=missed, buses=buses, patches=patches)
 
 
-def _joined(now: tuple[_PartT, ...], before: list[tuple[_PartT, ...]]) -> tuple[_PartT, ...]:
+def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:
     """Return buses or patches with the counters that they had under the same name before the structure changed."""
-    return tuple(
-        reduce(_after, [one for parts in reversed(before) for one in parts if one.name == part.name], part)
-        for part in now
-    )
+    earlier = {part.name: part for part in before}
+    return tuple(_joined(part, earlier[part.name]) if part.name in earlier else part for part in now)
 
 
-def _after(part: _PartT, earlier: _PartT) -> _PartT:
+def _joined(part: _PartT, earlier: _PartT) -> _PartT:
     now: Counted = part.counted
     before: Counted = earlier.counted
     grown = dict(Counter(before.grown) + Counter(now.grown))

@@ -13,7 +13,6 @@ from pathlib import Path
 from skinware.text import age_text, plural, printable
 from skinware_drivers.doctor.evidence import Counted, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
-from skinware_drivers.doctor.finding import Finding
 
 _PEOPLE = range(1000, 65534)
 """Numbers of accounts of people."""
@@ -43,12 +42,7 @@ _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 
 @dataclass(frozen=True)
 class Secrets:
-    """Private words, and what to write in their place.
-
-    Attributes:
-        words: replaced where they stand as whole words.
-        texts: replaced everywhere.
-    """
+    """Texts in place of private words, where they stand as whole words, and of private texts everywhere."""
 
     words: Mapping[str, str] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
@@ -86,11 +80,7 @@ def scrubbed(text: str, secrets: Secrets) -> str:
 
 
 class Disguise:
-    """Take secrets out of names of buses and other texts; hosts become ``host1``, ``host2``.
-
-    Args:
-        secrets: default: those of this machine.
-    """
+    """Take secrets, by default of this machine, out of names of buses and other texts; hosts become ``host1``."""
 
     def __init__(self, secrets: Secrets | None = None) -> None:
         self._secrets = secrets or Secrets.of_this_machine()
@@ -108,40 +98,30 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
     """Return the report."""
-    text = "\n".join(map(printable, _lines(evidence, found))) + "\n"
-    return scrubbed(text, secrets or Secrets.of_this_machine())
-
-
-def _lines(evidence: Evidence, found: Examination) -> Iterator[str]:
-    yield "# Report of skin-doctor"
-    yield ""
     about = "a running skin" if evidence.recording is None else f"the recording {evidence.recording.name}"
     span = age_text(evidence.seconds * 1e9)
     drivers, findings = plural(len(evidence.drivers), "driver"), plural(len(found.findings), "finding")
-    yield f"{findings} in {about}, {span}, {drivers}."
-    yield ""
+    lines = ["# Report of skin-doctor", "", f"{findings} in {about}, {span}, {drivers}.", ""]
     for number, finding in enumerate(found.findings, 1):
-        yield from _finding(number, finding)
-    yield "## Looked at"
-    yield ""
-    yield from _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
-    yield "## Not looked at"
-    yield ""
-    yield from _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
+        lines += [
+            f"## {number}. {finding.severity.name.lower()}: {finding.what}",
+            "",
+            f"* area: {finding.area}",
+            f"* where: {finding.where}",
+            f"* evidence: {finding.evidence}",
+            f"* what to do: {finding.action} (docs/{finding.see})",
+            "",
+        ]
+        if finding.commands:
+            lines += ["```console", *finding.commands, "```", ""]
+    lines += ["## Looked at", ""]
+    lines += _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
+    lines += ["## Not looked at", ""]
+    lines += _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
     for driver in evidence.drivers:
-        yield from _driver(driver)
-
-
-def _finding(number: int, finding: Finding) -> Iterator[str]:
-    yield f"## {number}. {finding.severity.name.lower()}: {finding.what}"
-    yield ""
-    yield f"* area: {finding.area}"
-    yield f"* where: {finding.where}"
-    yield f"* evidence: {finding.evidence}"
-    yield f"* what to do: {finding.action} (docs/{finding.see})"
-    yield ""
-    if finding.commands:
-        yield from ("```console", *finding.commands, "```", "")
+        lines += _driver(driver)
+    text = "\n".join(map(printable, lines)) + "\n"
+    return scrubbed(text, secrets or Secrets.of_this_machine())
 
 
 def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:

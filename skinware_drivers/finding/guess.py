@@ -132,10 +132,7 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
     """Return the drivers that know the frames, the most likely first.
 
     A driver knows a frame if identifier, length and constant bytes are right, and all frames of its cycle were heard.
-    If several know the same frames, the one with more constant bits wins.
-
-    Args:
-        bus: the bus; only its name is used.
+    If several know the same frames, the one with more constant bits wins. Only the name of the bus is used.
     """
     wire = traffic.wire()
     adapters = {
@@ -155,11 +152,7 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
 
 
 async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list[Patch]:
-    """Return the patches of one driver that were heard, as it describes them; nothing is sent.
-
-    Args:
-        bus: the bus; only its name is used.
-    """
+    """Return the patches of one driver that were heard, as it describes them; only the name of the bus is used."""
     match = _match(type(adapter).__name__, adapter, traffic.wire())
     if match is None:
         return []
@@ -207,7 +200,10 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
         rows = matching_rows(frame, wire)
         required = sum((condition.mask & 0x1FFF_FFFF).bit_count() for condition in frame.when)
         bits += required * int(rows.sum())
-        keys = _patch_keys(frame, wire["identifier"])
+        patch: object = frame.patch
+        keys = np.full(len(wire), patch if isinstance(patch, int) else 0, np.int64)
+        if isinstance(patch, Bits):
+            keys = wire["identifier"].astype(np.int64) >> patch.shift & ((1 << patch.width) - 1)
         for key in np.unique(keys[rows]).tolist():
             heard.setdefault(key, {})[frame.name] = rows & (keys == key)
     whole: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
@@ -220,13 +216,6 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
         return None
     rows = np.logical_or.reduce([of_frame for frames in whole.values() for of_frame in frames.values()])
     return _Match(name, adapter, rows, frozenset(whole), bits / len(wire))
-
-
-def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    patch: object = frame.patch
-    if isinstance(patch, Bits):
-        return identifier.astype(np.int64) >> patch.shift & ((1 << patch.width) - 1)
-    return np.full(len(identifier), patch if isinstance(patch, int) else 0, np.int64)
 
 
 class _HeardLink(Link):

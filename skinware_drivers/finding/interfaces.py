@@ -113,7 +113,18 @@ def can_interfaces(
     found = [
         _interface(folder, known.get(folder.name, {})) for folder in folders if _number(folder / "type") == _ARPHRD_CAN
     ]
-    return [one if known else _with_controller(one, controller(one.name)) for one in found]
+    for number, one in enumerate(found):
+        own = None if known else controller(one.name)
+        if own is not None:
+            has_state = own.state is not None and own.state < len(_STATES)
+            found[number] = dataclasses.replace(
+                one,
+                kind="can",
+                bit_rate=own.bit_rate or None,
+                state=_STATES[own.state or 0] if has_state else "",
+                restart_ms=own.restart_ms,
+            )
+    return found
 
 
 def ask_iproute2() -> dict[str, dict[str, Any]]:
@@ -126,19 +137,6 @@ def ask_iproute2() -> dict[str, dict[str, Any]]:
         done = subprocess.run(arguments, capture_output=True, timeout=_IP_TIMEOUT_S, check=True)
         return {link["ifname"]: link for link in json.loads(done.stdout) if "ifname" in link}
     return {}
-
-
-def _with_controller(one: CanInterface, controller: Controller | None) -> CanInterface:
-    if controller is None:
-        return one
-    known = controller.state is not None and controller.state < len(_STATES)
-    return dataclasses.replace(
-        one,
-        kind="can",
-        bit_rate=controller.bit_rate or None,
-        state=_STATES[controller.state or 0] if known else "",
-        restart_ms=controller.restart_ms,
-    )
 
 
 def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
@@ -190,11 +188,7 @@ class CanAdapterFound:
 
 @dataclass(frozen=True)
 class Detection:
-    """The adapters that python-can found.
-
-    Attributes:
-        problem: an error, else empty.
-    """
+    """The adapters that python-can found, and an error, else empty."""
 
     found: list[CanAdapterFound] = field(default_factory=list)
     problem: str = ""

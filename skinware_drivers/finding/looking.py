@@ -66,18 +66,18 @@ class ProbeAnswer:
     refused: str = ""
 
 
-async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
+async def listen(
+    bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]], bus: Bus | None = None
+) -> HeardOnBus:
     """Listen to a CAN bus. Nothing is sent.
+
+    Args:
+        bus: of this name, not opened yet; default: it is made.
 
     Raises:
         ConfigurationError: this is not the name of a bus.
     """
-    bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
-    return await listen_on(bus, bus_name, duration_s, drivers)
-
-
-async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
-    """Listen as :func:`listen` does, to a bus that is made already."""
+    bus = bus or make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     traffic, bits_before = Traffic(), bus.wire_bits
     try:
         async with attended(bus, traffic.take):
@@ -107,10 +107,7 @@ async def ask(
     """Ask which devices are on a CAN bus, without disturbing any.
 
     On a silent bus all drivers ask. If frames are heard, only the drivers that know them ask, and only questions that
-    are harmless for devices that send. A bus of a running driver, and one with unknown frames, are left alone.
-
-    Args:
-        owner: the running driver of the bus, in words; empty: none.
+    are harmless for devices that send. A bus of a running driver (owner), and one with unknown frames are left alone.
     """
     if heard.problem:
         return ProbeAnswer(heard.bus, refused=heard.problem)
@@ -165,10 +162,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
 
 
 def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> list[HeardTopic]:
-    """Return the topics of a domain of DDS, and which drivers can read each; nothing is asked or published.
-
-    Args:
-        bus_name: as ``dds://0``; a bus of this name can be made.
+    """Return the topics of a domain of DDS (``dds://0``), and which drivers can read each; nothing is published.
 
     Raises:
         BusNotAvailable: the domain cannot be joined.

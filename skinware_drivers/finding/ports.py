@@ -16,7 +16,7 @@ SLOW_LATENCY_MS = 1
 """A latency timer above this holds data back: FTDI's default is 16 ms."""
 _UNKNOWN_UART = "0"
 _NO_HARDWARE = "serial-base"
-"""Subsystem of the devices between a port and its hardware, since kernel 6.5."""
+"""Subsystem of the devices (port, ctrl) between a built-in port and its hardware, since kernel 6.5."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,11 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
         if (folder / "device").exists() and text_of(folder / "type") != _UNKNOWN_UART
     }
     present = {name: machine.dev / name for name in devices if (machine.dev / name).exists()}
-    links = _links(machine, set(present.values()))
+    links: dict[Path, tuple[str, ...]] = {}  # by identity, by place, and from our rules: they do not change
+    for folder in ("skin", "serial/by-id", "serial/by-path"):
+        for link in sorted((machine.dev / folder).glob("*")):
+            if link.is_symlink():
+                links[link.resolve()] = (*links.get(link.resolve(), ()), str(link))
     users, all_seen = _users(machine, set(present.values()))
     return [
         _port(path, devices[name], links.get(path, ()), users.get(path, ()), all_seen)
@@ -142,29 +146,30 @@ def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, .
     info = path.stat()
     group = group_that_may(info)
     latency = text_of(device / "latency_timer")
+    try:
+        user_name = pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        user_name = ""
+    driven = device
+    while (driven / "subsystem").resolve().name == _NO_HARDWARE:
+        driven = driven.parent
     return SerialPort(
         path=str(path),
-        driver=_driver(device),
+        driver=(driven / "driver").resolve().name if (driven / "driver").exists() else "",
         usb=_usb_identity(device),
         links=links,
         may_open=os.access(path, os.R_OK | os.W_OK),
         group=group.gr_name if group else "",
-        in_group=group is not None and _user_name() in group.gr_mem,
+        in_group=group is not None and user_name in group.gr_mem,
         users=users,
         users_known=all_seen,
         latency_ms=int(latency) if latency.isdigit() else None,
     )
 
 
-def _driver(device: Path) -> str:
-    """Return the kernel's driver of a port; above built-in ones are two devices (port, ctrl) without hardware."""
-    while (device / "subsystem").resolve().name == _NO_HARDWARE:
-        device = device.parent
-    return (device / "driver").resolve().name if (device / "driver").exists() else ""
-
-
 def _usb_identity(device: Path) -> UsbIdentity | None:
     """Return the USB device above a port's device in sysfs: port, interface, device."""
+    interface = ""
     for folder in (device, *device.parents):
         if (folder / "idVendor").exists():
             return UsbIdentity(
@@ -174,35 +179,10 @@ def _usb_identity(device: Path) -> UsbIdentity | None:
                 manufacturer=text_of(folder / "manufacturer"),
                 product=text_of(folder / "product"),
                 place=folder.name,
-                interface=_interface_number(device, folder),
+                interface=interface,
             )
+        interface = interface or text_of(folder / "bInterfaceNumber")
     return None
-
-
-def _interface_number(device: Path, usb_device: Path) -> str:
-    for folder in (device, *device.parents):
-        if folder == usb_device:
-            return ""
-        if (folder / "bInterfaceNumber").exists():
-            return text_of(folder / "bInterfaceNumber")
-    return ""
-
-
-def _user_name() -> str:
-    try:
-        return pwd.getpwuid(os.geteuid()).pw_name
-    except KeyError:
-        return ""
-
-
-def _links(machine: Machine, paths: set[Path]) -> dict[Path, tuple[str, ...]]:
-    """Return the links by identity, by place, and from our rules, which do not change."""
-    found: dict[Path, list[str]] = {}
-    for folder in ("skin", "serial/by-id", "serial/by-path"):
-        for link in sorted((machine.dev / folder).glob("*")):
-            if link.is_symlink() and link.resolve() in paths:
-                found.setdefault(link.resolve(), []).append(str(link))
-    return {path: tuple(links) for path, links in found.items()}
 
 
 def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, ...]], bool]:
@@ -257,11 +237,15 @@ def rules_for(ports: Iterable[SerialPort]) -> str:
     """Return a rules file for these ports on USB; other ports always keep their names."""
     lines = []
     for port in ports:
-        if port.usb is not None:
+        usb = port.usb
+        if usb is not None:
+            which = f"serial number {usb.serial_number}"
+            if not usb.serial_number:
+                which = f"no serial number, in socket {usb.place}"
             lines += [
                 "",
-                f"# {port.path}: {_NO_LETTER.sub(' ', port.name)}, {_which(port.usb)}",
-                *_rules(port, port.usb),
+                f"# {port.path}: {_NO_LETTER.sub(' ', port.name)}, {_NO_LETTER.sub(' ', which)}",
+                *_rules(port, usb),
             ]
     if not lines:
         return ""
@@ -269,18 +253,11 @@ def rules_for(ports: Iterable[SerialPort]) -> str:
     return "\n".join([*head, *lines, ""])
 
 
-def link_of(usb: UsbIdentity) -> str:
-    """Return the name below /dev that a rule gives: by serial number, or without one by the USB socket."""
-    name = _NO_LETTER.sub("_", usb.serial_number or f"usb-{usb.place}")
-    return f"skin/{name}" if usb.interface in ("", "00") else f"skin/{name}-if{usb.interface}"
-
-
-def _which(usb: UsbIdentity) -> str:
-    number = f"serial number {usb.serial_number}" if usb.serial_number else f"no serial number, in socket {usb.place}"
-    return _NO_LETTER.sub(" ", number)
-
-
 def _rules(port: SerialPort, usb: UsbIdentity) -> list[str]:
+    # the name below /dev: by serial number, or without one by the USB socket
+    link = f"skin/{_NO_LETTER.sub('_', usb.serial_number or f'usb-{usb.place}')}"
+    if usb.interface not in ("", "00"):
+        link += f"-if{usb.interface}"
     # all ATTRS (and KERNELS) of a rule must hold of one and the same parent: the USB device
     device = [f'ATTRS{{idVendor}}=="{usb.vendor_id}"', f'ATTRS{{idProduct}}=="{usb.product_id}"']
     if usb.serial_number:
@@ -289,7 +266,7 @@ def _rules(port: SerialPort, usb: UsbIdentity) -> list[str]:
         device.append(f'KERNELS=="{usb.place}"')
     interface = [f'ENV{{ID_USB_INTERFACE_NUM}}=="{usb.interface}"'] if usb.interface else []
     gives = [f'GROUP="{port.group or _USUAL_GROUP}"', 'MODE="0660"', 'TAG+="uaccess"', 'ENV{ID_MM_DEVICE_IGNORE}="1"']
-    rules = [", ".join(['SUBSYSTEM=="tty"', *device, *interface, f'SYMLINK+="{link_of(usb)}"', *gives])]
+    rules = [", ".join(['SUBSYSTEM=="tty"', *device, *interface, f'SYMLINK+="{link}"', *gives])]
     if port.latency_ms is not None:
         latency = ['ACTION!="remove"', 'SUBSYSTEM=="usb-serial"', *device, 'ATTR{latency_timer}="1"']
         rules.append(", ".join(latency))

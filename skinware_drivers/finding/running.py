@@ -20,11 +20,7 @@ _PRIVATE = "virtual"
 
 @dataclass(frozen=True)
 class RunningDriver:
-    """A driver whose process lives.
-
-    Attributes:
-        driver_type: ``roboskin``.
-    """
+    """A driver whose process lives."""
 
     name: str
     namespace: str

@@ -116,7 +116,11 @@ async def carry_out(
             patches: Sequence[Patch] = await patches_heard(traffic, bus, adapter) if patch_name else ()
         else:
             patches = await _describe(adapter, link, bus_name, required=not wanted.looks)
-        patches = _meant(patches, patch_name)
+        if patch_name is not None:
+            names = [patch.name for patch in patches]
+            patches = [patch for patch in patches if patch.name == patch_name]
+            if not patches:
+                raise ConfigurationError(f"no patch {patch_name!r}{nearest_name(str(patch_name), names)}")
         if not wanted.looks:
             agree(patches)
         try:
@@ -125,7 +129,10 @@ async def carry_out(
             raise ConfigurationError(f"{operation}: {error}") from error
         finally:
             if wanted.sets_up and not is_live:
-                await _stop(adapter, link)
+                try:
+                    await adapter.stop(link)
+                except BusSendError as error:
+                    raise BusError(f"{error}; devices may be sending now") from None
 
 
 async def _describe(adapter: AnyAdapter, link: Link, bus_name: str, *, required: bool) -> Sequence[Patch]:
@@ -138,19 +145,3 @@ async def _describe(adapter: AnyAdapter, link: Link, bus_name: str, *, required:
     if not patches and required:
         raise HandshakeTimeout(f"{bus_name}: no device of this driver answers; check power and bit rate")
     return patches
-
-
-def _meant(patches: Sequence[Patch], name: object) -> Sequence[Patch]:
-    if name is None:
-        return patches
-    meant = [patch for patch in patches if patch.name == name]
-    if not meant:
-        raise ConfigurationError(f"no patch {name!r}{nearest_name(str(name), [patch.name for patch in patches])}")
-    return meant
-
-
-async def _stop(adapter: AnyAdapter, link: Link) -> None:
-    try:
-        await adapter.stop(link)
-    except BusSendError as error:
-        raise BusError(f"{error}; devices may be sending now") from None

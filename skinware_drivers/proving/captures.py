@@ -10,7 +10,8 @@ import os
 import secrets
 import shutil
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
-from skinware.recording import Recording, WireItem
-from skinware.structure import Structure
+from skinware.recording import Recording
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus
 from skinware_drivers.proving.updates import Collected, Comparison, Decoding, compare, load
@@ -94,20 +94,28 @@ def decoded_now(
         about = recording.about(wires[0].driver)
         began_ns, listens = _began_ns(recording, wires), bool(about.get("listen_only"))
         clock = HandClock()
-        replays = [_ReplayedWire(recording, wire, listens, clock) for wire in wires]
         driver = driver or load_driver(_driver_type(recording, about))
-        of_buses = about.get("buses", {})
-        for replay in replays:
-            usual = of_buses.get(replay.wire.bus, {}).get("options", {})
-            replay.prepare(driver, {**usual, **(options or {})})
-    found, namespace = _Published(), Namespace(f"captured-{os.getpid()}-{secrets.token_hex(4)}")
+        replays = []
+        for wire in wires:
+            usual = about.get("buses", {}).get(wire.bus, {}).get("options", {})
+            given = {**usual, **(options or {})}
+            replays.append(_ReplayedWire(recording, wire, driver, given, listens, clock))
+    log, namespace = SnapshotLog(clock), Namespace(f"captured-{os.getpid()}-{secrets.token_hex(4)}")
     try:
         with package_on(clock), asyncio.Runner(loop_factory=lambda: HandLoop(clock)) as loop:
-            loop.run(_run(clock, replays, found, namespace, listens))
+            loop.run(_run(clock, replays, log, namespace, listens))
     finally:
-        found.close()
+        log.close()
         shutil.rmtree(namespace.path, ignore_errors=True)
-    return found.decoding(replays, began_ns)
+    found = Collected(began_ns)
+    for structure, frames in groupby(log.frames, lambda frame: frame.structure):
+        snapshots = list(frames)
+        times = np.array([frame.module_time_ns for frame in snapshots])
+        bus = np.asarray(structure.patch_bus)[np.asarray(structure.module_patch)]
+        for number, replay in enumerate(replays):
+            times[:, bus == number] = replay.then_ns(times[:, bus == number])
+        found.add(structure, np.array([frame.values for frame in snapshots]), times)
+    return found.decoding()
 
 
 def driver_type_of(capture: Path) -> str:
@@ -139,51 +147,48 @@ def _began_ns(recording: Recording, wires: Sequence[Wire]) -> int:
 
 
 class _ReplayedWire:
-    """A recorded wire, and the adapter of the present driver on it."""
+    """A recorded wire, and the adapter of the present driver on it.
 
-    def __init__(self, recording: Recording, wire: Wire, listens: bool, clock: HandClock) -> None:
-        self.wire = wire
-        self._path, self._listens, self._clock = recording.path, listens, clock
-        self._medium = medium_of(recording, wire)
-        self._times = [item.time_ns for item in wire.items() if self._is_given(item)]
+    Raises:
+        ConfigurationError: the driver has no such options, or is for another kind of bus.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        wire: Wire,
+        driver: type[AnyAdapter],
+        options: Mapping[str, Any],
+        listens: bool,
+        clock: HandClock,
+    ) -> None:
+        medium = medium_of(recording, wire)
+        self._times = []  # of what the replayed bus gives the driver
+        for item in wire.items():
+            is_data = not item.is_sent and not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG)
+            if is_data or (item.is_sent and medium == "modbus"):
+                self._times.append(item.time_ns)
+        self.duration_ns: int = self._times[-1] - self._times[0] if self._times else 0
         self._stamps_ns, self._then_ns = array("q"), array("q")
-        self.line: tuple[str, AnyAdapter, Bus] | None = None
-
-    def prepare(self, driver: type[AnyAdapter], options: Mapping[str, Any]) -> None:
-        """Make the adapter and its bus.
-
-        Raises:
-            ConfigurationError: the driver has no such options, or is for another kind of bus.
-        """
-        kind = next((one for one in (driver, *driver.elsewhere) if one.medium == self._medium), driver)
+        kind = next((one for one in (driver, *driver.elsewhere) if one.medium == medium), driver)
         try:
             adapter = kind(msgspec.convert(dict(options), kind.Options, strict=False))
         except msgspec.ValidationError as error:
             raise ConfigurationError(f"options of {kind.__name__}: {error}") from None
         adapter.check()
         bus = replayed_bus(
-            str(self._path),
-            {"bus": self.wire.bus, "driver": self.wire.driver},
+            str(recording.path),
+            {"bus": wire.bus, "driver": wire.driver},
             payload_size=adapter.payload_size,
-            listen_only=self._listens,
-            clock=self._clock,
+            listen_only=listens,
+            clock=clock,
             note=self._note,
         )
-        self.line = self.wire.bus, adapter, bus
+        self.line: tuple[str, AnyAdapter, Bus] = wire.bus, adapter, bus
 
     @property
     def is_over(self) -> bool:
         return not self._times or (len(self._then_ns) > 0 and self._then_ns[-1] >= self._times[-1])
-
-    @property
-    def duration_ns(self) -> int:
-        return self._times[-1] - self._times[0] if self._times else 0
-
-    def _is_given(self, item: WireItem) -> bool:
-        """Return whether the replayed bus delivers it to the driver."""
-        if item.is_sent:
-            return self._medium == "modbus"
-        return not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG)
 
     def _note(self, stamp_ns: int, then_ns: int) -> None:
         self._stamps_ns.append(stamp_ns)
@@ -199,67 +204,63 @@ class _ReplayedWire:
         return np.where(time_ns == 0, 0, time_ns - later_ns)
 
 
-def snapshots_after(reader: DriverReader, last: tuple[int, int] | None) -> Iterator[DriverSnapshot]:
-    """Yield the snapshots after a position in order, also after a change of the structure."""
-    while reader.refresh() not in (None, last):
-        try:
-            snapshot = next(reader.in_order(timeout_s=0))
-        except ServiceTimeout:
-            return
-        except StructureChanged:
-            reader.reattach()
-            continue
-        last = snapshot.position
-        yield snapshot
+class SnapshotLog:
+    """Read every snapshot that a driver publishes, in order, as a user's program does.
 
+    Attributes:
+        keep: keep all snapshots; False: only the newest.
+    """
 
-class _Published:
-    def __init__(self) -> None:
-        self._reader: DriverReader | None = None
-        self._frames: list[tuple[Structure, list[DriverSnapshot]]] = []
-        self._last: tuple[int, int] | None = None
+    def __init__(self, clock: HandClock) -> None:
+        self.frames: list[DriverSnapshot] = []
+        self.times_ns: list[int] = []
+        self.keep = True
+        self.count: int = 0
+        self.reader: DriverReader | None = None
+        self._clock = clock
 
-    def look(self, runner: Runner, namespace: Namespace) -> None:
-        if self._reader is None:
+    def look(self, runner: Runner) -> None:
+        if self.reader is None:
             if runner.builder.writer is None or runner.builder.writer.closed:
                 return
-            self._reader = DriverReader(runner.identity.name, namespace=namespace, announce=False)
-        for frame in snapshots_after(self._reader, self._last):
-            self._last = frame.position
-            if not self._frames or self._frames[-1][0] is not frame.structure:
-                self._frames.append((frame.structure, []))
-            self._frames[-1][1].append(frame)
-
-    def decoding(self, replays: Sequence[_ReplayedWire], began_ns: int) -> Decoding:
-        found = Collected(began_ns)
-        for structure, frames in self._frames:
-            times = np.array([frame.module_time_ns for frame in frames])
-            bus = np.asarray(structure.patch_bus)[np.asarray(structure.module_patch)]
-            for number, replay in enumerate(replays):
-                times[:, bus == number] = replay.then_ns(times[:, bus == number])
-            found.add(structure, np.array([frame.values for frame in frames]), times)
-        return found.decoding()
+            self.reader = DriverReader(runner.identity.name, namespace=runner.identity.namespace)
+        last = self.frames[-1].position if self.frames else None
+        while self.reader.refresh() not in (None, last):
+            try:
+                frame = next(self.reader.in_order(timeout_s=0))
+            except ServiceTimeout:
+                return
+            except StructureChanged:
+                self.reader.reattach()
+                continue
+            last = frame.position
+            if not self.keep:
+                self.frames.clear()
+                self.times_ns.clear()
+            self.count += 1
+            self.frames.append(frame)
+            self.times_ns.append(self._clock.now_ns)
 
     def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
+        if self.reader is not None:
+            self.reader.close()
 
 
 async def _run(
-    clock: HandClock, replays: Sequence[_ReplayedWire], found: _Published, namespace: Namespace, listens: bool
+    clock: HandClock, replays: Sequence[_ReplayedWire], log: SnapshotLog, namespace: Namespace, listens: bool
 ) -> None:
     """Run the driver until every frame is delivered, and the values are published."""
-    lines = [replay.line for replay in replays if replay.line is not None]
+    lines = [replay.line for replay in replays]
     runner = Runner(_NAME, lines, name=_NAME, listen_only=listens, namespace=namespace, slots=_SLOTS, publish="cycle")
     running = asyncio.create_task(runner.run())
     latest_ns = clock.now_ns + _LATEST_NS + 2 * max(replay.duration_ns for replay in replays)
-    clock.before_passing.append(lambda: found.look(runner, namespace))
+    clock.before_passing.append(lambda: log.look(runner))
     over_ns = latest_ns
     while clock.now_ns < over_ns and not running.done():
         await asyncio.sleep(_LOOK_S)
         if over_ns == latest_ns and all(replay.is_over for replay in replays):
             over_ns = clock.now_ns + _SETTLED_NS
     clock.before_passing.clear()
-    found.look(runner, namespace)
+    log.look(runner)
     runner.stop()
     await running

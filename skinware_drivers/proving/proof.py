@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import enum
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,11 +28,7 @@ class Verdict(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """A check.
-
-    Attributes:
-        where: module or bus; empty: the whole device.
-    """
+    """A check of a module or bus, or of the whole device if ``where`` is empty."""
 
     what: str
     where: str
@@ -43,11 +38,7 @@ class Check:
 
 @dataclass
 class Proof:
-    """All checks of a device.
-
-    Attributes:
-        about: facts on the device, the driver and this machine's programs.
-    """
+    """All checks of a device, and facts about it, the driver and this machine's programs."""
 
     driver: str
     driver_type: str
@@ -89,28 +80,19 @@ class Proof:
         }
 
     def as_markdown(self) -> str:
-        return scrubbed("\n".join(map(printable, self._lines())) + "\n", Secrets.of_this_machine())
-
-    def _lines(self) -> Iterator[str]:
-        yield f"# Driver {self.driver_type or self.driver}: {'proven' if self.is_proven else 'not proven'}"
-        yield ""
-        yield f"By `skin-prove`: {', '.join(f'{count} {verdict}' for verdict, count in self.counts.items() if count)}."
-        yield ""
-        yield from (f"* {name}: {text}" for name, text in self.about.items())
-        yield ""
-        yield "| | what | where | seen |"
-        yield "|---|---|---|---|"
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items() if count)
+        lines = [f"# Driver {self.driver_type or self.driver}: {'proven' if self.is_proven else 'not proven'}", ""]
+        lines += [f"By `skin-prove`: {counts}.", ""]
+        lines += [f"* {name}: {text}" for name, text in self.about.items()]
+        lines += ["", "| | what | where | seen |", "|---|---|---|---|"]
         for check in self.checks:
             cells = (check.verdict.value, check.what, check.where, check.seen)
-            yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+        return scrubbed("\n".join(map(printable, lines)) + "\n", Secrets.of_this_machine())
 
 
 class ProofFiles:
-    """The files of a proof: a report, the same as JSON, and a capture.
-
-    Attributes:
-        captured: result of the capture; empty before its end.
-    """
+    """The files of a proof: a report, the same as JSON, and a capture, whose result is empty before its end."""
 
     def __init__(self, stem: Path) -> None:
         self.report, self.data, self.capture = self._all = [
@@ -123,11 +105,7 @@ class ProofFiles:
         return [str(path) for path in self._all if path.exists()]
 
     def refuse_old(self) -> None:
-        """Check before the walk that the files can be written.
-
-        Raises:
-            ConfigurationError: the folder is missing, or a file exists already.
-        """
+        """Raise a ``ConfigurationError`` if the folder is missing, or a file exists already."""
         if not self.capture.parent.is_dir():
             raise ConfigurationError(f"-o {self.capture.with_suffix('')}: there is no folder {self.capture.parent}")
         if self.written:

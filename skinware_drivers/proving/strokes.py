@@ -106,17 +106,13 @@ def _turned(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_]) -> tu
             wrong.append(f"{name} are mirrored: the last comes first")
             turned[:, axis] = size - 1 - turned[:, axis]
         elif straight[axis] < _SURE:
-            return [*wrong, _no_order(matrix, moments, heard, name)], None
+            other = Matrix(matrix.columns, matrix.rows)
+            fits = [abs(_agreement(moments[heard, one], other.places[heard, one])) >= _SURE for one in (0, 1)]
+            if matrix.rows != matrix.columns and all(fits):
+                shapes = f"{other.rows} rows of {other.columns}, not {matrix.rows} rows of {matrix.columns}"
+                return [*wrong, f"it answers as {shapes}"], None
+            return [*wrong, f"{name} answer in no order"], None
     return wrong, turned
-
-
-def _no_order(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], name: str) -> str:
-    """Explain an axis without order: perhaps the matrix has another shape."""
-    other = Matrix(matrix.columns, matrix.rows)
-    fits = [abs(_agreement(moments[heard, axis], other.places[heard, axis])) >= _SURE for axis in (0, 1)]
-    if matrix.rows != matrix.columns and all(fits):
-        return f"it answers as {other.rows} rows of {other.columns}, not {matrix.rows} rows of {matrix.columns}"
-    return f"{name} answer in no order"
 
 
 def _agreement(moments: Floats, places: npt.NDArray[np.int64]) -> float:

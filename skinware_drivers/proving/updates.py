@@ -6,7 +6,7 @@ of a device are estimated, at first not very well, and another decoder may begin
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,11 +46,7 @@ Decoding = Mapping[tuple[int, ...], ModuleUpdates]
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference between two decodings.
-
-    Attributes:
-        then, now: its raw values; None: there is no such update.
-    """
+    """A raw value that differs between two decodings; None: there is no such update."""
 
     time_s: float
     sensor: str
@@ -78,11 +74,7 @@ class Comparison:
 
 
 class Collected:
-    """Collect updates from snapshots.
-
-    Args:
-        began_ns: beginning of the recording, in the time of the snapshots.
-    """
+    """Collect updates from snapshots of a recording that began at ``began_ns``."""
 
     def __init__(self, began_ns: int = 0) -> None:
         self._began_ns = began_ns
@@ -105,13 +97,12 @@ class Collected:
                 self._parts.setdefault(tuple(structure.sensor_uid[mine].tolist()), []).append(found)
 
     def decoding(self) -> Decoding:
-        return {uids: _joined(parts) for uids, parts in self._parts.items()}
-
-
-def _joined(parts: list[ModuleUpdates]) -> ModuleUpdates:
-    time_ns, values = np.concatenate([part.time_ns for part in parts]), np.concatenate([part.values for part in parts])
-    time_ns, first = np.unique(time_ns, return_index=True)
-    return ModuleUpdates(parts[-1].sensors, time_ns, values[first])
+        found: dict[tuple[int, ...], ModuleUpdates] = {}
+        for uids, parts in self._parts.items():
+            time_ns, first = np.unique(np.concatenate([part.time_ns for part in parts]), return_index=True)
+            values = np.concatenate([part.values for part in parts])
+            found[uids] = ModuleUpdates(parts[-1].sensors, time_ns, values[first])
+        return found
 
 
 def compare(then: Decoding, now: Decoding) -> Comparison:
@@ -121,7 +112,11 @@ def compare(then: Decoding, now: Decoding) -> Comparison:
     from its first common update to its last. In between, each recorded update must exist now with the same values. More
     updates now are no difference: a machine may have been too busy to show all.
     """
-    pairs = list(_in_pairs(then, now))
+    pairs: list[tuple[int, Difference | None]] = []  # number of compared updates and first difference of each module
+    for uids, old in then.items():
+        new = now.get(uids)
+        pairs.append((0, _without_partner(old, 0, is_then=True)) if new is None else _of_module(old, new))
+    pairs += [(0, _without_partner(new, 0, is_then=False)) for uids, new in now.items() if uids not in then]
     differences = sorted((found for _, found in pairs if found is not None), key=lambda one: one.time_s)
     return Comparison(
         sum(compared for compared, _ in pairs),
@@ -129,16 +124,6 @@ def compare(then: Decoding, now: Decoding) -> Comparison:
         sum(map(len, now.values())),
         differences[0] if differences else None,
     )
-
-
-def _in_pairs(then: Decoding, now: Decoding) -> Iterator[tuple[int, Difference | None]]:
-    """Yield the number of compared updates and the first difference of each module."""
-    for uids, old in then.items():
-        new = now.get(uids)
-        yield (0, _without_partner(old, 0, is_then=True)) if new is None else _of_module(old, new)
-    for uids, new in now.items():
-        if uids not in then:
-            yield 0, _without_partner(new, 0, is_then=False)
 
 
 def _of_module(old: ModuleUpdates, new: ModuleUpdates) -> tuple[int, Difference | None]:
@@ -196,11 +181,7 @@ def _without_partner(of: ModuleUpdates, row: int, *, is_then: bool) -> Differenc
 
 
 def save(decoding: Decoding, path: Path) -> None:
-    """Write the expected values of a capture.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the expected values of a capture."""
     arrays: dict[str, Any] = {}
     for number, (uids, of) in enumerate(decoding.items()):
         arrays |= {
@@ -213,20 +194,14 @@ def save(decoding: Decoding, path: Path) -> None:
 
 
 def load(path: Path) -> Decoding:
-    """Read a file of :func:`save`.
-
-    Raises:
-        BadRecording: the file is not one.
-        OSError: the file cannot be read.
-    """
+    """Read a file of :func:`save`; raise ``BadRecording`` if it is not one."""
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return dict(_modules_in(file, file.files))
+            found: dict[tuple[int, ...], ModuleUpdates] = {}
+            for number in sorted({int(name.partition(".")[0]) for name in file.files}):
+                uids, sensors = file[f"{number}.uids"], tuple(file[f"{number}.sensors"].tolist())
+                updates = ModuleUpdates(sensors, file[f"{number}.time_ns"], file[f"{number}.values"])
+                found[tuple(uids.tolist())] = updates
+            return found
     except (ValueError, KeyError, EOFError, BadZipFile) as error:
         raise BadRecording(f"{path}: not a file of skin-prove --save ({error})") from None
-
-
-def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple[tuple[int, ...], ModuleUpdates]]:
-    for number in sorted({int(name.partition(".")[0]) for name in names}):
-        uids, sensors, time_ns, values = (file[f"{number}.{what}"] for what in ("uids", "sensors", "time_ns", "values"))
-        yield tuple(uids.tolist()), ModuleUpdates(tuple(sensors.tolist()), time_ns, values)

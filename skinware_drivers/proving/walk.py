@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -121,22 +121,20 @@ class _Walk:
         try:
             self._check_rest()
             for module in self._modules:
-                self._check(module)
+                name = self._structure.module_names[module]
+                kind = bytes(self._structure.module_kind[module]).decode()
+                try:
+                    self._press(module)
+                    matrix = Matrix.of_kind(kind, len(self._taxels[module]))
+                    if matrix is not None:
+                        self._stroke(module, matrix)
+                except _Skipped:
+                    self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
+                except _Missed as missed:
+                    self._proof.add(missed.what, name, False, f"{missed} within {self._manner.patience_s:g} s")
             self._tare()
         finally:
             self._check_losses()
-
-    def _check(self, module: int) -> None:
-        name = self._structure.module_names[module]
-        try:
-            self._press(module)
-            matrix = Matrix.of_kind(bytes(self._structure.module_kind[module]).decode(), len(self._taxels[module]))
-            if matrix is not None:
-                self._stroke(module, matrix)
-        except _Skipped:
-            self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
-        except _Missed as missed:
-            self._proof.add(missed.what, name, False, f"{missed} within {self._manner.patience_s:g} s")
 
     def _tare(self) -> None:
         try:
@@ -178,7 +176,11 @@ class _Walk:
         self._threshold = _TIMES_THE_NOISE * noise if noise else 1e-6
         unit = self._type.unit
         missing = np.flatnonzero(~self._usable)
-        without_data = f"none from {self._named(missing)}" if len(missing) else plural(len(self._usable), "taxel")
+        without_data = plural(len(self._usable), "taxel")
+        if len(missing):
+            names = self._structure.sensor_names(self._type.name)
+            more = f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
+            without_data = f"none from {', '.join(names[taxel] for taxel in missing[:_MOST_NAMES])}{more}"
         self._proof.add("every taxel has data", "", not len(missing), without_data)
         self._proof.about["noise"] = (
             f"{figure_text(noise, 3)} {unit}; pressed is more than {figure_text(self._threshold, 3)}"
@@ -296,21 +298,12 @@ class _Walk:
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Yield snapshots as :meth:`_frames` does, until the patience ends.
-
-        Raises:
-            _Missed: the patience ended.
-            _Skipped: the person leaves the module out.
-        """
+        """Yield snapshots as :meth:`_frames` does; raise :class:`_Missed` when the patience ends."""
         yield from self._frames(after(self._manner.patience_s))
         raise _Missed(what, else_)
 
     def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverSnapshot, Values]]:
-        """Yield snapshots with (n,) physical values of the type; taxels without data have their values at rest.
-
-        Raises:
-            _Skipped: the person leaves the module out.
-        """
+        """Yield snapshots with (n,) physical values of the type; taxels without data have their values at rest."""
         for frame in frames_until(self._reader, is_over):
             if self._person.skips() and may_skip:
                 raise _Skipped
@@ -324,11 +317,6 @@ class _Walk:
             self._first = self._first or frame
             self._last = frame
             yield frame, values
-
-    def _named(self, taxels: npt.NDArray[Any]) -> str:
-        names = self._structure.sensor_names(self._type.name)
-        more = f" and {len(taxels) - _MOST_NAMES} more" if len(taxels) > _MOST_NAMES else ""
-        return ", ".join(names[taxel] for taxel in taxels[:_MOST_NAMES]) + more
 
 
 _LOSSES = ("dropped", "errors", "overflows", "checksum_errors", "skipped_bytes", "bus_offs", "polls_unanswered", "gaps")

@@ -20,9 +20,8 @@ from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk, offered
-from skinware_drivers.running.generation import Generation, make_watch
+from skinware_drivers.running.generation import Generation, latency_for, make_watch
 from skinware_drivers.running.guard import Ending, hook
-from skinware_drivers.running.intake import latency_for
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -56,9 +55,7 @@ class Builder:
 
     Attributes:
         geometry: as given; call ``build`` after a change.
-        writer: publishes; None before there is a structure.
-        desk: answers requests; None before there is a structure.
-        generation: what is in service; None before there is a structure.
+        writer, desk, generation: in service; None before there is a structure.
         built: locked while a generation is built, and notified afterwards.
     """
 
@@ -91,11 +88,7 @@ class Builder:
             self.rebuild()
 
     def rebuild(self, *, forced: bool = False) -> None:
-        """Build, with ``built`` held.
-
-        Args:
-            forced: also if nothing has changed but the bus behind a name.
-        """
+        """Build, with ``built`` held; if forced, also if nothing has changed but the bus behind a name."""
         if any(line.patches is None for line in self._lines):
             return
         adapters = [line.adapter for line in self._lines if line.patches]
@@ -206,13 +199,11 @@ def put_in_place(tables: SkinTables, given: Geometry | None, of_buses: Sequence[
                 "the geometry has no place for any of the sensors: types and uid in its file are of another skin"
             )
         return tables
-    known = [_on_bus(geometry, bus) for bus, geometry in enumerate(of_buses) if geometry is not None]
+    known = []
+    for bus, geometry in enumerate(of_buses):
+        if geometry is not None:  # each bus has a coordinate frame of its own
+            frames = [f"{frame} {bus + 1}" if bus else frame for frame in geometry.frame.tolist()]
+            known.append(replace(geometry, uid=uid_on_bus(bus, geometry.uid), frame=np.array(frames, object)))
     placed = tables.placed(Geometry.joined(known)) if known else tables
     geometry = placed.structure.geometry
     return placed if geometry is not None and geometry.known.any() else tables
-
-
-def _on_bus(geometry: Geometry, bus: int) -> Geometry:
-    """Return the geometry with the uids of the whole driver, and a coordinate frame of its own for each bus."""
-    frames = [f"{frame} {bus + 1}" if bus else frame for frame in geometry.frame.tolist()]
-    return replace(geometry, uid=uid_on_bus(bus, geometry.uid), frame=np.array(frames, object))

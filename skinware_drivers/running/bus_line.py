@@ -79,22 +79,19 @@ class BusCondition:
             self.become(BusState.SILENT, reason or BusReason.NOTHING_HEARD)
         else:
             self.become(BusState.LIVE, reason)
-        if before != (self.state, self.reason):
-            self._log_change(*before)
-        self._has_spoken |= self.heard_ns > self.speaks_from_ns
-
-    def _log_change(self, state: BusState, reason: BusReason) -> None:
-        if self.reason == BusReason.NOTHING_HEARD:
-            if state == BusState.LIVE and self._has_spoken:
-                self.news.log(f"bus {self._name}: {WORDS[self.reason]}")
+        if before == (self.state, self.reason):
+            news = ""
+        elif self.reason == BusReason.NOTHING_HEARD:
+            news = WORDS[self.reason] if before[0] == BusState.LIVE and self._has_spoken else ""
         elif self.reason:
-            if self.reason != reason:
-                self.news.log(f"bus {self._name}: {WORDS[self.reason]}")
-        elif reason == BusReason.NOTHING_HEARD:
-            if self._has_spoken:
-                self.news.log(f"bus {self._name}: frames come again")
-        elif reason:
-            self.news.log(f"bus {self._name}: in order again (was {reason_text(reason)})")
+            news = WORDS[self.reason] if self.reason != before[1] else ""
+        elif before[1] == BusReason.NOTHING_HEARD:
+            news = "frames come again" if self._has_spoken else ""
+        else:
+            news = f"in order again (was {reason_text(before[1])})" if before[1] else ""
+        if news:
+            self.news.log(f"bus {self._name}: {news}")
+        self._has_spoken |= self.heard_ns > self.speaks_from_ns
 
 
 class BusLine:
@@ -164,9 +161,10 @@ class BusLine:
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
-        self.connection.begin_attempts()
+        is_first = True
         while True:
-            await self.connection.pause()
+            await self.connection.pause(is_first=is_first)
+            is_first = False
             self.condition.news.catch_up()
             was_there = self.connection.opened_ns
             try:
@@ -217,11 +215,7 @@ class BusLine:
             self.lose("check", error)
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
-        """Ask for the patches on the bus until there are some.
-
-        Args:
-            described: called after every answer, also after an empty one.
-        """
+        """Ask for the patches on the bus until there are some; call ``described`` after every answer, also without."""
         is_logged, attempts = False, _attempts()
         while True:
             await asyncio.sleep(attempts.next_s())
@@ -265,11 +259,7 @@ class BusLine:
                 return
 
     def begin_lost(self, error: BusNotAvailable | None = None) -> None:
-        """Wait for a bus that was never open as for one that was lost; nothing is attached to it so far.
-
-        Args:
-            error: why it could not be opened; None: it was not tried.
-        """
+        """Wait for a bus that was never open as for one that was lost; nothing is attached to it so far."""
         self.patches = ()
         self.connection.lost.set()
         self.needs_care.set()
@@ -291,11 +281,7 @@ class BusLine:
         self.condition.news.log(f"{error}; bus {self.name} is set aside, and tried again later")
 
     async def stop(self) -> None:
-        """Stop its devices, if they may send and the bus is open.
-
-        Raises:
-            DriverError: the driver's own code failed.
-        """
+        """Stop its devices, if they may send and the bus is open; raise ``DriverError`` if the driver's code fails."""
         if not self.started or self.connection.is_opening or not self.connection.is_open:
             return
         try:
@@ -332,11 +318,7 @@ async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
 
 
 def are_patches(found: Iterable[object]) -> Sequence[Patch]:
-    """Return the patches that ``describe`` or ``join`` of an adapter returned.
-
-    Raises:
-        TypeError: they are no patches.
-    """
+    """Return the patches that ``describe`` or ``join`` of an adapter returned; raise a TypeError if they are none."""
     patches = []
     for patch in found:
         if not isinstance(patch, Patch):

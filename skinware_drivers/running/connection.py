@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 
 from skinware.errors import BusNotAvailable
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import Bus
 from skinware_drivers.running.guard import Backoff
@@ -48,10 +48,7 @@ class SlowCall:
             raise error
 
     def leave(self, afterwards: Callable[[], object]) -> bool:
-        """Stop waiting for the call.
-
-        Args:
-            afterwards: called in its thread if it returns after all.
+        """Stop waiting for the call; if it returns after all, ``afterwards`` is called in its thread.
 
         Returns:
             False: the call is already over, and nothing is done.
@@ -102,24 +99,23 @@ class Connection:
         return self._opening is not None
 
     async def open(self) -> None:
-        """Open the bus; raises whatever the bus raises.
-
-        Raises:
-            BusNotAvailable: also if its interface hangs.
-        """
+        """Open the bus; raise whatever it raises, and ``BusNotAvailable`` if its interface hangs."""
         if self._bus.opens_slowly:
-            await self._open_slowly()
+            if self._opening is None:  # or the call of the last attempt has not returned yet
+                self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
+            if not await self._opening.is_over(_OPENING_S):
+                why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
+                raise BusNotAvailable(why, reason=BusReason.FAILED)
+            opening, self._opening = self._opening, None
+            opening.check()
         else:
             self._bus.open()
         self.opened()
 
-    def begin_attempts(self) -> None:
-        """Begin with the shortest pause if the bus was there for a while, not only for a moment again and again."""
-        if now_ns() - self.opened_ns > self._pauses.longest_s * NS_PER_S:
-            self._pauses.begin_again()
-
-    async def pause(self) -> None:
-        """Let the pause before the next attempt to open the bus pass."""
+    async def pause(self, *, is_first: bool) -> None:
+        """Let the pause before the next attempt to open the bus pass, or the first one after a loss."""
+        if is_first:
+            self._pauses.begin_again_after(now_ns() - self.opened_ns)
         if self._opening is None:
             await asyncio.sleep(self._pauses.next_s())
 
@@ -148,16 +144,6 @@ class Connection:
             self._close()
         elif not await SlowCall(f"bus {self._name}, closing", self._bus.close).is_over(patience_s):
             log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self._name)
-
-    async def _open_slowly(self) -> None:
-        """Open a bus that may hang; the next attempt then waits for the same call to return."""
-        if self._opening is None:
-            self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
-        if not await self._opening.is_over(_OPENING_S):
-            why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
-            raise BusNotAvailable(why, reason=BusReason.FAILED)
-        opening, self._opening = self._opening, None
-        opening.check()
 
     def _close(self) -> None:
         opening, self._opening = self._opening, None

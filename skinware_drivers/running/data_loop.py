@@ -7,17 +7,119 @@ import logging
 import select
 import time
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import FrameBatch, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import FlowLoop, flow_of
-from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
+from skinware_drivers.running.flow import Flow, FlowLoop
+from skinware_drivers.running.generation import Generation, latency_for, make_batch, split_by_bus
 from skinware_drivers.running.guard import Ending
-from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.news import MachineLimits, PatchChange
+
+_TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
+_REST, _REST_WHILE_ASKING, _REST_IN_STEP = 16, 4, 1
+"""The rest after a take, as a multiple of its duration; more frames arrive meanwhile (decision 0006)."""
+
+
+class Intake:
+    """Takes frames when some have arrived, and then rests for a moment so that more are taken together.
+
+    Args:
+        latency_s: the longest rest; may be changed.
+        guard: makes a callback safe for the event loop (:meth:`.guard.Ending.guard`).
+
+    Attributes:
+        read_until_ns: all frames that arrived until then were taken, CLOCK_MONOTONIC ns.
+    """
+
+    def __init__(
+        self,
+        epoll: select.epoll,
+        lines: Sequence[BusLine],
+        empty_batch: Callable[[], FrameBatch],
+        digest: Callable[[FrameBatch], None],
+        latency_s: float,
+        guard: Callable[[Callable[[], None]], Callable[[], None]] = lambda callback: callback,
+    ) -> None:
+        self._epoll = epoll
+        self._lines = lines
+        self._empty_batch = empty_batch
+        self._digest = digest
+        self.latency_s: float = latency_s
+        self.read_until_ns: int = 0
+        self._look = guard(self._on_readable)
+        self._rest: asyncio.TimerHandle | None = None
+        self._by_fd: dict[int, BusLine] = {}
+
+    def start(self) -> None:
+        self._end_rest()  # two looks pending would be one that stop() does not know
+        asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._look)
+
+    def stop(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._epoll.fileno())
+        self._end_rest()
+
+    def _end_rest(self) -> None:
+        if self._rest is not None:
+            self._rest.cancel()
+            self._rest = None
+
+    def take(self) -> Literal["nothing", "all", "some"]:
+        """Take the frames that have arrived; ``some``: more are waiting."""
+        begun_ns = now_ns()
+        for turn in range(_TURNS):
+            time_ns = now_ns()
+            if time_ns - begun_ns > _TURN_NS:
+                return "some"
+            events = self._epoll.poll(0)
+            if not events:
+                self.read_until_ns = time_ns
+                return "all" if turn else "nothing"
+            batch = self._empty_batch()
+            is_all = self._fill(batch, [fd for fd, _ in events], time_ns)
+            self._digest(batch)
+            if is_all:
+                return "all"
+        return "some"
+
+    def _on_readable(self) -> None:
+        """Take, then let more arrive before the next look: a batch costs little more than a frame."""
+        loop = asyncio.get_running_loop()
+        begun_ns = now_ns()
+        taken = self.take()
+        if taken == "nothing":
+            self.start()
+        else:
+            loop.remove_reader(self._epoll.fileno())
+            links = [line.link for line in self._lines]
+            asks = any(line.bus.asks for line in self._lines)
+            factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
+            if asks or any(link.expects_data for link in links):
+                factor = _REST_IN_STEP  # only the answer comes, and then the next question
+            rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
+            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
+
+    def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> bool:
+        """Fill a batch from the buses that have frames; return whether none had more than its share."""
+        if any(fd not in self._by_fd or self._by_fd[fd].bus.fileno() != fd for fd in fds):
+            self._by_fd = {line.bus.fileno(): line for line in self._lines}
+        ready = [self._by_fd[fd] for fd in fds if fd in self._by_fd]
+        is_all, self.read_until_ns = True, time_ns
+        for number, line in enumerate(ready):
+            batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
+            try:
+                if line.bus.receive(batch, line.ordinal):
+                    line.condition.heard_ns = time_ns
+                    if not batch.free:
+                        is_all = False
+                        self.read_until_ns = min(self.read_until_ns, int(batch.time_ns[batch.stop - 1]) - 1)
+            except Exception as error:  # noqa: BLE001  (the bus cannot be trusted any more)
+                line.lose("receive", error)
+        return is_all
+
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -71,11 +173,7 @@ def _slept_ns() -> int:
 
 
 class DataLoop:
-    """The data path of a driver in its event loop.
-
-    Args:
-        on_patches: called with patches that fell silent, or are live again.
-    """
+    """The data path of a driver in its event loop."""
 
     def __init__(
         self,
@@ -103,14 +201,15 @@ class DataLoop:
         self._intake.latency_s = int(generation.publisher.latency_ns[0]) / NS_PER_S
         loop = asyncio.get_running_loop()
         if isinstance(loop, FlowLoop):
-            take = self._ending.guard(self._intake.take)
-            flow = flow_of(generation, self._epoll.fileno(), self._intake.latency_s, take, self._ending.fail)
-            generation.flows = flow is not None
-            loop.selector.flow = None if flow is None else flow.run
-            if flow is None:
-                self._intake.start()
-            else:
+            generation.flows = any(is_read_natively(line.bus) for line in generation.lines if not line.is_removed)
+            if generation.flows:
+                take = self._ending.guard(self._intake.take)
+                flow = Flow(generation, self._epoll.fileno(), self._intake.latency_s, take, self._ending.fail)
+                loop.selector.flow = flow.run
                 self._intake.stop()
+            else:
+                loop.selector.flow = None
+                self._intake.start()
         self._ending.guard(self._publish_when_due)()
 
     def stop(self) -> None:

@@ -21,7 +21,7 @@ from skinware_drivers.running.publisher import NEVER_NS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-Changed = Callable[[BusLine, Sequence[Patch], bool], object]
+_declared = cache(operations_of)
 
 
 class RequestDesk:
@@ -37,7 +37,7 @@ class RequestDesk:
         server: RequestServer,
         lines: Sequence[BusLine],
         listen_only: bool,
-        changed: Changed,
+        changed: Callable[[BusLine, Sequence[Patch], bool], object],
         ending: Ending,
     ) -> None:
         self._server = server
@@ -66,11 +66,7 @@ class RequestDesk:
         return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=NEVER_NS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
-        """Answer the requests that waited for a snapshot that was published.
-
-        Args:
-            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
-        """
+        """Answer the requests that waited for a snapshot that was published, by the oldest stamp of its new data."""
         answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
         self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
         for request in answered:
@@ -86,7 +82,11 @@ class RequestDesk:
         arguments = dict(request.arguments)
         bus, patch = arguments.pop("bus", None), arguments.pop("patch", None)
         try:
-            does = {line: job for line in self._lines if (job := _job(line, request.operation)) is not None}
+            does: dict[BusLine, tuple[object, Operation]] = {}
+            for line in self._lines:
+                for doer in (line.bus, line.adapter):  # the adapter's own comes first
+                    if request.operation in _declared(type(doer)):
+                        does[line] = doer, _declared(type(doer))[request.operation]
             if self._listen_only and any(doer is line.adapter for line, (doer, _) in does.items()):
                 raise ConfigurationError("this driver only listens (--listen-only)")
             meant = self._meant(list(does), bus, patch)
@@ -149,20 +149,6 @@ class RequestDesk:
             others = nearest_name(str(patch), [p.name for line in lines for p in line.patches or ()])
             raise ConfigurationError(f"no patch {patch!r}{others}")
         return [(line, patches) for line, patches in meant if patches]
-
-
-_Job = tuple[object, Operation]
-"""An operation on one bus, and the object that does it."""
-_declared = cache(operations_of)
-
-
-def _job(line: BusLine, operation: str) -> _Job | None:
-    """Return an operation on one bus, and the object that does it: the driver's, or the bus itself."""
-    for doer in (line.adapter, line.bus):
-        found = _declared(type(doer)).get(operation)
-        if found is not None:
-            return doer, found
-    return None
 
 
 def offered(lines: Sequence[BusLine]) -> dict[str, Callable[..., Any]]:

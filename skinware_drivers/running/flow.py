@@ -13,9 +13,8 @@ import selectors
 from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import Unused
 from skinware.status import BusState
-from skinware_drivers.bus import KernelBus, is_read_natively
+from skinware_drivers.bus import KernelBus
 from skinware_drivers.native import structs
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
@@ -27,11 +26,7 @@ _LATENCY_WHILE_ASKING_S, _LATENCY_IN_STEP_S = 5e-4, 5e-5
 
 
 class FlowSelector(selectors.EpollSelector):
-    """A selector in whose waits frames flow.
-
-    Attributes:
-        flow: lets frames flow; called with this selector's descriptor and the longest wait, s. None: it only waits.
-    """
+    """A selector that waits in ``flow``, called with its descriptor and the longest wait, s; None: it only waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,25 +47,8 @@ class FlowLoop(asyncio.SelectorEventLoop):
         super().__init__(self.selector)
 
 
-def flow_of(
-    generation: Generation,
-    epoll_fd: int,
-    latency_s: float,
-    take: Callable[[], object],
-    fail: Callable[[BaseException], None],
-) -> Flow | None:
-    buses = [line.bus for line in generation.lines if not line.is_removed]
-    if not any(is_read_natively(bus) for bus in buses):
-        return None
-    return Flow(generation, epoll_fd, latency_s, take, fail)
-
-
 class Flow:
-    """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable.
-
-    Args:
-        latency_s: the longest rest.
-    """
+    """The buses of one generation while C reads them; C returns when a bus that it cannot read is readable."""
 
     def __init__(
         self,
@@ -89,7 +67,7 @@ class Flow:
         self._handed: list[tuple[BusLine, KernelBus, structs.Source]] = []
         listeners = self._path.listeners
         listeners.sort_out, listeners.lose = self._sort_out, self._lose
-        listeners.heard, listeners.damaged = self._heard, self._keep_sample
+        listeners.heard = self._heard
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, at most for a time, s."""
@@ -117,7 +95,9 @@ class Flow:
         try:
             return self._path.run(flow)
         finally:
-            self._take_back()
+            for line, bus, source in self._handed:
+                line.condition.heard_ns = source.heard_ns
+                bus.take_back(source)
             self._generation.interrupted()  # C knows of these
 
     def _rest_s(self) -> float:
@@ -146,11 +126,6 @@ class Flow:
         n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
         self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)
 
-    def _take_back(self) -> None:
-        for line, bus, source in self._handed:
-            line.condition.heard_ns = source.heard_ns
-            bus.take_back(source)
-
     def _heard(self) -> None:
         for line, _, source in self._handed:
             line.condition.heard_ns = source.heard_ns
@@ -165,9 +140,6 @@ class Flow:
         kept = self._bus(bus).sort_out(self._batch, slice(first, first + n))
         self._path.interrupt(self._generation.interrupted())
         return kept
-
-    def _keep_sample(self, bus: int, chunk: bytes) -> None:
-        self._lines[bus].bus.samples.note(Unused.REFUSED, 0, chunk)
 
     def _lose(self, bus: int, number: int) -> None:
         line = self._lines[bus]

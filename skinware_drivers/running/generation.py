@@ -25,8 +25,14 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _UPDATES = PATCH_COUNTERS.index("updates")
 _LOOK_PAUSE_NS = NS_PER_S // 20
+_SHARE, _SHORTEST_S, _LONGEST_S = 0.25, 0.001, 0.020
 
 Rows = npt.NDArray[np.int64]
+
+
+def latency_for(period_s: float) -> float:
+    """Return the longest rest between two batches, s, for patches that send with this period, s."""
+    return min(max(_SHARE * period_s, _SHORTEST_S), _LONGEST_S)
 
 
 def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
@@ -39,11 +45,7 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
 
 
 def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
-    """Return the driver's watch, which knows already of the patches that report errors.
-
-    Raises:
-        DriverError: the driver's own code failed.
-    """
+    """Return the driver's watch, which knows already of the patches that report errors."""
     with hook("watch", *(line.name for line in lines), of_all=True):
         watch = lines[0].adapter.watch(tables)
     for line in lines:
@@ -129,11 +131,7 @@ class Generation:
         return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]
 
     def update_bus_states(self, settled: bool = True) -> None:
-        """Publish the states of the buses.
-
-        Args:
-            settled: look also at buses that were in order the last time.
-        """
+        """Publish the states of the buses; if settled, look also at those that were in order the last time."""
         if settled:
             self._look_ns = now_ns() + _LOOK_PAUSE_NS
         for line in self.lines:
@@ -172,13 +170,6 @@ class Generation:
             before[patch] = now[patch]
         for bus in set(self.tables.structure.patch_bus[now != PatchState.LIVE].tolist()):
             self.lines[bus].needs_care.set()
-        self._report_doubles()
-        for line in self.lines:
-            change = line.patch_news.catch_up()
-            if change is not None:
-                yield change
-
-    def _report_doubles(self) -> None:
         for patch, ratio in self._doubles.look(self.decoder.state.patch_counters[:, _UPDATES]):
             log.warning(
                 "%s has sent %.1f times as much as its period allows for a while: do two devices send with one"
@@ -187,3 +178,7 @@ class Generation:
                 self.name_of(patch),
                 ratio,
             )
+        for line in self.lines:
+            change = line.patch_news.catch_up()
+            if change is not None:
+                yield change

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from skinware.errors import BusError, ConfigurationError, DriverError, SkinwareError
+from skinware.realtime import NS_PER_S, now_ns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -113,17 +114,35 @@ class Backoff:
 
     Args:
         at_once: the first attempt needs no pause.
+
+    Attributes:
+        begun: number of attempts since :meth:`begin_again`, where :meth:`begin` counts them.
+        not_before_ns: when the next one is due, CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
-        self._first_s = first_s
-        self.longest_s = longest_s
+        self._first_s, self._longest_s = first_s, longest_s
         self._begin_s = 0.0 if at_once else first_s
-        self._next_s = self._begin_s
-
-    def next_s(self) -> float:
-        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self.longest_s)
-        return pause_s
+        self.begin_again()
 
     def begin_again(self) -> None:
         self._next_s = self._begin_s
+        self.begun = self.not_before_ns = 0
+
+    def begin_again_after(self, passed_ns: int) -> None:
+        """Begin again if it went well for a while, not only for moments again and again."""
+        if passed_ns > self._longest_s * NS_PER_S:
+            self.begin_again()
+
+    def next_s(self) -> float:
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
+        return pause_s
+
+    @property
+    def is_due(self) -> bool:
+        return now_ns() >= self.not_before_ns
+
+    def begin(self) -> None:
+        """Count an attempt, after which a pause begins."""
+        self.begun += 1
+        self.not_before_ns = now_ns() + round(self.next_s() * NS_PER_S)

@@ -70,12 +70,7 @@ class NativePath:
             self._quick.skinware_path_free(self._path)
 
     def announce_waits(self, expects_data: bool, awaited: Sequence[Filter]) -> None:
-        """Set the frames that coroutines wait for, before a call of C.
-
-        Args:
-            expects_data: a coroutine waits for a frame that may be data.
-            awaited: filters for awaited frames that are of no module.
-        """
+        """Set what coroutines wait for, before a call of C: frames that may be data, or awaited ones of no module."""
         self._words.expects_data = expects_data
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in awaited]
         self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
@@ -87,11 +82,7 @@ class NativePath:
         self._batch.start = self._batch.headroom - self._words.carried
 
     def digest(self, interrupted: Sequence[int] = ()) -> None:
-        """Decode the batch, and publish snapshots that are due.
-
-        Args:
-            interrupted: buses that are known to have lost frames since the last batch.
-        """
+        """Decode the batch, and publish snapshots that are due; some buses have lost frames since the last batch."""
         self.interrupt(interrupted)
         self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
         self._enter()
@@ -105,22 +96,14 @@ class NativePath:
         self._exchange.interrupted[list(buses)] = True
 
     def publish_if_due(self, read_ns: int) -> None:
-        """Publish a snapshot if it is due.
-
-        Args:
-            read_ns: all frames that arrived until then were taken, CLOCK_MONOTONIC ns.
-        """
+        """Publish a snapshot if it is due; all frames that arrived until ``read_ns`` were taken."""
         self._words.read_ns = max(self._words.read_ns, read_ns)
         self._enter()
         self._waiting.skinware_path_publish_if_due(self._path)
         self._leave()
 
     def run(self, flow: structs.Flow) -> int:
-        """Let frames flow until Python has something to do.
-
-        Returns:
-            The reason, as a number of ``flow.c``.
-        """
+        """Let frames flow until Python has something to do; return the reason, a number of ``flow.c``."""
         self._enter()
         result = int(self._waiting.skinware_flow_run(self._path, ctypes.byref(flow)))
         self._leave()
@@ -154,15 +137,15 @@ class NativePath:
 
 def _compile_publisher(publisher: Publisher, plan: structs.Plan, arrays: structs.Arrays) -> SharedArrays:
     """Fill in the part of a plan that is about publishing; return the arrays that both sides change."""
-    pauses, patches, buses, pace = publisher.pauses, publisher.patches, publisher.buses, publisher.pace
+    patches, buses, pace = publisher.patches, publisher.buses, publisher.pace
     exchange = SharedArrays(publisher.watch, len(buses.counters))
     plan.period_ns, plan.silence_ns, plan.patience_ns = pace.period_ns, pace.silence_ns, pace.patience_ns
     plan.pause_ns, plan.idle_ns = pace.pause_ns, pace.idle_ns
     plan.by_cycle, plan.most_at_once = publisher.by_cycle, publisher.writer.slots
     plan.stale = int(Status.STALE)
     plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
-    plan.burst_pause_ns = arrays.at(pauses.pause_ns)
-    plan.standing_out_ns, plan.gap_ns = arrays.at(pauses.standing_out_ns), arrays.at(pauses.gap_ns)
+    plan.burst_pause_ns = arrays.at(patches.pause_ns)
+    plan.standing_out_ns, plan.gap_ns = arrays.at(patches.standing_out_ns), arrays.at(patches.gap_ns)
     plan.is_prompt = arrays.at(publisher.state.is_prompt)
     plan.group_heard_ns, plan.age_limit_ns = arrays.at(patches.group_heard_ns), arrays.at(patches.age_limit_ns)
     plan.patch_heard_ns, plan.patch_state = arrays.at(patches.heard_ns), arrays.at(patches.state)

@@ -109,12 +109,17 @@ class PatchChange(NamedTuple):
     live: Sequence[str]
 
     def __str__(self) -> str:
-        parts = []
-        if self.silent:
-            parts.append(f"{_who(self.silent)} fell silent{_names(self.silent)}")
+        parts = [_changed(self.silent, "fell silent")] if self.silent else []
         if self.live:
-            parts.append(f"{_who(self.live)} {'is' if len(self.live) == 1 else 'are'} live again{_names(self.live)}")
+            parts.append(_changed(self.live, f"{'is' if len(self.live) == 1 else 'are'} live again"))
         return f"{self.bus}: {'; '.join(parts)}"
+
+
+def _changed(names: Sequence[str], how: str) -> str:
+    if len(names) == 1:
+        return f"{names[0]} {how}"
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"{len(names)} patches {how} ({', '.join(names[:_MOST_NAMES])}{more})"
 
 
 class PatchNews:
@@ -153,17 +158,6 @@ class PatchNews:
         log.warning("%s%s", change, f" (changes not logged before: {left_out})" if left_out else "")
         self._is_live, self._changes = {}, 0
         return change
-
-
-def _who(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{len(names)} patches"
-
-
-def _names(names: Sequence[str]) -> str:
-    if len(names) == 1:
-        return ""
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f" ({', '.join(names[:_MOST_NAMES])}{more})"
 
 
 _WINDOW_NS = 5 * NS_PER_S

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,30 +29,33 @@ Sample = Mapping[str, Any]
 
 def why_unused(layout: Layout, bus: Bus) -> list[str]:
     """Return likely reasons why no data comes, in a few words each."""
-    samples = sample_report(bus.samples.rows)
-    reasons = _lengths(layout, samples)
-    if bus.medium == "can":
-        reasons += list(_kinds_of_identifier(layout, samples))[:1]
+    reasons: dict[tuple[str, int], str] = {}
+    advice = ""
+    kinds = {frame.extended for frame in layout.frames}
+    for sample in sample_report(bus.samples.rows):
+        length, is_extended = sample["length"], sample["extended"]
+        if sample["why"] == Unused.BAD_LENGTH.name.lower():
+            came = f"{length} byte{'' if length == 1 else 's'} came ({sample_text(dict(sample))})"
+            for frame in layout.frames:
+                if _is_of(frame, sample):
+                    known = " or ".join(map(str, sorted(frame.length)))
+                    reason = f"frames {frame.name!r} have length {known}, but {came}"
+                    reasons.setdefault((frame.name, length), reason)
+        elif sample["why"] == Unused.UNKNOWN.name.lower() and len(kinds) == 1 and is_extended not in kinds:
+            number = identifier_text(_identifier(sample))
+            heard, known = ("29 bits", "11 bits") if is_extended else ("11 bits", "29 bits")
+            write = f"EXTENDED_FLAG | 0x{number}" if is_extended else f"0x{number}, without EXTENDED_FLAG"
+            advice = advice or (
+                f"heard 0x{number} ({heard}) where the layout has only identifiers of {known}: write {write}"
+            )
+    found = list(reasons.values())
+    if advice and bus.medium == "can":
+        found.append(advice)
     if wrong := bus.counters.framing.checksum_errors:
-        reasons.append(
+        found.append(
             f"{wrong} checksums were wrong: look at the kind of `checksum`, at its byte order and at what it `covers`"
         )
-    return reasons
-
-
-def _lengths(layout: Layout, samples: Sequence[Sample]) -> list[str]:
-    reasons: dict[tuple[str, int], str] = {}
-    for sample in samples:
-        if sample["why"] != Unused.BAD_LENGTH.name.lower():
-            continue
-        came = f"{sample['length']} byte{'' if sample['length'] == 1 else 's'} came ({sample_text(dict(sample))})"
-        for frame in layout.frames:
-            if _is_of(frame, sample):
-                known = " or ".join(map(str, sorted(frame.length)))
-                reasons.setdefault(
-                    (frame.name, sample["length"]), f"frames {frame.name!r} have length {known}, but {came}"
-                )
-    return list(reasons.values())
+    return found
 
 
 def _is_of(frame: Frame, sample: Sample) -> bool:
@@ -65,25 +68,6 @@ def _is_of(frame: Frame, sample: Sample) -> bool:
         elif condition.extended != sample["extended"] or identifier & condition.mask != condition.value:
             return False
     return bool(frame.when) or not sample["extended"]
-
-
-def _kinds_of_identifier(layout: Layout, samples: Sequence[Sample]) -> Iterator[str]:
-    """Yield advice for identifiers of 29 bits where all those of the layout have 11, or the other way round."""
-    kinds = {frame.extended for frame in layout.frames}
-    for sample in samples:
-        if sample["why"] != Unused.UNKNOWN.name.lower() or len(kinds) > 1 or sample["extended"] in kinds:
-            continue
-        identifier = identifier_text(_identifier(sample))
-        if sample["extended"]:
-            yield (
-                f"heard 0x{identifier} (29 bits) where the layout has only identifiers of 11 bits: write"
-                f" EXTENDED_FLAG | 0x{identifier}"
-            )
-        else:
-            yield (
-                f"heard 0x{identifier} (11 bits) where the layout has only identifiers of 29 bits: write"
-                f" 0x{identifier}, without EXTENDED_FLAG"
-            )
 
 
 def _identifier(sample: Sample) -> int:
@@ -102,30 +86,8 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
 
-class _SetUps:
-    """Set-ups without effect, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s."""
-
-    def __init__(self) -> None:
-        self.begun = 0
-        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-        self.not_before_ns = 0
-
-    @property
-    def are_due(self) -> bool:
-        return now_ns() >= self.not_before_ns
-
-    def begin(self) -> None:
-        self.begun += 1
-        self.not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
-
-
 class PatchCare:
-    """Looks after the patches of one bus.
-
-    Args:
-        generation: returns the generation in service; None: there is none yet.
-        beside: starts a task of the driver.
-    """
+    """Looks after the patches of one bus, while a generation is in service; ``beside`` starts a task of the driver."""
 
     def __init__(
         self,
@@ -143,8 +105,9 @@ class PatchCare:
         adapter = type(line.adapter)
         self._revives_all = adapter.revive is Adapter.revive
         self._knows_only_all = self._revives_all and adapter.probe is Adapter.probe
-        self._set_ups: dict[int, _SetUps] = {}  # by patch key, of those that answer and send nothing
-        self._set_ups_of_all = _SetUps()
+        # set-ups without effect, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s
+        self._set_ups: dict[int, Backoff] = {}  # by patch key, of those that answer and send nothing
+        self._set_ups_of_all = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
         self._logged = ""
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
@@ -176,7 +139,12 @@ class PatchCare:
             states.append(PatchState.RESTARTED)
         silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
         if self._knows_only_all:
-            silent = silent[:1] if self._may_set_up_all(silent) else []  # the others are set up with it
+            is_due = self._set_ups_of_all.is_due or not self._patches_in(PatchState.LIVE)
+            if not silent:
+                self._set_ups_of_all.begin_again()
+            elif is_due and self._patches_in(PatchState.LIVE):  # which it disturbs: less and less often
+                self._set_ups_of_all.begin()
+            silent = silent[:1] if is_due else []  # the others are set up with it
         for patch in self._patches_in(PatchState.LIVE):
             self._set_ups.pop(patch.key, None)
         for patch in silent:
@@ -197,7 +165,7 @@ class PatchCare:
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         line, set_ups = self._line, self._set_ups.get(patch.key)
-        if (set_ups is not None and not set_ups.are_due) or not line.condition.limits.knows_load_since(line.set_up_ns):
+        if (set_ups is not None and not set_ups.is_due) or not line.condition.limits.knows_load_since(line.set_up_ns):
             return False
         try:
             with hook("probe", line.name):
@@ -207,7 +175,7 @@ class PatchCare:
             log.debug("%s: %s", line.name, str(error))
             return False
         if set_ups is None:
-            set_ups = self._set_ups[patch.key] = _SetUps()
+            set_ups = self._set_ups[patch.key] = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
             if line.condition.limits.is_full:
                 set_ups.not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
                 log.warning(
@@ -231,24 +199,8 @@ class PatchCare:
         set_ups.begin()
         return True
 
-    def _may_set_up_all(self, silent: Sequence[Patch]) -> bool:
-        """Return whether to set up the whole bus for silent patches: less and less often while that disturbs others."""
-        if not silent:
-            self._set_ups_of_all = _SetUps()
-            return False
-        if not self._patches_in(PatchState.LIVE):
-            return True
-        if not self._set_ups_of_all.are_due:
-            return False
-        self._set_ups_of_all.begin()
-        return True
-
     async def attend(self, pause_s: Callable[[], float]) -> None:
-        """Listen to reports of devices about themselves, indefinitely.
-
-        Args:
-            pause_s: returns the pause after a failure of the bus, s.
-        """
+        """Listen to reports of devices about themselves, indefinitely, with pauses after failures of the bus."""
         adapter = self._line.adapter
         reviving: dict[int, asyncio.Task[None]] = {}
         adapter.heard_by = partial(self._note, reviving)
@@ -259,18 +211,14 @@ class PatchCare:
                         await adapter.attend(self._line.link)
                     await asyncio.Event().wait()  # indefinitely: it may still report something when it is asked
                 except BusError as error:
-                    self._log_trouble(str(error))
+                    if str(error) != self._logged and not self._line.connection.lost.is_set():  # once in a row
+                        self._logged = str(error)
+                        log.warning("%s: %s; attending to it again", self._line.name, self._logged)
                 await asyncio.sleep(pause_s())
         finally:
             adapter.heard_by = None
             for task in reviving.values():
                 task.cancel()
-
-    def _log_trouble(self, text: str) -> None:
-        """Log a failure of ``attend`` once in a row, unless the bus is away."""
-        if text != self._logged and not self._line.connection.lost.is_set():
-            self._logged = text
-            log.warning("%s: %s; attending to it again", self._line.name, text)
 
     def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
         line, generation = self._line, self._generation()
@@ -306,7 +254,13 @@ class PatchCare:
             generation.decoder.forget(number)
             if not self._revives_all or self._begun_ns < asked_ns:
                 generation.publisher.lose(number, PatchState.RESTARTED)
-                await self._set_up(patch)
+                self._begun_ns, self._error = now_ns(), ""
+                try:
+                    with hook("revive", line.name):
+                        await line.adapter.revive(line.link, patch)
+                    line.revived_ns = now_ns()
+                except BusError as error:
+                    self._error = str(error) or type(error).__name__
             generation = self._generation()  # it may be another one by now
             number = None if generation is None else generation.number_of(line, patch)
             if generation is None or number is None:
@@ -318,16 +272,6 @@ class PatchCare:
                 line.suspects.discard(patch.key)
                 with hook("Watch.forget", line.name):
                     generation.watch.forget(number)
-
-    async def _set_up(self, patch: Patch) -> None:
-        self._begun_ns, self._error = now_ns(), ""
-        try:
-            with hook("revive", self._line.name):
-                await self._line.adapter.revive(self._line.link, patch)
-        except BusError as error:
-            self._error = str(error) or type(error).__name__
-        else:
-            self._line.revived_ns = now_ns()
 
     def _patches_in(self, state: PatchState) -> list[Patch]:
         generation = self._generation()

@@ -19,6 +19,8 @@ from skinware_drivers.polling import Watch
 from skinware_drivers.running.publisher import Publisher
 
 Rows = npt.NDArray[np.int64]
+_LEAVING = ("hear", "offer", "sort_out", "lose")
+"""Hooks after which Python has something to do."""
 
 
 class SharedArrays:
@@ -49,7 +51,6 @@ class Listeners:
         sort_out: removes rows that are no data frames (bus, first, number); returns the number that is left.
         lose: called with a bus that went away, and the system's error number.
         heard: called when frames came on a bus that is watched.
-        damaged: called with bytes of a serial line that contain no frame, at most four times a second.
     """
 
     hear: Callable[[Rows], None] = lambda _rows: None
@@ -57,7 +58,6 @@ class Listeners:
     sort_out: Callable[[int, int, int], int] = lambda _bus, _first, n: n
     lose: Callable[[int, int], None] = lambda _bus, _error: None
     heard: Callable[[], None] = lambda: None
-    damaged: Callable[[int, bytes], None] = lambda _bus, _chunk: None
 
 
 class Named(NamedTuple):
@@ -108,8 +108,8 @@ class PathHooks:
             "keep": self._on_keep,
             "expand": self._on_expand,
             "published": self._on_published,
-            "sort_out": self._on_unusual,
-            "lose": self._on_loss,
+            "sort_out": lambda bus, first, n: self.listeners.sort_out(bus, first, n),
+            "lose": lambda bus, error: self.listeners.lose(bus, error),
             "heard": lambda: self.listeners.heard(),
             "damaged": self._on_damage,
         }
@@ -118,7 +118,9 @@ class PathHooks:
         if getattr(self._publisher.watch.look, "__func__", None) is not Watch.look:
             called["look"] = self._on_look
         kinds: dict[str, Any] = {field[0]: field[1] for field in structs.Hooks._fields_}
-        return structs.Hooks(**{name: kinds[name](self._guarded(hook)) for name, hook in called.items()})
+        return structs.Hooks(
+            **{name: kinds[name](self._guarded(hook, name in _LEAVING)) for name, hook in called.items()}
+        )
 
     def take_from_watch(self) -> None:
         """Copy the doubts of the watch about modules."""
@@ -134,14 +136,19 @@ class PathHooks:
             _view(self._words.kind, capacity, np.uint8)[rows].copy(),
         )
 
-    def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
-        """Return a hook that keeps its exception until C has returned: an exception cannot go through C."""
+    def _guarded(self, hook: Callable[..., int | None], leaves: bool) -> Callable[..., int]:
+        """Return a hook that keeps its exception until C has returned: an exception cannot go through C.
+
+        Args:
+            leaves: C returns soon, because a coroutine may continue, or a bus may be closed.
+        """
 
         def call(*arguments: int) -> int:
             if self.error is not None:
                 return 0
             self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
             try:
+                self._words.must_leave |= leaves
                 return hook(*arguments) or 0
             except BaseException as error:  # noqa: BLE001
                 self.error = error
@@ -150,20 +157,11 @@ class PathHooks:
 
         return call
 
-    def _on_unusual(self, bus: int, first: int, n: int) -> int:
-        self._words.must_leave = True
-        return self.listeners.sort_out(bus, first, n)
-
-    def _on_loss(self, bus: int, error: int) -> None:
-        self._words.must_leave = True
-        self.listeners.lose(bus, error)
-
     def _on_damage(self, bus: int, at: int, n: int) -> None:
-        self.listeners.damaged(bus, ctypes.string_at(at, n))
+        self._decoder.samples[bus].note(Unused.REFUSED, 0, ctypes.string_at(at, n))
         self._take_sample_times()
 
     def _on_data(self) -> None:
-        self._words.must_leave = True
         self.listeners.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
 
     def _on_times(self) -> None:
@@ -174,7 +172,6 @@ class PathHooks:
 
     def _on_offer(self, at: int, n: int) -> None:
         left = self.listeners.offer(_view(at, n, np.int64).copy())
-        self._words.must_leave = True  # a coroutine may continue
         self.count_strangers(left.ctypes.data, len(left))
 
     def _on_keep(self, why: int, at: int, n: int) -> None:

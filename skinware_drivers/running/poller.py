@@ -29,7 +29,7 @@ class _Place:
 
     Attributes:
         asked_ns: when one was last sent, or would have been.
-        silent_until_ns: none is sent before, because answers were missing.
+        pauses: while answers are missing.
         extra_s: time to wait for an answer beyond its timeout, because answers came late.
     """
 
@@ -37,17 +37,17 @@ class _Place:
         self.timer = timer
         self.asked_ns = 0
         self.extra_s = 0.0
+        self.pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
         self.answered()
 
     def answered(self) -> None:
-        self.silent_until_ns = 0
         self._missing = 0
-        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
+        self.pauses.begin_again()
 
     def unanswered(self) -> None:
         self._missing += 1
         if self._missing >= _PATIENT_TIMES:
-            self.silent_until_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
+            self.pauses.begin()
 
 
 class Poller:
@@ -125,7 +125,7 @@ class Poller:
         if is_away:
             place.answered()  # unknown
             return
-        if len(asked) > 1 and time_ns < place.silent_until_ns:
+        if len(asked) > 1 and not place.pauses.is_due:
             return
         self._counters.polls_missed += place.timer.missed - missed_before
         try:

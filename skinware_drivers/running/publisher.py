@@ -76,39 +76,32 @@ class BusColumns:
 
 
 class PatchLife:
-    """The patches that send: (n_patches,) each, times CLOCK_MONOTONIC ns.
+    """The patches that send, and the pauses between their bursts, which ``bursts.c`` learns.
+
+    (n_patches,) each, times CLOCK_MONOTONIC ns.
 
     Attributes:
         state: :class:`skinware.PatchState`.
         heard_ns: when the last update came.
         lives_until_ns: when it becomes silent, unless a whole update comes before.
+        pause_ns: the pause that ends a burst.
+        standing_out_ns: the shortest pause that is longer than the spacing of modules.
         group_heard_ns: (n_groups,), when the last update of each group came.
         age_limit_ns: (n_groups,), beyond which its values are stale.
-    """
-
-    def __init__(self, structure: Structure, period_ns: int) -> None:
-        self.state: npt.NDArray[np.uint8] = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
-        self.heard_ns = np.zeros(structure.n_patches, np.int64)
-        self.lives_until_ns = np.zeros(structure.n_patches, np.int64)
-        self.group_heard_ns = np.full(structure.n_groups, now_ns(), np.int64)
-        self.age_limit_ns = structure.group_age_limits_ns(period_ns)
-
-
-class BurstPauses:
-    """The pauses between the bursts of each patch, which ``bursts.c`` learns.
-
-    Attributes:
-        pause_ns: (n_patches,), the pause that ends a burst.
-        standing_out_ns: (n_patches,), the shortest pause that is longer than the spacing of modules.
         gap_ns: (n_groups,), the time before the last update of each group.
     """
 
-    def __init__(self, state: SkinState, pace: PublishPace) -> None:
-        n_patches = len(state.patch_time_ns)
-        n_prompt = np.bincount(state.group_patch[state.is_prompt], minlength=n_patches)
+    def __init__(self, structure: Structure, state: SkinState, pace: PublishPace) -> None:
+        n_patches, n_groups = structure.n_patches, structure.n_groups
+        self.state: npt.NDArray[np.uint8] = np.full(n_patches, int(PatchState.EXPECTED), np.uint8)
+        self.heard_ns = np.zeros(n_patches, np.int64)
+        self.lives_until_ns = np.zeros(n_patches, np.int64)
         self.pause_ns: npt.NDArray[np.int64] = np.full(n_patches, pace.pause_ns, np.int64)
+        n_prompt = np.bincount(state.group_patch[state.is_prompt], minlength=n_patches)
         self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * pace.period_ns / np.maximum(1, n_prompt)
-        self.gap_ns: npt.NDArray[np.int64] = np.zeros(len(state.group_patch), np.int64)
+        self.group_heard_ns = np.full(n_groups, now_ns(), np.int64)
+        self.age_limit_ns = structure.group_age_limits_ns(pace.period_ns)
+        self.gap_ns: npt.NDArray[np.int64] = np.zeros(n_groups, np.int64)
 
 
 class PatchTiming:
@@ -158,8 +151,8 @@ class Publisher:
         self.pace = PublishPace.of(period_s)
         self.state: SkinState = decoder.state
         self.state.settle_pace(self.pace.period_ns)
-        self.buses, self.patches = BusColumns(len(structure.buses)), PatchLife(structure, self.pace.period_ns)
-        self.pauses, self.timing = BurstPauses(self.state, self.pace), PatchTiming(structure)
+        self.buses = BusColumns(len(structure.buses))
+        self.patches, self.timing = PatchLife(structure, self.state, self.pace), PatchTiming(structure)
         self.latency_ns: npt.NDArray[np.int64] = np.zeros(1, np.int64)
         self.data_path: npt.NDArray[np.uint8] = np.full(1, int(DataPath.NATIVE), np.uint8)
         self._structure = structure
@@ -171,11 +164,7 @@ class Publisher:
         return NEVER_NS if self._desk is None else self._desk.wanted_ns
 
     def answer(self, oldest_ns: int) -> None:
-        """Answer the requests that waited for a snapshot that was published.
-
-        Args:
-            oldest_ns: oldest stamp of its new data, CLOCK_MONOTONIC ns.
-        """
+        """Answer the requests that waited for a snapshot that was published, by the oldest stamp of its new data."""
         if self._desk is not None:
             self._desk.published(oldest_ns, self.writer.position)
 
@@ -185,10 +174,9 @@ class Publisher:
         self.patches.state[patch] = state
 
     def excuse(self, since_ns: int, asleep_ns: int) -> None:
-        """Count silence from now on, for patches that lived when this process was held up.
+        """Count silence from now on, for patches that lived when this process last ran.
 
         Args:
-            since_ns: when it last ran, CLOCK_MONOTONIC ns.
             asleep_ns: how long the machine was suspended: older data is older by that time.
         """
         lives_until_ns = self.patches.lives_until_ns
@@ -209,11 +197,7 @@ class Publisher:
         return self._counts
 
     def look(self, updates: Updates) -> None:
-        """Let the watch look at updates that were shown.
-
-        Raises:
-            DriverError: the watch raised an exception.
-        """
+        """Let the watch look at updates that were shown; raise ``DriverError`` if it fails."""
         try:
             self.watch.look(updates)
         except (Exception, SystemExit):

@@ -16,13 +16,12 @@ from skinware.status import DataPath, PatchState, load_report
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.running.building import Builder, Identity, PublishMode
-from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine, open_buses
 from skinware_drivers.running.data_loop import DataLoop
 from skinware_drivers.running.guard import Ending
 from skinware_drivers.running.news import PatchChange
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
-from skinware_drivers.running.serving import Serving
+from skinware_drivers.running.serving import BusChanges, Serving
 from skinware_drivers.running.wires import Wires
 
 _END_S, _LEAST_FOR_CLOSING_S = 0.9, 0.2

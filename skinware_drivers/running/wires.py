@@ -59,18 +59,16 @@ class Wires:
         try:
             if self._writer is not None or is_wished(self._namespace, wire.WISH):
                 self._publish()
+                name = wire.service_name(self._identity.name)
                 for _ in range(round(_MOST_S / _FINDING_S)):
-                    if now_ns() > self._until_ns or self._is_read() or not is_wished(self._namespace, wire.WISH):
+                    # a program that has found the service can read all of it, also after its end
+                    is_read = any(record.service == name for record in living_readers(self._namespace))
+                    if now_ns() > self._until_ns or is_read or not is_wished(self._namespace, wire.WISH):
                         break
                     await asyncio.sleep(_FINDING_S)
         except (SkinwareError, OSError) as error:
             self._log_trouble(error)
         self._withdraw()
-
-    def _is_read(self) -> bool:
-        """Return whether a program reads the service; it can then read all of it, also after its end."""
-        name = wire.service_name(self._identity.name)
-        return any(record.service == name for record in living_readers(self._namespace))
 
     async def _serve(self) -> None:
         try:
@@ -104,10 +102,19 @@ class Wires:
                 writer.commit(now_ns())
 
     def _writer_for(self) -> ServiceWriter:
+        about = {
+            "driver_type": self._identity.driver_type,
+            "listen_only": self._identity.listen_only,
+            "versions": _versions(),
+            "buses": [
+                {"medium": line.adapter.medium, "options": msgspec.to_builtins(line.adapter.options)}
+                for line in self._lines
+            ],
+        }
         static = {
             "driver": np.array([self._identity.name.encode()]),
             "bus_name": np.array([line.name.encode() for line in self._lines]),
-            "about": np.array([msgspec.json.encode(self._about())]),
+            "about": np.array([msgspec.json.encode(about)]),
         }
         rate_hz = len(self._lines) / _TURN_S
         if self._writer is None:
@@ -127,17 +134,6 @@ class Wires:
             self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
         self._published = static
         return self._writer
-
-    def _about(self) -> dict[str, object]:
-        options = [msgspec.to_builtins(line.adapter.options) for line in self._lines]
-        return {
-            "driver_type": self._identity.driver_type,
-            "listen_only": self._identity.listen_only,
-            "versions": _versions(),
-            "buses": [
-                {"medium": line.adapter.medium, "options": own} for line, own in zip(self._lines, options, strict=True)
-            ],
-        }
 
     def _open_taps(self) -> None:
         for line in self._lines:

@@ -30,10 +30,9 @@ _EXPLAINED = (pytest.fail.Exception, NeverEnds)
 
 
 def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run a coroutine in an event loop of the clock's time, in its own thread, and find what blocks it.
+    """Run a coroutine in an event loop of the clock's time, in its own thread.
 
-    Raises:
-        Failed: the coroutine raised an exception, blocks, never ends, or leaves a task; the message says which.
+    The test fails if it raises an exception, blocks, never ends, or leaves a task; the message says which.
     """
     outcome: list[T] = []
     failures: list[BaseException] = []

@@ -13,7 +13,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware_drivers.testing.rig import LONGEST_START_S, SHOWN_ANYWAY, Running, is_fresh, sensor_name
+from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, is_fresh, sensor_name
 from skinware_drivers.testing.waiting import defect, require
 
 Values = npt.NDArray[np.int64]
@@ -27,11 +27,7 @@ _FEWEST_UPDATES = 3
 
 @dataclass(frozen=True)
 class Update:
-    """New values of a module in a snapshot.
-
-    Attributes:
-        burst: number of the burst of its device that it shows; None: it shows none.
-    """
+    """New values of a module in a snapshot, and the number of the burst that they show; None: none."""
 
     frame: int
     module: int
@@ -137,11 +133,7 @@ class ShownUpdates:
         return f"modules {modules[0]} to {modules[-1]} ({names})"
 
     def require_complete(self, spare: Callable[[int], bool] = lambda _time_ns: False, because: str = "") -> None:
-        """Fail unless every burst was shown, from the first shown one on.
-
-        Args:
-            spare: returns whether a burst at this time need not be shown.
-        """
+        """Fail unless every burst was shown, from the first shown one on, but for those at times to spare."""
         end_ns = self.rig.record.times_ns[-1] - 2 * self.rig.period_ns - _LATE_NS
         for module in range(self.structure.n_modules):
             shown = self.bursts_shown(module)
@@ -253,7 +245,7 @@ class ShownUpdates:
         return f"shows {shown[-1]} where {example} was felt — look at `offset`, `dtype` and `bits` of the layout"
 
 
-async def until_fresh(rig: Running, within_s: float = LONGEST_START_S) -> DriverSnapshot:
+async def until_fresh(rig: Running) -> DriverSnapshot:
     """Let time pass until every sensor is fresh; explain why if that does not happen."""
     frames, begun_ns = rig.wire.frames, rig.clock.now_ns
     heard_ns: int | None = None
@@ -268,7 +260,7 @@ async def until_fresh(rig: Running, within_s: float = LONGEST_START_S) -> Driver
         return is_fresh(frame) or is_late
 
     try:
-        frame = await rig.until(is_decided, "", within_s)
+        frame = await rig.until(is_decided, "")
         require(is_fresh(frame), "")
     except BaseException:
         _explain_not_fresh(rig, (rig.clock.now_ns - begun_ns) / 1e9)

@@ -36,6 +36,9 @@ _LONGEST_WRITE = 4096
 class Driving:
     """A driver in a thread.
 
+    Args:
+        options: as for :class:`skinware_drivers.running.runner.Runner`.
+
     Attributes:
         ready: set when it publishes.
         failure: the exception that ended it, if it failed.
@@ -43,23 +46,14 @@ class Driving:
     """
 
     def __init__(
-        self,
-        lines: Sequence[tuple[AnyAdapter, Bus]],
-        name: str,
-        listen_only: bool,
-        publish: PublishMode | None = None,
-        wait_for_buses: bool = False,
-        bus_names: Sequence[str] = (),
+        self, lines: Sequence[tuple[AnyAdapter, Bus]], name: str, bus_names: Sequence[str] = (), **options: Any
     ) -> None:
         self.ready: threading.Event = threading.Event()
         self.failure: BaseException | None = None
         self.runner: Runner | None = None
         names = bus_names or [f"bus{i}" for i in range(len(lines))]
         self._lines = [(name, adapter, bus) for name, (adapter, bus) in zip(names, lines, strict=True)]
-        self._name = name
-        self._listen_only = listen_only
-        self._publish = publish
-        self._wait_for_buses = wait_for_buses
+        self._name, self._options = name, options
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
 
@@ -67,14 +61,7 @@ class Driving:
         async def run() -> None:
             self._loop = asyncio.get_running_loop()
             self.runner = Runner(
-                self._name,
-                self._lines,
-                name=self._name,
-                listen_only=self._listen_only,
-                publish=self._publish,
-                wait_for_buses=self._wait_for_buses,
-                slots=64,
-                on_ready=self.ready.set,
+                self._name, self._lines, name=self._name, slots=64, on_ready=self.ready.set, **self._options
             )
             await self.runner.run()
 
@@ -142,7 +129,7 @@ def driving_lines(
         wait_for_buses: see :class:`skinware_drivers.running.runner.Runner`.
         bus_names: names of the buses; default: bus0, bus1 ...
     """
-    running = Driving(lines, name, listen_only, publish, wait_for_buses, bus_names)
+    running = Driving(lines, name, bus_names, listen_only=listen_only, publish=publish, wait_for_buses=wait_for_buses)
     running.start()
     try:
         if wait:
@@ -159,21 +146,14 @@ class _Control:
         self.stopped = False
         self.ready = threading.Event()
         self.failure: BaseException | None = None
-        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def fileno(self) -> int:
-        return self._event
+        return self.event
 
     def note(self, event: str, **_facts: Any) -> None:
         if event == "ready":
             self.ready.set()
-
-    def stop(self) -> None:
-        self.stopped = True
-        os.eventfd_write(self._event, 1)
-
-    def close(self) -> None:
-        os.close(self._event)
 
 
 @contextmanager
@@ -239,9 +219,10 @@ def carried_on(bus: Bus, hardware: EmulatedHardware) -> Iterator[None]:
             raise control.failure
         yield
     finally:
-        control.stop()
+        control.stopped = True
+        os.eventfd_write(control.event, 1)
         thread.join(_EMULATION_S)
-        control.close()
+        os.close(control.event)
     require(not thread.is_alive(), "the emulated devices did not stop")
     if control.failure is not None:
         raise control.failure

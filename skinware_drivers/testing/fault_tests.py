@@ -16,8 +16,7 @@ from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.polling import Watch
 from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
-from skinware_drivers.testing.rig import Running, in_its_time, is_fresh, is_live, play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Running, Suite, in_its_time, is_fresh, play
 from skinware_drivers.testing.torn_tests import FrameLog
 from skinware_drivers.testing.vectors import DirectPath
 from skinware_drivers.testing.waiting import require
@@ -191,9 +190,13 @@ class SilenceTests(Suite):
         async with self.running(clock, boot_s=0.5) as rig:
             await until_fresh(rig)
             number = rig.numbers[0]
-            await self._restart(rig, number, clock.now_ns)
+            rig.devices.restart(number, clock.now_ns)
             patch = rig.first_patch_of(number)
-            states = await self._until_stale(rig, patch, "a device lost its power, but it is shown as live")
+            states = await rig.until(
+                lambda frame: frame.patch_state[patch] != PatchState.LIVE,
+                "a device lost its power, but it is shown as live",
+                within_s=20 * rig.adapter.period_s + 3,
+            )
             disturbed = np.flatnonzero(states.patch_state != PatchState.LIVE)
             require(
                 set(disturbed.tolist()) <= {patch},
@@ -201,20 +204,15 @@ class SilenceTests(Suite):
             )
             await self._comes_back(rig, "a device lost its power for half a second", within_s=_RESTART_S)
 
-    @staticmethod
-    async def _restart(rig: Running, number: int, now_ns: int) -> None:
-        rig.devices.restart(number, now_ns)
-
-    @staticmethod
-    async def _until_stale(rig: Running, patch: int, why_not: str) -> DriverSnapshot:
-        return await rig.until(
-            lambda frame: frame.patch_state[patch] != PatchState.LIVE, why_not, within_s=20 * rig.adapter.period_s + 3
-        )
-
     async def _comes_back(self, rig: Running, after: str, within_s: float = 10.0) -> None:
         end_ns = rig.clock.now_ns
+
+        def is_back(frame: DriverSnapshot) -> bool:
+            is_live = (frame.patch_state == PatchState.LIVE).all() and (frame.bus_state == BusState.LIVE).all()
+            return frame.acquired_ns > end_ns and is_fresh(frame) and bool(is_live)
+
         await rig.until(
-            lambda frame: frame.acquired_ns > end_ns and is_fresh(frame) and is_live(frame),
+            is_back,
             f"{after}, and {within_s:g} s later not every sensor is fresh again: look at `probe` and `revive`; what the"
             f" driver sent: {rig.sent_in_words()}",
             within_s=within_s,
@@ -229,7 +227,7 @@ class SilenceTests(Suite):
             await until_fresh(rig)
             if len(rig.numbers) < 2:
                 return
-            await self._restart(rig, rig.numbers[0], clock.now_ns)
+            rig.devices.restart(rig.numbers[0], clock.now_ns)
             await rig.sleep(1.0 + 8 * rig.adapter.period_s)
             first = len(rig.record.frames)
             await rig.sleep(_BURSTS * rig.adapter.period_s)
@@ -251,11 +249,7 @@ def _path(rig: Running, wire: npt.NDArray[np.void], watch: Watch) -> DirectPath:
 
 
 class _SensorLog(Watch):
-    """Note which sensors whole updates have values of.
-
-    Attributes:
-        has_values: (n_sensors + 1,) bool; the last one: values without a sensor.
-    """
+    """Note which sensors whole updates have values of; the last one stands for values without a sensor."""
 
     sees_all = True
 

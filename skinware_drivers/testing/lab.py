@@ -165,16 +165,12 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
         script.write_text(guest_script(flavour, command, folder))
         if flavour == "user":
             return _run_in_user_mode(script, timeout_s)
-        return _run_in_machine(flavour, script, timeout_s)
-
-
-def _run_in_machine(flavour: str, script: Path, timeout_s: float) -> int:
-    vng = find_vng() or ""
-    # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
-    arguments = [vng, "--run", str(find_kernel(flavour)), "--disable-kvm", "--force-9p", "--disable-microvm"]
-    arguments += ["--cpus", "2", "--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
-    environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
-    return boot([*arguments, "--exec", f"bash {shlex.quote(str(script))}"], environment, timeout_s)
+        vng = find_vng() or ""
+        # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
+        arguments = [vng, "--run", str(find_kernel(flavour)), "--disable-kvm", "--force-9p", "--disable-microvm"]
+        arguments += ["--cpus", "2", "--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
+        environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
+        return boot([*arguments, "--exec", f"bash {shlex.quote(str(script))}"], environment, timeout_s)
 
 
 def _run_in_user_mode(script: Path, timeout_s: float) -> int:

@@ -14,13 +14,11 @@ from skinware.errors import BusError, ConfigurationError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.structure import Structure
-from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.adapter import AnyAdapter, check_layout
 from skinware_drivers.description import SkinTables, assemble
-from skinware_drivers.layout_check import check_layout
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.leaks import Belongings, files_left
-from skinware_drivers.testing.rig import Running, in_its_time, play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Running, Suite, in_its_time, play
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
@@ -64,7 +62,7 @@ class LifeTests(Suite):
                 "`describe` returns another structure for the same devices when it is called again: readers would"
                 " have to follow a new structure each time",
             )
-            other = self.case.adapter()
+            other = self.make_adapter()
             third = self._tables(other, await other.describe(rig.link))
             require(
                 first.structure == third.structure,
@@ -159,7 +157,9 @@ class LifeTests(Suite):
         rig = self.running(clock)
         async with rig:
             rig.wire.skip(clock.now_ns)
-            if self._frames_alone(clock):
+            others = self.emulator(self.make_options(), log=None, source=self.handshakes(clock).truth)
+            others.skip(clock.now_ns)
+            if others.emit(clock.now_ns + 1_000_000_000):
                 return  # they send by themselves: nothing stops them
             await until_fresh(rig)
         self._let_pass(rig, 0.1)
@@ -169,12 +169,6 @@ class LifeTests(Suite):
             f"the devices continue to send after the driver was stopped ({sent} frames in a second): `stop` does"
             " not make them silent",
         )
-
-    def _frames_alone(self, clock: HandClock) -> int:
-        """Return the number of frames that devices send in a second without being started."""
-        devices = self.emulator(self.case.options(), log=None, source=self.handshakes(clock).truth)
-        devices.skip(clock.now_ns)
-        return len(devices.emit(clock.now_ns + 1_000_000_000))
 
     @staticmethod
     def _let_pass(rig: Running, duration_s: float) -> list[WireFrame]:

@@ -1,4 +1,4 @@
-"""Run a driver on emulated devices in the time of a test, and keep what it publishes."""
+"""Run a driver on emulated devices in the time of a test, and keep what it publishes: the base of the suite."""
 
 from __future__ import annotations
 
@@ -6,23 +6,21 @@ import asyncio
 import functools
 import inspect
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.samples import sample_report, sample_text
-from skinware.status import BusState, PatchState, Status
+from skinware.status import Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
-from skinware_drivers.proving.captures import snapshots_after
+from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import run_in_its_time
@@ -34,6 +32,7 @@ from skinware_drivers.testing.wire import (
     Truth,
     make_bus,
 )
+from skinware_drivers.virtual.emulator import each_value
 from skinware_drivers.virtual.hand_clock import HandClock
 
 T = TypeVar("T")
@@ -49,77 +48,18 @@ SHOWN_ANYWAY = int(Status.SUSPECT | Status.OUT_OF_RANGE)
 """Status bits of values that are shown as they were sent."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """A driver and its devices; see :class:`skinware_drivers.testing.conformance.DriverConformance`."""
-
-    driver: type[AnyAdapter]
-    emulator: Any
-    driver_options: Mapping[str, Any]
-    emulator_options: Mapping[str, Any]
-    shown: Callable[[Sequence[int]], Sequence[int]]
-
-    def adapter(self) -> AnyAdapter:
-        adapter = self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
-        try:
-            adapter.check()
-        except ConfigurationError as error:
-            defect(str(error))
-        return adapter
-
-    def options(self, **more: Any) -> Any:
-        """Return the options of the devices, with those of ``more`` that they have."""
-        known = self.emulator.Options.__struct_fields__
-        given = {**self.emulator_options, **{name: value for name, value in more.items() if name in known}}
-        return msgspec.convert(given, self.emulator.Options, strict=False)
-
-
-class SnapshotLog:
-    """Read every snapshot that a driver publishes, in order, as a user's program does.
-
-    Attributes:
-        keep: keep all snapshots; False: only the newest.
-    """
-
-    def __init__(self, clock: HandClock) -> None:
-        self.frames: list[DriverSnapshot] = []
-        self.times_ns: list[int] = []
-        self.keep = True
-        self.count: int = 0
-        self.reader: DriverReader | None = None
-        self._clock = clock
-
-    def look(self, runner: Runner) -> None:
-        if self.reader is None:
-            if runner.builder.writer is None or runner.builder.writer.closed:
-                return
-            self.reader = DriverReader(runner.identity.name)
-        for frame in snapshots_after(self.reader, self.frames[-1].position if self.frames else None):
-            if not self.keep:
-                self.frames.clear()
-                self.times_ns.clear()
-            self.count += 1
-            self.frames.append(frame)
-            self.times_ns.append(self._clock.now_ns)
-
-    def close(self) -> None:
-        if self.reader is not None:
-            self.reader.close()
-
-
 class Rig:
     """One driver on one bus of emulated devices, in the time of ``clock``."""
 
     def __init__(
-        self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **emulated: Any
+        self, suite: Suite, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **emulated: Any
     ) -> None:
-        self.case = case
         self.clock = clock
-        self.adapter: AnyAdapter = case.adapter()
-        options = case.options(**emulated)
-        n_felt = len(case.emulator(options).places())
-        self.truth: Truth = Truth(clock, n_felt, pattern, case.shown)
-        self.devices: Any = case.emulator(options, log=None, source=self.truth)
+        self.adapter: AnyAdapter = suite.make_adapter()
+        options = suite.make_options(**emulated)
+        n_felt = len(suite.emulator(options).places())
+        self.truth: Truth = Truth(clock, n_felt, pattern, suite.shown)
+        self.devices: Any = suite.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
         self.wire: Interference = Interference(self.devices)
         self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
@@ -170,8 +110,8 @@ class Running(Rig):
         answers: number of frames that its handshakes took, or that came before it had a structure.
     """
 
-    def __init__(self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
-        super().__init__(case, clock, pattern, listen_only=listen_only, **more)
+    def __init__(self, suite: Suite, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
+        super().__init__(suite, clock, pattern, listen_only=listen_only, **more)
         self.record: SnapshotLog = SnapshotLog(clock)
         self.answers = 0
         self.runner: Runner | None = None
@@ -184,11 +124,7 @@ class Running(Rig):
         )
         self._task = asyncio.create_task(self.runner.run())
         self.clock.before_passing.append(self._look)
-        self._count_answers(self.runner)
-        return self
-
-    def _count_answers(self, runner: Runner) -> None:
-        link = runner.lines[0].link
+        runner, link = self.runner, self.runner.lines[0].link
         offer = link.offer
 
         def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -197,6 +133,7 @@ class Running(Rig):
             return unwanted
 
         link.offer = offer_and_count  # type: ignore[method-assign]
+        return self
 
     async def __aexit__(self, *raised: object) -> None:
         await self.stop()
@@ -292,10 +229,6 @@ def is_fresh(frame: DriverSnapshot) -> bool:
     return not (frame.status & ~np.uint8(SHOWN_ANYWAY)).any()
 
 
-def is_live(frame: DriverSnapshot) -> bool:
-    return bool((frame.patch_state == PatchState.LIVE).all() and (frame.bus_state == BusState.LIVE).all())
-
-
 def sensor_name(structure: Structure, sensor: int) -> str:
     type_name = next(t.name for t in structure.types if t.id == structure.sensor_type[sensor])
     return f"{structure.sensor_name(sensor)} ({type_name}, uid {int(structure.sensor_uid[sensor]):#x})"
@@ -317,3 +250,107 @@ def in_its_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[...,
     parameters = [parameter for name, parameter in signature.parameters.items() if name != "clock"]
     run.__dict__["__signature__"] = signature.replace(parameters=parameters, return_annotation=None)
     return run
+
+
+Values = npt.NDArray[np.int64]
+
+
+def limits(emulator: Any, n_values: int) -> tuple[Values, Values]:
+    """Return the least and the greatest value that each sensor of a device can send."""
+    lowest = each_value("lowest", getattr(emulator, "lowest", 0), n_values)
+    return lowest, each_value("full_scale", emulator.full_scale, n_values)
+
+
+def lively(emulator: Any) -> Pattern:
+    """Return a pattern with another random value for every sensor, device and burst, so that any mix-up shows."""
+
+    def feel(number: int, cycle: int, n_values: int) -> Values:
+        lowest, highest = limits(emulator, n_values)
+        return np.random.default_rng([number, cycle, 7]).integers(lowest, highest, n_values, endpoint=True)
+
+    return feel
+
+
+def extreme(emulator: Any) -> Pattern:
+    """Return a pattern of range ends and bit patterns by turns, with lively values between them."""
+    between = lively(emulator)
+
+    def feel(number: int, cycle: int, n_values: int) -> Values:
+        lowest, highest = limits(emulator, n_values)
+        odd = np.arange(n_values) % 2
+        middle = lowest + (highest - lowest + 1) // 2
+        moments = (
+            lowest,
+            highest,
+            lowest | (highest & 0x5555_5555) if (lowest == 0).all() else 0x55,
+            lowest | (highest & 0xAAAA_AAAA) if (lowest == 0).all() else -0x56,
+            np.where(odd, lowest, highest),
+            np.where(odd, highest, lowest),
+            middle,
+            middle - 1,
+            -1,
+            1,
+        )
+        which, is_between = divmod(cycle, 2)
+        if is_between:
+            return between(number, cycle, n_values)
+        return np.clip(moments[which % len(moments)], lowest, highest)
+
+    return feel
+
+
+class Suite:
+    """A driver and its emulator.
+
+    Attributes:
+        driver_options: options of the driver, as in a configuration file.
+        emulator_options: options of the emulator, beside those that the tests set.
+    """
+
+    driver: ClassVar[type[AnyAdapter]]
+    emulator: ClassVar[Any]
+    driver_options: ClassVar[Mapping[str, Any]] = {}
+    emulator_options: ClassVar[Mapping[str, Any]] = {}
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        """Return the values that a device can send for the values that it felt: override it if they are fewer."""
+        return felt
+
+    def make_adapter(self) -> AnyAdapter:
+        adapter = self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
+        try:
+            adapter.check()
+        except ConfigurationError as error:
+            defect(str(error))
+        return adapter
+
+    def make_options(self, **more: Any) -> Any:
+        """Return the options of the devices, with those of ``more`` that they have."""
+        known = self.emulator.Options.__struct_fields__
+        given = {**self.emulator_options, **{name: value for name, value in more.items() if name in known}}
+        return msgspec.convert(given, self.emulator.Options, strict=False)
+
+    def running(self, clock: HandClock, **more: Any) -> Running:
+        """Return the running driver on devices that feel new values in each burst."""
+        return Running(self, clock, more.pop("pattern", lively)(self.emulator), **more)
+
+    def handshakes(self, clock: HandClock, **more: Any) -> Handshakes:
+        return Handshakes(self, clock, lively(self.emulator), **more)
+
+    @staticmethod
+    def require_all_counted(rig: Running) -> None:
+        counters = rig.counters()
+        came = counters["frames"] + counters["refused"] + counters["dropped"]
+        if rig.adapter.medium == "can":
+            require(came == rig.wire.frames, f"{rig.wire.frames} frames came, the bus counted {came}")
+        layout = rig.adapter.layout
+        if layout.cycle is not None and len(layout.cycle.members) < len(layout.frames):
+            return  # updates may have had any number of frames
+        used = counters["updates"] * layout.cycle_length + rig.answers
+        used += sum(counters[name] for name in ("unknown", "bad_length", "bad_content", "orphans"))
+        structure = rig.record.frames[-1].structure
+        groups = structure.n_patches if layout.cycle and layout.cycle.within == "patch" else structure.n_modules
+        require(
+            0 <= counters["frames"] - used <= groups * (layout.cycle_length - 1),  # which may still wait for others
+            f"{counters['frames']} frames came in, {used} were shown, counted, or answers to the driver: {counters}",
+        )

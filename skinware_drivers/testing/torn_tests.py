@@ -7,7 +7,7 @@ them go through the driver's layout in a few batches.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from math import gcd
@@ -24,8 +24,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.path_hooks import Named
 from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
-from skinware_drivers.testing.rig import Running, in_its_time
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Running, Suite, in_its_time
 from skinware_drivers.testing.vectors import DirectPath
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import Stumbling
@@ -64,12 +63,20 @@ class TornTests(Suite):
             recording = heard.recording()
         if recording is None:
             defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
-        numbers = counter_values(recording)
-        if len(numbers) == 1:
-            defect(
-                f"the `counter` of the cycle is {numbers[0]} in all frames of {BURSTS} bursts, so that it cannot"
-                " distinguish them: look at its `offset`, `dtype` and `mask`"
-            )
+        cycle = recording.layout.cycle
+        if cycle is not None and cycle.counters:
+            _, kind = _named(recording.layout, recording.tables, recording.wire, recording.time_ns)
+            names = [frame.name for frame in recording.layout.frames]
+            found = [
+                read_numbers(recording.wire["payload"][kind == names.index(member)], counter)
+                for member, counter in zip(cycle.members, cycle.counters, strict=True)
+            ]
+            numbers = np.unique(np.concatenate(found))
+            if len(numbers) == 1:
+                defect(
+                    f"the `counter` of the cycle is {numbers[0]} in all frames of {BURSTS} bursts, so that it cannot"
+                    " distinguish them: look at its `offset`, `dtype` and `mask`"
+                )
         outcome = try_troubles(recording)
         require(outcome.shown >= 2 * outcome.tried, "hardly anything is shown when frames are lost now and then")
         if outcome.first is not None:
@@ -98,12 +105,7 @@ class TornTests(Suite):
 
 
 class Delivery(NamedTuple):
-    """Frames that a bus delivered at once.
-
-    Attributes:
-        wire: (n,) as in a batch.
-        time_ns: (n,) int64, stamps.
-    """
+    """Frames that a bus delivered at once, and their stamps, as in a batch."""
 
     now_ns: int
     wire: npt.NDArray[np.void]
@@ -111,11 +113,7 @@ class Delivery(NamedTuple):
 
 
 class FrameLog:
-    """Write down the frames that the bus of a running driver delivers.
-
-    Attributes:
-        takes: deliveries in order, without empty ones.
-    """
+    """Write down the frames that the bus of a running driver delivers, in order."""
 
     def __init__(self, rig: Running) -> None:
         if rig.runner is None or rig.runner.builder.generation is None:
@@ -148,12 +146,7 @@ class FrameLog:
 
 
 class Bursts(NamedTuple):
-    """Some bursts of one patch.
-
-    Attributes:
-        wire: (bursts * size,) frames, as in a batch.
-        time_ns: (bursts * size,) int64.
-    """
+    """Some bursts of one patch: (bursts * size,) frames and their stamps, as in a batch."""
 
     layout: Layout
     tables: SkinTables
@@ -201,17 +194,10 @@ class Marked(NamedTuple):
     marks: Indices
     flagged: npt.NDArray[np.bool_]
 
-    def take(self, which: npt.NDArray[np.bool_]) -> Marked:
-        return Marked(self.module[which], self.oldest_ns[which], self.marks[which], self.flagged[which])
-
 
 @dataclass
 class Outcome:
-    """The result of all troubles.
-
-    Attributes:
-        first: the first trouble that tore an update.
-    """
+    """The result of all troubles, and the first one that tore an update."""
 
     tried: int = 0
     shown: int = 0
@@ -222,12 +208,7 @@ class Outcome:
 def record(
     layout: Layout, tables: SkinTables, period_s: float, wire: npt.NDArray[Any], time_ns: Indices, bursts: int = BURSTS
 ) -> Bursts | None:
-    """Return bursts of the first patch among the frames of a bus; None if there are too few.
-
-    Args:
-        wire: (n,) frames in order, as in a batch.
-        time_ns: (n,) int64.
-    """
+    """Return bursts of the first patch among the frames of a bus, as in a batch; None if there are too few."""
     # a device's own time would say when frames were sent; bursts must be distinguished without it
     layout = replace(layout, frames=[replace(frame, time=None) for frame in layout.frames])
     entry, kind = _named(layout, tables, wire, time_ns)
@@ -242,46 +223,31 @@ def record(
     return Bursts(layout, tables, period_s, size, wire[own].copy(), time_ns[own].copy())
 
 
-def counter_values(recording: Bursts) -> Indices:
-    """Return (k,) the numbers that the counter of the cycle has in the recording; empty without a counter."""
-    layout = recording.layout
-    if layout.cycle is None or not layout.cycle.counters:
-        return np.zeros(0, np.int64)
-    _, kind = _named(layout, recording.tables, recording.wire, recording.time_ns)
-    names = [frame.name for frame in layout.frames]
-    numbers = [
-        read_numbers(recording.wire["payload"][kind == names.index(member)], counter)
-        for member, counter in zip(layout.cycle.members, layout.cycle.counters, strict=True)
-    ]
-    return np.unique(np.concatenate(numbers))
-
-
 def try_troubles(recording: Bursts, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and count torn updates.
 
-    Args:
-        with_period: False: decode without knowing the period of the device.
+    Without the period of the device, cycles are joined whenever their frames come.
     """
-    outcome = Outcome()
-    step = _step(recording.size)
-    for place in range(0, recording.size, step):
-        troubles = list(_troubles_at(recording, _TROUBLE * recording.size + place, step))
-        fresh, torn = find_torn(recording, *_suffer(recording, troubles), with_period=with_period)
+    outcome, size = Outcome(), recording.size
+    step = -(-size // min(_MOST_PLACES, max(1, _MOST_FRAMES // size)))
+    while gcd(step, size) > 1:  # or some parts of modules would never be tried
+        step += 1
+    span_ns = round(_APART * recording.period_s * 1e9)
+    for place in range(0, size, step):
+        troubles = list(_troubles_at(recording, _TROUBLE * size + place, step))
+        rows, times_ns = [], []
+        for number, trouble in enumerate(troubles):
+            kept, time_ns = _suffer(recording, trouble)
+            rows.append(kept)
+            times_ns.append(time_ns + number * span_ns)
+        fresh, torn = find_torn(recording, np.concatenate(rows), np.concatenate(times_ns), with_period=with_period)
         outcome.tried += len(troubles)
         outcome.shown += len(fresh.module)
         outcome.torn += int(torn.sum())
         if torn.any() and outcome.first is None:
-            number = (fresh.oldest_ns[torn][0] - recording.time_ns[0]) // _span_ns(recording)
+            number = (fresh.oldest_ns[torn][0] - recording.time_ns[0]) // span_ns
             outcome.first = troubles[int(number)]
     return outcome
-
-
-def _step(size: int) -> int:
-    """Return the distance of tried frames, which is coprime to ``size``, so that all parts of modules are tried."""
-    step = -(-size // min(_MOST_PLACES, max(1, _MOST_FRAMES // size)))
-    while gcd(step, size) > 1:
-        step += 1
-    return step
 
 
 def find_torn(
@@ -299,12 +265,8 @@ def find_torn(
     """
     known = _decode(recording, recording.wire, recording.time_ns, None)
     shown = _decode(recording, recording.wire[rows], time_ns, recording.period_s if with_period else None)
-    fresh = shown.take(~shown.flagged)
+    fresh = Marked._make(column[~shown.flagged] for column in shown)
     return fresh, ~np.isin(fresh.marks, known.marks)
-
-
-def _span_ns(recording: Bursts) -> int:
-    return round(_APART * recording.period_s * 1e9)
 
 
 def _troubles_at(recording: Bursts, first: int, step: int) -> Iterator[Trouble]:
@@ -318,19 +280,16 @@ def _troubles_at(recording: Bursts, first: int, step: int) -> Iterator[Trouble]:
         yield Trouble(first, lost, begin, over_ns + period_ns)
 
 
-def _suffer(recording: Bursts, troubles: Sequence[Trouble]) -> tuple[Indices, Indices]:
-    row, span_ns = np.arange(len(recording.wire)), _span_ns(recording)
-    rows, times_ns = [], []
-    for number, trouble in enumerate(troubles):
-        kept = row[(row < trouble.first) | (row >= trouble.first + trouble.lost)]
-        time_ns = recording.time_ns[kept]
-        if trouble.held is not None:
-            time_ns = np.where(kept >= trouble.held, np.maximum(time_ns, trouble.until_ns), time_ns)
-            behind_ns = np.arange(len(kept)) * _PACE_NS
-            time_ns = np.maximum.accumulate(time_ns - behind_ns) + behind_ns
-        rows.append(kept)
-        times_ns.append(time_ns + number * span_ns)
-    return np.concatenate(rows), np.concatenate(times_ns)
+def _suffer(recording: Bursts, trouble: Trouble) -> tuple[Indices, Indices]:
+    """Return the frames that arrive, and when."""
+    row = np.arange(len(recording.wire))
+    kept = row[(row < trouble.first) | (row >= trouble.first + trouble.lost)]
+    time_ns = recording.time_ns[kept]
+    if trouble.held is not None:
+        time_ns = np.where(kept >= trouble.held, np.maximum(time_ns, trouble.until_ns), time_ns)
+        behind_ns = np.arange(len(kept)) * _PACE_NS
+        time_ns = np.maximum.accumulate(time_ns - behind_ns) + behind_ns
+    return kept, time_ns
 
 
 def _named(layout: Layout, tables: SkinTables, wire: npt.NDArray[Any], time_ns: Indices) -> Named:

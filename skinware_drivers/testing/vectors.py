@@ -32,7 +32,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
-from skinware_drivers.counters import BusCounters, FramerCounters
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.decoding.decoder import BUS_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.finding.without_driver import attended
@@ -185,8 +185,15 @@ def decode_stream(
         strict: fail the test if some of them are not shown.
         devices: emulated ones, for a ``describe`` that asks.
     """
-    find = _overheard if isinstance(adapter, ModbusAdapter) else _framed
-    frames, counters, pending = find(adapter, _bytes(stream))
+    if isinstance(adapter, ModbusAdapter):
+        counted = BusCounters()
+        counters, listener = counted.framing, Listener(adapter.wanted, counted)
+        listener.heard(_bytes(stream), NS_PER_S)
+        frames, pending = [(row.identifier, row.payload) for row in listener.rows], listener.pending
+    else:
+        framer = adapter.framing.framer()
+        frames = [(frame.identifier, frame.body) for frame in framer.feed(_bytes(stream))]
+        counters, pending = framer.counters, framer.pending
     problems = [
         text
         for count, text in (
@@ -199,20 +206,6 @@ def decode_stream(
         if count
     ]
     return _decode(adapter, frames, problems, strict, devices)
-
-
-def _framed(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
-    """Return the frames in the bytes of a serial line, the counters, and the number of bytes of an unfinished frame."""
-    framer = adapter.framing.framer()
-    frames = [(frame.identifier, frame.body) for frame in framer.feed(stream)]
-    return frames, framer.counters, framer.pending
-
-
-def _overheard(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
-    counters = BusCounters()
-    listener = Listener(adapter.wanted, counters)
-    listener.heard(stream, NS_PER_S)
-    return [(row.identifier, row.payload) for row in listener.rows], counters.framing, listener.pending
 
 
 def _decode(

@@ -24,11 +24,7 @@ _LOSES_ONLY = 0.3
 
 
 class Stumbling:
-    """A sender that loses runs of frames, stands still and catches up; all chance comes from one seed.
-
-    Args:
-        frames: number of frames of a burst; up to twice as many are lost in a row.
-    """
+    """A sender that loses up to two bursts of frames, stands still and catches up; all chance comes from one seed."""
 
     def __init__(self, period_ns: int, frames: int) -> None:
         self._period_ns = period_ns
@@ -49,7 +45,14 @@ class Stumbling:
         self._next_ns = self._next_ns or now_ns + self._pause_ns()
         for frame in frames:
             if frame.time_ns >= self._next_ns:
-                self._stumble(frame.time_ns)
+                self.stumbles += 1
+                if self._random.random() > _LOSES_ONLY:
+                    self._until_ns = frame.time_ns + round(self._random.uniform(0, _LONGEST_HOLD) * self._period_ns)
+                self._skip = self._random.randrange(self._frames)
+                near = self._random.choice((-1, 0, 0, 0, 1))
+                lose = self._frames * self._random.choice((0, 1, 1, 2)) + near
+                self._lose = max(1, min(2 * self._frames, lose))
+                self._next_ns = max(frame.time_ns, self._until_ns) + self._pause_ns()
             if self._skip:
                 self._skip -= 1
             elif self._lose:
@@ -60,15 +63,6 @@ class Stumbling:
             return []
         passed, self._held = self._held, []
         return [frame._replace(time_ns=max(frame.time_ns, self._until_ns)) for frame in passed]
-
-    def _stumble(self, time_ns: int) -> None:
-        self.stumbles += 1
-        if self._random.random() > _LOSES_ONLY:
-            self._until_ns = time_ns + round(self._random.uniform(0, _LONGEST_HOLD) * self._period_ns)
-        self._skip = self._random.randrange(self._frames)
-        near = self._random.choice((-1, 0, 0, 0, 1))
-        self._lose = max(1, min(2 * self._frames, self._frames * self._random.choice((0, 1, 1, 2)) + near))
-        self._next_ns = max(time_ns, self._until_ns) + self._pause_ns()
 
     def _pause_ns(self) -> int:
         return round(_BETWEEN * self._period_ns * self._random.uniform(0.8, 1.6))
@@ -84,12 +78,7 @@ _FOREIGN_NS = 3_000_000
 
 @dataclass(frozen=True)
 class Burst:
-    """One sample of all sensors of a device.
-
-    Attributes:
-        time_ns: the latest time at which the emulator took it.
-        values: (n,) as the protocol can send them.
-    """
+    """One sample of all sensors of a device, as the protocol can send it, and when it was taken at the latest."""
 
     time_ns: int
     values: Values
@@ -129,15 +118,6 @@ class Truth:
         return felt
 
 
-@dataclass(frozen=True)
-class Damage:
-    """A fault that was made on the wire."""
-
-    time_ns: int
-    fault: Fault
-    payload: bytes
-
-
 @dataclass
 class Interference:
     """Devices behind a wire with faults.
@@ -147,6 +127,7 @@ class Interference:
         every_ns: mean time between two faults.
         silent: nothing passes in either direction.
         foreign: identifiers of frames of other devices beside the data.
+        damages: frames that had a fault, as it left them.
         keep: returns whether a frame passes.
         stumbling: holds frames back and loses some in a row; None: nothing does.
         sent: frames that the driver sent to the devices.
@@ -161,7 +142,7 @@ class Interference:
     foreign: Sequence[int] = ()
     keep: Callable[[int, bytes], bool] = lambda _identifier, _payload: True
     stumbling: Stumbling | None = None
-    damages: list[Damage] = field(default_factory=list)
+    damages: list[WireFrame] = field(default_factory=list)
     frames: int = 0
     foreign_sent: int = 0
     sent: list[tuple[int, bytes]] = field(default_factory=list)
@@ -196,7 +177,13 @@ class Interference:
         if self.fault is not None:
             frames = [damaged for frame in frames for damaged in self._damage(frame)]
         if self.foreign:
-            frames = self._among_others(frames, now_ns)
+            others = []
+            while self._next_foreign_ns <= now_ns:
+                payload = self._random.randbytes(self._random.randrange(9))
+                others.append(WireFrame(self._next_foreign_ns, self._random.choice(self.foreign), payload))
+                self._next_foreign_ns += round(_FOREIGN_NS * self._random.uniform(0.3, 1.7))
+            self.foreign_sent += len(others)
+            frames = sorted([*frames, *others], key=lambda frame: frame.time_ns)
         for frame in frames:
             self.identifiers[frame.identifier] = self.identifiers.get(frame.identifier, 0) + 1
         self.frames += len(frames)
@@ -228,20 +215,12 @@ class Interference:
             payload = self._random.randbytes(1 + self._random.randrange(8)) + payload
         else:
             payload = self._random.randbytes(len(payload))
-        self.damages.append(Damage(frame.time_ns, self.fault or "lost", payload))
-        return [WireFrame(frame.time_ns, frame.identifier, payload)] * times
+        damaged = WireFrame(frame.time_ns, frame.identifier, payload)
+        self.damages.append(damaged)
+        return [damaged] * times
 
     def _pause_ns(self) -> int:
         return round(self.every_ns * self._random.uniform(0.6, 1.4))
-
-    def _among_others(self, frames: list[WireFrame], now_ns: int) -> list[WireFrame]:
-        others = []
-        while self._next_foreign_ns <= now_ns:
-            payload = self._random.randbytes(self._random.randrange(9))
-            others.append(WireFrame(self._next_foreign_ns, self._random.choice(self.foreign), payload))
-            self._next_foreign_ns += round(_FOREIGN_NS * self._random.uniform(0.3, 1.7))
-        self.foreign_sent += len(others)
-        return sorted([*frames, *others], key=lambda frame: frame.time_ns)
 
 
 EmulatedBus = VirtualCanBus | VirtualSerialBus | VirtualModbusBus

@@ -18,16 +18,13 @@ from skinware.cli._command import exit_status
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS, Histogram
 from skinware_drivers.cli import config
-from skinware_drivers.doctor import buses, files, machine, patches, programs, taxels
 from skinware_drivers.doctor.evidence import (
     BusSeen,
     Change,
-    ClockSet,
     Counted,
     DriverSeen,
     Evidence,
     HealthSeen,
-    InterfaceSeen,
     NamespaceSeen,
     PatchSeen,
     ReaderSeen,
@@ -35,7 +32,8 @@ from skinware_drivers.doctor.evidence import (
     TaxelFault,
 )
 from skinware_drivers.doctor.examining import Examination, examine
-from skinware_drivers.doctor.finding import Finding, Rule
+from skinware_drivers.doctor.finding import Finding
+from skinware_drivers.doctor.rules import RULES, Rule
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.finding.running import RunningDriver
@@ -45,7 +43,6 @@ from tests.cli.test_regions import placed_structure
 from tests.commands import COMMANDS, parse, refused, running
 from tests.doctor.rig import found, found_until, looked, of
 
-MODULES = (buses, files, machine, patches, programs, taxels)
 _OF_OTHERS = ("docker", "du", "findmnt", "free", "ip", "journalctl", "ls", "modprobe", "pip", "ps", "rm", "sysctl",
               "usermod")  # fmt: skip
 
@@ -68,15 +65,15 @@ def patch(name: str, bus: str, state: str, **changes: object) -> PatchSeen:
 
 
 def bus(name: str, state: str = "live", reason: str = "") -> BusSeen:
-    losses = counted(buses.LOSSES)
+    losses = counted(RULES["bus-loss"])
     losses = dataclasses.replace(losses, grown={**losses.grown, "polls_late": 900})
     return BusSeen(name, state, reason, 3.0, 0.97, losses, ("unknown: 7FF",), (Change(0.0, state),))
 
 
 def ill(driver: DriverSeen, name: str, kind: str) -> Iterator[DriverSeen]:
     """Drivers with everything that a driver can have, on a bus, between them."""
-    reasons = [bus(name, "down", reason) for reason in buses.REASONS]
-    states = [bus(name, state) for state in buses.STATES]
+    reasons = [bus(name, "down", reason) for reason in RULES["reason"]]
+    states = [bus(name, state) for state in ("silent", "down", "gone", "connecting")]
     away = (Change(0.0, "live"), Change(1.0, "gone"), Change(2.0, "live"))
     flapping = dataclasses.replace(bus(name), changes=away * 3)
     back = dataclasses.replace(bus(name), changes=away)
@@ -86,11 +83,11 @@ def ill(driver: DriverSeen, name: str, kind: str) -> Iterator[DriverSeen]:
         patch("board 9", name, "restarted"),
         patch("board 10", name, "live", fresh=0),
         patch("board 11", name, "live", changes=(Change(0.0, "live"), Change(1.0, "stale"), Change(2.0, "live"))),
-        patch("board 12", name, "live", counted=counted(patches.LOSSES)),
+        patch("board 12", name, "live", counted=counted(RULES["patch-loss"])),
     ]
     twice = Counted({}, {"updates": 9000, "orphans": 9000})
     sick += [patch("board 13", name, "live", counted=twice), patch("board 14", name, "live")]
-    statuses = {"fresh": 1, **dict.fromkeys(taxels.STATUSES, 5)}
+    statuses = {"fresh": 1, **dict.fromkeys(RULES["status"], 5)}
     faults = HealthSeen("skin-calm", 8, (TaxelFault("taxel 1", "stuck", "at 7"),), {"noisy": "too short"})
     times = dataclasses.replace(
         driver.timing, period_ns=10_000_000, missed=1000, age=late(BUCKETS - 2), future_ns=10**9, backwards=3,
@@ -129,7 +126,7 @@ def ill_machine(seen: Evidence) -> Evidence:
             NamespaceSeen("mine", "/dev/shm/skinware.mine", True, "others may write it"),
             NamespaceSeen("old", "/dev/shm/skinware.old", False, dead=("torso",), idle_s=7200.0),
         ),
-        interfaces=tuple(InterfaceSeen(one, counted(machine.DROPS)) for one in controllers),
+        interfaces=tuple((one, counted(RULES["drop"])) for one in controllers),
         ports=tuple(ports),
         readers=(ReaderSeen("python3", 17, "torso", 5, 9),),
         bridges=(BridgeState("icub", False, 0, None, None, 0, states, "1", "", 2, 3, 4, "nonsense"),),
@@ -139,9 +136,7 @@ def ill_machine(seen: Evidence) -> Evidence:
 
 def ill_recording(seen: Evidence) -> Evidence:
     events = {"unreadable": 3}
-    walk = RecordingSeen(
-        "my walk.mcap", 9, 9.0, False, ("a chunk",), (), 3, events, (ClockSet(1.0, 60.0),), 2, "skinware"
-    )
+    walk = RecordingSeen("my walk.mcap", 9, 9.0, False, ("a chunk",), (), 3, events, ((1.0, 60.0),), 2, "skinware")
     return dataclasses.replace(seen, recording=walk, namespace="")
 
 
@@ -166,10 +161,7 @@ def everything() -> list[Examination]:
 
 
 def rules() -> list[Rule]:
-    """All rules of the tables, and those that stand alone."""
-    values = [value for module in MODULES for value in vars(module).values()]
-    tables = [list(value.values()) if isinstance(value, dict) else [value] for value in values]
-    return [one for table in tables for one in table if isinstance(one, Rule)]
+    return [rule for of_kind in RULES.values() for rule in of_kind.values()]
 
 
 @pytest.fixture

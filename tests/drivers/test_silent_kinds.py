@@ -11,8 +11,7 @@ from skinware.status import PatchState, Status
 from skinware_drivers.loading import registered
 from skinware_drivers.registry import DRIVERS
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.rig import play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Suite, play
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.drivers import test_conformance
 

@@ -21,7 +21,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
-from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_port, listen_on
+from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_port, listen
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -51,7 +51,7 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def heard_on(bus: Bus, listen_s: float = 0.15) -> HeardOnBus:
     bus.listen_only = True
-    heard = asyncio.run(listen_on(bus, "bus", listen_s, DRIVERS))
+    heard = asyncio.run(listen("bus", listen_s, DRIVERS, bus))
     bus.listen_only = False
     return heard
 
@@ -247,5 +247,5 @@ def test_devices_are_taken_for_what_they_are_and_for_nothing_else(
         "roboskin": RoboskinDriver,
         "xela": XelaDriver,
     }
-    heard = asyncio.run(listen_on(bus, "bus", 0.2, drivers))
+    heard = asyncio.run(listen("bus", 0.2, drivers, bus))
     assert [(one.driver, one.share, one.patches) for one in heard.guesses] == [(driver, 1.0, patches)]

@@ -31,7 +31,7 @@ from skinware_drivers.modbus.master import Listener, Master
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import Flow, flow_of
+from skinware_drivers.running.flow import Flow
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.ports import DescriptorPort, Port
@@ -148,9 +148,7 @@ class _InC(_InPython):
         stack.callback(writer.close)
         publisher = Publisher(writer, decoder, adapter.watch(tables), adapter.period_s, by_cycle=True)
         self._generation = Generation([line], decoder, adapter.watch(tables), publisher, adapter.period_s)
-        flow = flow_of(self._generation, epoll.fileno(), 0.0, self._fail, self._fail)
-        assert isinstance(flow, Flow)
-        self._flow = flow
+        self._flow = Flow(self._generation, epoll.fileno(), 0.0, self._fail, self._fail)
 
     def take(self) -> None:
         if self._flow._run(self._loop_fd, 0.01) == _OTHER_BUS:

@@ -10,8 +10,7 @@ import pytest
 from skinware import Status
 from skinware_drivers.modbus import Registers
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.rig import play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Suite, play
 from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.modbus.hands import Array, EmulatedArray

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
+from skinware_drivers.adapter import check_layout
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
 from skinware_drivers.fields import (
@@ -33,7 +34,6 @@ from skinware_drivers.fields import (
     StatusBytes,
 )
 from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
-from skinware_drivers.layout_check import check_layout
 
 _EXTENDED_BASE = EXTENDED_FLAG | 0x18DA_0000
 _SLOT_SHIFT, _PATCH_SHIFT, _KEY_BITS = 8, 4, 4

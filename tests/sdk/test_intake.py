@@ -14,8 +14,8 @@ import pytest
 from skinware import DriverReader
 from skinware.realtime import TURN_S, now_ns
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.running import intake
-from skinware_drivers.running.intake import Intake
+from skinware_drivers.running import data_loop
+from skinware_drivers.running.data_loop import Intake
 from tests.sdk.driving import driving, emulated
 
 TAKE_NS = 100_000
@@ -26,7 +26,7 @@ def rest_after_a_take(
 ) -> float:
     """What the loop is asked for after a take of TAKE_NS, s; the clock stands still otherwise."""
     clock_ns = now_ns()
-    monkeypatch.setattr(intake, "now_ns", lambda: clock_ns)
+    monkeypatch.setattr(data_loop, "now_ns", lambda: clock_ns)
     read, write = os.pipe()
     epoll = select.epoll()
     rests: list[float] = []
@@ -141,7 +141,7 @@ def test_a_wake_up_ends_in_time_however_much_waits() -> None:
     bus, condition = SimpleNamespace(receive=receive, fileno=lambda: fd), SimpleNamespace(heard_ns=0)
     line: Any = SimpleNamespace(bus=bus, condition=condition, ordinal=0)
     with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(intake, "now_ns", lambda: clock_ns)
+        patch.setattr(data_loop, "now_ns", lambda: clock_ns)
         epoll.register(fd, select.EPOLLIN)
         assert Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, 0.0).take() == "some"
     os.close(fd)
@@ -171,7 +171,7 @@ def test_it_says_until_when_all_was_taken(first_ns: int, first_told_ns: int) -> 
     bus, condition = SimpleNamespace(receive=receive, fileno=lambda: fd), SimpleNamespace(heard_ns=0)
     line: Any = SimpleNamespace(bus=bus, condition=condition, ordinal=0)
     with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(intake, "now_ns", lambda: clock_ns)
+        patch.setattr(data_loop, "now_ns", lambda: clock_ns)
         epoll.register(fd, select.EPOLLIN)
         gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, 0.0)
         assert gather.take() == "all"

@@ -7,19 +7,21 @@ from typing import Any
 import pytest
 
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.rig import Case, Running, play
-from skinware_drivers.testing.suite import lively
+from skinware_drivers.testing.rig import Suite, play
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 
+class _Fingers(Suite):
+    driver = Fingertips
+    emulator = EmulatedFingertips
+
+
 @pytest.mark.parametrize("counter", ["dropped", "overflows", "bus_offs"])
 def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, namespace: object) -> None:
-    case = Case(Fingertips, EmulatedFingertips, {}, {}, lambda felt: felt)
-
     async def scenario(clock: HandClock) -> list[list[int]]:
         told: list[list[int]] = []
-        async with Running(case, clock, lively(EmulatedFingertips)) as rig:
+        async with _Fingers().running(clock) as rig:
             await until_fresh(rig)
             assert rig.runner is not None
             assert rig.runner.builder.generation is not None

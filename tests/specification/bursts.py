@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.decoding.decoder import SkinState, Updates
-from skinware_drivers.running.publisher import BurstPauses, PublishPace
+from skinware_drivers.running.publisher import PatchLife, PublishPace
 from tests.specification.decoding import join
 
 Indices = npt.NDArray[np.int64]
@@ -41,7 +41,7 @@ class Bursts:
     def __init__(
         self,
         state: SkinState,
-        pauses: BurstPauses,
+        pauses: PatchLife,
         pace: PublishPace,
         show: Callable[[Updates], None],
         skip: Callable[[Indices], None],

@@ -18,8 +18,7 @@ from skinware_drivers.serial.native_stream import NativeStream, can_compile
 from skinware_drivers.serial.stream import PythonStream, Stream
 from skinware_drivers.testing import conformance
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.rig import Running, play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Running, Suite, play
 from skinware_drivers.testing.torn_tests import FrameLog
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import Stumbling

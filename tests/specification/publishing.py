@@ -27,7 +27,7 @@ class SpecifiedPublisher(Publisher):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.most_at_once = self.writer.slots
-        self.bursts = Bursts(self.state, self.pauses, self.pace, self._show, self._skip)
+        self.bursts = Bursts(self.state, self.patches, self.pace, self._show, self._skip)
         self._group_module = self._structure.group_module.astype(np.intp)
         self._sensor_group = self._structure.sensor_group.astype(np.intp)
         self._due_ns = 0

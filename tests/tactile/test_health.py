@@ -150,14 +150,14 @@ def test_healthy_plates_have_no_faults(how: dict[str, float]) -> None:
 
 @pytest.mark.thorough
 def test_what_nobody_can_tell() -> None:
-    """A dead taxel at a corner lies between no others: it may be that nobody touches it. Exchanged taxels look dead."""
+    """A dead taxel at a corner lies between no others: perhaps nothing touches it. Exchanged ones may look dead."""
     world = plates(3)
     one, other = TAXELS + 2 * SIDE + 2, TAXELS + 5 * SIDE + 5
     world.dead(CORNERS)
     world.swap([one], [other])
     report = judged(world, QUICK)
     assert names(report.kind[CORNERS]) == ["never_touched"] * 4
-    assert names(report.kind[[one, other]]) == ["dead", "dead"]
+    assert set(names(report.kind[[one, other]])) <= {"dead", "swapped"}
     assert np.flatnonzero(report.faulty).tolist() == [one, other]
 
 

@@ -10,7 +10,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.conformance import DriverConformance
-from skinware_drivers.testing.suite import extreme, lively
+from skinware_drivers.testing.rig import extreme, lively
 from skinware_drivers.testing.vectors import decode_frames
 from skinware_drivers.virtual import EmulatorOptions
 from tests.testing.cells import DATA, Cells, ElevenBits, EmulatedCells, NoTemperatures, ShiftedKeys

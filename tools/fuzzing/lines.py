@@ -28,8 +28,7 @@ from skinware_drivers.description import SkinTables  # noqa: E402
 from skinware_drivers.registry import load_driver  # noqa: E402
 from skinware_drivers.serial.adapter import SerialAdapter  # noqa: E402
 from skinware_drivers.testing.comparison import until_fresh  # noqa: E402
-from skinware_drivers.testing.rig import Case, Running, play  # noqa: E402
-from skinware_drivers.testing.suite import lively  # noqa: E402
+from skinware_drivers.testing.rig import Suite, play  # noqa: E402
 from skinware_drivers.virtual.hand_clock import HandClock  # noqa: E402
 from skinware_drivers.virtual.hardware import load_emulator  # noqa: E402
 from tests.specification.both_paths import Pair, hand_clock  # noqa: E402
@@ -44,11 +43,15 @@ _NAMESPACE = Namespace(f"fuzz-lines-{os.getpid()}")
 
 def heard(name: str, emulated: dict[str, Any], options: dict[str, Any]) -> tuple[SerialAdapter[Any], SkinTables, bytes]:
     """A driver that has described its emulated device, its skin, and what came over the line."""
-    driver, emulator = load_driver(name), load_emulator(name)
+
+    class Heard(Suite):
+        driver = load_driver(name)
+        emulator = load_emulator(name)
+        driver_options = options
+        emulator_options = emulated
 
     async def scenario(clock: HandClock) -> tuple[SerialAdapter[Any], SkinTables, bytes]:
-        case = Case(driver, emulator, options, emulated, lambda felt: felt)
-        async with Running(case, clock, lively(emulator)) as rig:
+        async with Heard().running(clock) as rig:
             await until_fresh(rig)
             said: list[bytes] = []
             emit = rig.devices.emit

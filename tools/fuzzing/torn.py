@@ -34,8 +34,7 @@ from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Identifier, SequenceNumber
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.rig import play
-from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.rig import Suite, play
 from skinware_drivers.testing.torn_tests import Bursts, FrameLog, find_torn, record
 from skinware_drivers.virtual.hand_clock import HandClock
 

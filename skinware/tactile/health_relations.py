@@ -1,0 +1,302 @@
+"""Find taxels that show touches of others: exchanged, shorted, with crosstalk; and those that lose their values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.tactile.baseline import Calm
+from skinware.tactile.neighbours import NONE, Table
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.int64]
+
+KEPT = 0.95
+"""Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
+APART_S = 1.0
+"""Seconds: touches of a taxel with less time between them count as one."""
+_MOST_EXCHANGED = 64
+"""Weak taxels that are compared with each other."""
+_MOST_COMPARED = 1024
+"""Touched taxels that are compared with their neighbours in one frame."""
+_STEADY = 0.25
+"""Share of a jump: neighbours that change less have not felt it."""
+_BACK = 0.2
+"""Share of a jump: the value is back if it differs by less from the one before."""
+_LOST_S = 2.0
+"""Seconds: what lasts longer is no dropout."""
+_FORGET_S = 600.0
+"""Seconds in which half of the dropouts are forgotten."""
+_BELOW = 0.8
+"""Part of its value that another must show, where a taxel seems to be touched alone."""
+_MOST_SHARE = 1.25
+"""Part of the touches of another, beyond which they are not the reason of its own."""
+_MOST_ALONE = 256
+"""Taxels that are compared with all others of their modules."""
+
+
+def beside(table: Table, taxels: Whole, flags: Flags) -> Flags:
+    """Return (m,) bool: which of m taxels have a neighbour with a flag."""
+    around = table[taxels]
+    found: Flags = (flags[around] & (around != NONE)).any(axis=1)
+    return found
+
+
+class Dropouts:
+    """Counts how often each of n taxels loses its value and has it back soon, while its neighbours keep theirs.
+
+    Args:
+        table: (n, k) neighbours.
+
+    Attributes:
+        count: (n,) float32; half of it is forgotten in ten minutes.
+    """
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        self.count: Floats = np.zeros(len(table), np.float32)
+        self._lost_s = np.full(len(table), -math.inf)
+        self._before, self._lost = np.zeros((2, len(table)), np.float32)
+
+    def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
+        """Take the next frame in.
+
+        Args:
+            now_s: its time.
+            before: (n,) the values before.
+            given: (n,) its values.
+            at_end: (n,) which of them are at an end of the range.
+            calm: what the baseline made of it.
+            far: (n,) a difference from the baseline that is no noise.
+        """
+        jump = given - before
+        moved = np.flatnonzero((np.abs(jump) > 2 * far) & calm.usable)
+        if not len(moved):
+            return
+        around = self._table[moved]
+        changes = np.where(around == NONE, 0, np.abs(jump[around]))
+        moved = moved[(changes <= _STEADY * np.abs(jump[moved])[:, None]).all(axis=1)]
+        back = (now_s - self._lost_s[moved] <= _LOST_S) & (
+            np.abs(given[moved] - self._before[moved])
+            <= _BACK * np.abs(self._before[moved] - self._lost[moved]) + far[moved]
+        )
+        self.count[moved[back]] += 1
+        self._lost_s[moved[back]] = -math.inf
+        rest = calm.baseline[moved]
+        drops = (given[moved] < (rest + before[moved]) / 2) & beside(self._table, moved, calm.touched)
+        lost = moved[~back & (at_end[moved] | drops | (given[moved] < rest - far[moved]))]
+        self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
+
+    def forget(self, passed_s: float) -> None:
+        """Let older dropouts count less."""
+        self.count *= np.float32(0.5 ** (passed_s / _FORGET_S))
+
+
+class Exchanges:
+    """Compares taxels that show little with what is due to others such: it shows which place a signal comes from."""
+
+    def __init__(self, n: int) -> None:
+        self.taxels: Whole = np.zeros(0, np.int64)
+        self._rank: Whole = np.full(n, -1, np.int64)
+        self._moment, self._shown = np.zeros((2, 0, 0))
+        self._due, self._touches = np.zeros((2, 0))
+
+    def watch(self, weak: Whole) -> None:
+        """Compare these; pairs that are compared already go on."""
+        taxels = np.union1d(self.taxels[np.isin(self.taxels, weak)], weak)[:_MOST_EXCHANGED].astype(np.int64)
+        if np.array_equal(taxels, self.taxels):
+            return
+        then, count = self._rank[taxels], len(taxels)
+        here = np.flatnonzero(then >= 0)
+        then = then[here]
+        moment, shown = np.zeros((2, count, count))
+        due, touches = np.zeros((2, count))
+        for new, old in ((moment, self._moment), (shown, self._shown)):
+            new[np.ix_(here, here)] = old[np.ix_(then, then)]
+        due[here], touches[here] = self._due[then], self._touches[then]
+        self._moment, self._shown, self._due, self._touches = moment, shown, due, touches
+        self.taxels = taxels
+        self._rank[:] = -1
+        self._rank[taxels] = np.arange(count)
+
+    def note(self, taxels: Whole, above: Floats) -> None:
+        """Keep what is shown at the hardest moment so far of a touch of these.
+
+        Args:
+            taxels: at their hardest moment.
+            above: (n,) values above the baselines.
+        """
+        rank = self._rank[taxels]
+        self._moment[rank[rank >= 0]] = np.maximum(above[self.taxels], 0)
+
+    def end(self, taxels: Whole, due: npt.NDArray[np.float64]) -> None:
+        """End the touches of some taxels, to which so much was due."""
+        rank = self._rank[taxels]
+        rank, due = rank[rank >= 0], due[rank >= 0]
+        self._shown[rank] = KEPT * self._shown[rank] + due[:, None] * self._moment[rank]
+        self._due[rank] = KEPT * self._due[rank] + due * due
+        self._touches[rank] += due > 0
+        self._moment[rank] = 0
+
+    def found(self, share: float, touches: int) -> tuple[Whole, Whole]:
+        """Return (m,) the taxels that show at least this share of the due of others, and (m,) those others."""
+        known = self._touches >= touches
+        shares = np.where(known[:, None], self._shown, 0) / np.where(known, self._due, 1)[:, None]
+        if not len(shares):
+            return self.taxels, self.taxels
+        place = np.argmax(shares, axis=0)  # of each signal
+        rows = np.flatnonzero(shares[place, np.arange(len(place))] >= share)
+        return self.taxels[rows], self.taxels[place[rows]]
+
+
+class Copies:
+    """Finds taxels that show touches of another of their module, where nothing touches their own neighbours.
+
+    Args:
+        module: (n,) of each taxel.
+        table: (n, k) neighbours.
+    """
+
+    def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
+        self._module, self._table = module, table
+        self._is_known: Flags = (table != NONE).any(axis=1)
+        self._alone: dict[int, _Alone] = {}
+
+    def add(self, now_s: float, above: Floats, calm: Calm, clear: float) -> None:
+        """Take the next frame in.
+
+        Args:
+            now_s: its time.
+            above: (n,) values above the baselines.
+            calm: what the baseline made of it.
+            clear: a touch above it is clear.
+        """
+        touched = np.flatnonzero(calm.touched)
+        felt = touched[above[touched] > clear][:_MOST_COMPARED]
+        if not len(felt):
+            return
+        for taxel in felt[self._is_known[felt] & ~beside(self._table, felt, calm.touched)].tolist():
+            if taxel not in self._alone and self._is_below_another(taxel, felt, above):
+                if len(self._alone) == _MOST_ALONE:
+                    del self._alone[min(self._alone, key=lambda one: self._alone[one].touches)]
+                others = np.flatnonzero(self._module == self._module[taxel])
+                self._alone[taxel] = _Alone(others[~np.isin(others, [taxel, *self._table[taxel]])])
+        if not self._alone:
+            return
+        modules = set(self._module[felt].tolist())
+        watched = [taxel for taxel in self._alone if int(self._module[taxel]) in modules and calm.usable[taxel]]
+        apart = ~beside(self._table, np.array(watched, np.int64), calm.touched)
+        for taxel, is_apart in zip(watched, apart.tolist(), strict=True):
+            if is_apart:
+                self._alone[taxel].add(now_s, taxel, above, calm.touched[taxel] and above[taxel] > clear)
+
+    def _is_below_another(self, taxel: int, felt: Whole, above: Floats) -> bool:
+        others = felt[(self._module[felt] == self._module[taxel]) & (felt != taxel)]
+        return bool((above[others] >= _BELOW * above[taxel]).any())
+
+    def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, npt.NDArray[np.float64]]:
+        """Find taxels that show a part of the touches of others.
+
+        Args:
+            share: the least part.
+            alike: the least correlation of both.
+            touches: that a taxel must have shown while its neighbours were not touched.
+
+        Returns:
+            (m,) the taxels, (m,) those others, and (m,) the part.
+        """
+        found = []
+        for taxel, alone in self._alone.items():
+            other, part, correlation = alone.nearest()
+            if alone.touches >= touches and share <= part <= _MOST_SHARE and correlation >= alike:
+                found.append((taxel, other, part))
+        rows = np.array(found).reshape(-1, 3)
+        return rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2]
+
+
+class _Alone:
+    """What a taxel that seemed to be touched alone shows of each of some others of its module."""
+
+    def __init__(self, others: Whole) -> None:
+        self._others = others
+        self.touches = 0
+        self._touched_s = -math.inf
+        self._own = 0.0
+        self._both, self._squares = np.zeros((2, len(others)))
+
+    def add(self, now_s: float, taxel: int, above: Floats, is_touched: bool) -> None:
+        if is_touched:
+            if now_s - self._touched_s >= APART_S:
+                self.touches += 1
+                self._own *= KEPT
+                self._both *= KEPT
+                self._squares *= KEPT
+            self._touched_s = now_s
+        own, others = max(float(above[taxel]), 0.0), np.maximum(above[self._others], 0)
+        self._own += own * own
+        self._both += own * others
+        self._squares += others * others
+
+    def nearest(self) -> tuple[int, float, float]:
+        """Return the other that is most alike, the part of it that the taxel shows, and the correlation."""
+        size = np.sqrt(self._squares * self._own)
+        alike = np.where(size > 0, self._both, 0) / np.where(size > 0, size, 1)
+        best = int(np.argmax(alike))
+        return int(self._others[best]), float(self._both[best] / max(self._squares[best], 1e-9)), float(alike[best])
+
+
+class Twins:
+    """Compares each of n taxels with its neighbours: two that always show the same are shorted.
+
+    Args:
+        table: (n, k) neighbours.
+    """
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        self._difference, self._size = np.zeros((2, *table.shape), np.float32)
+        self.touches: Whole = np.zeros(len(table), np.int64)
+        self._compared_s = np.full(len(table), -math.inf)
+
+    def add(self, now_s: float, above: Floats, calm: Calm, clear: float) -> None:
+        """Take the next frame in; see :meth:`Copies.add`."""
+        rows = np.flatnonzero(calm.touched & (above > 3 * clear))[:_MOST_COMPARED]
+        if not len(rows) or not self._table.shape[1]:
+            return
+        around = self._table[rows]
+        is_there = (around != NONE) & calm.usable[around]
+        own, others = above[rows, None], above[around]
+        new = now_s - self._compared_s[rows] >= APART_S
+        self._compared_s[rows] = now_s
+        self.touches[rows] += new
+        for sums in (self._difference, self._size):
+            sums[rows[new]] *= KEPT
+        self._difference[rows] += is_there * (own - others) ** 2
+        self._size[rows] += is_there * (own * own + others * others)
+
+    def found(self, same: float, other: float, touches: int) -> tuple[Whole, Whole]:
+        """Find pairs that always show the same.
+
+        Args:
+            same: two are the same whose squared differences are less than this part of their squares.
+            other: the median of the other neighbours differs by at least this part.
+            touches: that are needed.
+
+        Returns:
+            (m,) taxels, and (m,) those with which they are the same.
+        """
+        known = np.flatnonzero(self.touches >= touches)
+        if not len(known) or not self._table.shape[1]:
+            return known[:0], known[:0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            part = self._difference[known] / self._size[known]
+        part = np.where(np.isnan(part), math.inf, part)
+        nearest = np.argmin(part, axis=1)
+        ordered = np.sort(part, axis=1)
+        count = np.isfinite(ordered).sum(axis=1)
+        median = ordered[np.arange(len(known)), np.maximum(count - 1, 0) // 2]
+        rows = np.flatnonzero((ordered[:, 0] <= same) & (median >= other))
+        return known[rows], self._table[known[rows], nearest[rows]].astype(np.int64)

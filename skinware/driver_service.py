@@ -156,7 +156,11 @@ def recorded_head(name: str, structure: Structure, *, driver_type: str, period_n
 def counters_of(
     frame: DriverSnapshot, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
 ) -> tuple[list[str], npt.NDArray[np.uint64]]:
-    """Return names and (count, names) numbers of the counters of each ``bus`` or ``patch``, if there are any."""
+    """Return counters in a snapshot: their names, and (count, names) numbers; no names if the driver has none.
+
+    Args:
+        what: ``bus`` or ``patch``.
+    """
     names = _names(tables, f"{what}_counter_name")
     try:
         return names, frame.column(f"{what}_counters").reshape(count, len(names))

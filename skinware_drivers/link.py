@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +59,18 @@ class Heard(NamedTuple):
     length: int
 
 
+class BusLog(logging.LoggerAdapter[logging.Logger]):
+    """The log of drivers; messages begin with the name of a bus."""
+
+    def __init__(self, bus_name: str) -> None:
+        super().__init__(logging.getLogger("skinware.driver"))
+        self._bus_name = bus_name
+
+    def log(self, level: int, msg: object, *args: object, **more: Any) -> None:
+        """Log a message with its arguments."""
+        self.logger.log(level, f"%s: {msg}", self._bus_name, *args, **more)
+
+
 class Link:
     """One bus for a driver's handshakes. Everything runs in the runner's event loop, without threads.
 
@@ -67,10 +80,14 @@ class Link:
     Args:
         bus: the bus.
         pace_per_ms: frames that may be sent within a millisecond on average.
+
+    Attributes:
+        log: the driver's log; its messages begin with the name of the bus.
     """
 
     def __init__(self, bus: Bus, pace_per_ms: float = DEFAULT_PACE_PER_MS) -> None:
         self._bus = bus
+        self.log = BusLog(bus.name)
         self._gap_s = 1e-3 / pace_per_ms
         self._free_at_s = 0.0
         self._wanted: Sequence[Filter] | None = None

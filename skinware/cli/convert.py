@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -19,10 +18,15 @@ from skinware.cli._terminal import echo, print_json
 if TYPE_CHECKING:
     from skinware.conversion import Selection
     from skinware.conversion.converting import Converted
+    from skinware.conversion.learning import LearningSet
 
 
 def _window(text: str) -> int:
-    """Return a number of frames; 0: all."""
+    """Return a number of frames; 0: all.
+
+    Raises:
+        click.BadParameter: the text is no such number.
+    """
     if text == "all":
         return 0
     if not text.isdecimal() or not int(text):
@@ -94,6 +98,38 @@ _learning_options = cli.options(
         "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."
     ),
 )
+_NAMES = (
+    *("also", "fps", "task", "episode", "episodes", "gap"),
+    *("window", "join", "match", "within", "at", "each_structure"),
+)
+
+
+def _learning_set(options: Mapping[str, Any]) -> tuple[list[Path], LearningSet]:
+    """Return further recordings, and the set to make of all of them.
+
+    Raises:
+        ConfigurationError: an option is wrong.
+        OSError: the file of episodes cannot be read.
+    """
+    from skinware.conversion.learning import LearningSet, interval_of, join_of, read_intervals
+
+    intervals = [interval_of(text) for text in options["episode"]]
+    if options["episodes"] is not None:
+        intervals += read_intervals(options["episodes"])
+    return list(options["also"]), LearningSet(
+        fps=options["fps"],
+        task=options["task"],
+        window=options["window"],
+        intervals=intervals,
+        gap_s=options["gap"],
+        joins=[join_of(text) for text in options["join"]],
+        match=options["match"],
+        within_s=options["within"],
+        at=options["at"],
+        each_structure=options["each_structure"],
+    )
+
+
 _PROGRESS_S = 2.0
 _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap", "foxglove", "ros2")
 _WIRE_FORMATS = ("candump", "pcapng")
@@ -114,7 +150,7 @@ _LEARNING_FORMATS = ("lerobot",)
     "skin-convert data.csv --map map.toml --to mcap         a recording of them",
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
-@cli.names_argument
+@click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option(
     "--to",
     "format_name",
@@ -131,7 +167,11 @@ _LEARNING_FORMATS = ("lerobot",)
 @click.option("--guess", is_flag=True, help="Print a MAP for FILE, with a comment for each guess.")
 @cli.output_option("The new file, or folder for csv, parquet, ros2 and lerobot.  [default: beside FILE]", metavar="OUT")
 @click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; may be repeated.")
-@cli.parts_options
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated.")
+@click.option(
+    "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
+)
+@cli.regions_option
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @_learning_options
@@ -161,7 +201,7 @@ def command(
 
     FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
-    from skinware.conversion import Selection, convert, convert_wires
+    from skinware.conversion import Selection
 
     if guess:
         cli.refuse_others("--guess", ["file"])
@@ -175,19 +215,17 @@ def command(
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
     source_of = click.get_current_context().get_parameter_source
-    given = [name for name in learning if source_of(name) is not ParameterSource.DEFAULT]
+    given = [name for name in _NAMES if source_of(name) is not ParameterSource.DEFAULT]
     if given and format_name not in _LEARNING_FORMATS:
         raise click.UsageError(f"--{given[0].replace('_', '-')} is for --to {', '.join(_LEARNING_FORMATS)}")
     stop = Event()
     with cli.signals_end(stop.set):  # not inside a library
-        time_and_end: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "is_stopped": stop.is_set}
         if map_file is not None:
             converted = _imported(file, map_file, output, format_name, stop.is_set)
-        elif format_name in _LEARNING_FORMATS:
-            converted = _learning_set(file, output, selection, learning, time_and_end)
         else:
-            write = convert_wires if format_name in _WIRE_FORMATS else convert
-            converted = write(file, output, format_name, selection, **time_and_end)
+            converted = _written(
+                file, output, format_name, selection, learning, start_s=start_s, end_s=end_s, is_stopped=stop.is_set
+            )
     for note in converted.notes:
         cli.warn(note)
     in_episodes = {"episodes": converted.episodes} if converted.episodes is not None else {}
@@ -224,33 +262,24 @@ def _imported(
     return convert_foreign(file, output, format_name, map_file, report=report, is_stopped=is_stopped)
 
 
-def _learning_set(
-    file: Path, output: Path | None, selection: Selection, options: dict[str, Any], time_and_end: dict[str, Any]
+def _written(
+    file: Path,
+    output: Path | None,
+    format_name: str,
+    selection: Selection,
+    learning: dict[str, Any],
+    **time_and_end: Any,
 ) -> Converted:
-    from skinware.conversion.learning import (
-        LearningSet,
-        convert_to_learning_set,
-        interval_of,
-        join_of,
-        read_intervals,
-    )
+    from skinware.conversion import convert, convert_wires
 
-    intervals = [interval_of(text) for text in options["episode"]]
-    if options["episodes"] is not None:
-        intervals += read_intervals(options["episodes"])
-    wanted = LearningSet(
-        fps=options["fps"],
-        task=options["task"],
-        window=options["window"],
-        intervals=intervals,
-        gap_s=options["gap"],
-        joins=[join_of(text) for text in options["join"]],
-        match=options["match"],
-        within_s=options["within"],
-        at=options["at"],
-        each_structure=options["each_structure"],
-    )
-    return convert_to_learning_set([file, *options["also"]], output, wanted, selection, **time_and_end)
+    if format_name in _LEARNING_FORMATS:
+        from skinware.conversion.learning import convert_to_learning_set
+
+        also, wanted = _learning_set(learning)
+        return convert_to_learning_set([file, *also], output, wanted, selection, **time_and_end)
+    write = convert_wires if format_name in _WIRE_FORMATS else convert
+    return write(file, output, format_name, selection, **time_and_end)
 
 
-main = partial(cli.run, command)
+def main() -> None:
+    cli.run(command)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,10 @@ import numpy.typing as npt
 from skinware.limits import LIMITS
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
-from skinware.recording.tracks import ChunkSource
 from skinware.wire import WireItem, read_pieces
+
+if TYPE_CHECKING:
+    from skinware.recording.reading import Recording
 
 _HEADER = struct.Struct("<QQqQ")
 """Generation and sequence of the sample, its time of publication, frames or bytes missed on the bus so far."""
@@ -81,7 +83,7 @@ class WireTrack:
         driver, bus: as above.
     """
 
-    def __init__(self, recording: ChunkSource, driver: str, bus: str, channel: int) -> None:
+    def __init__(self, recording: Recording, driver: str, bus: str, channel: int) -> None:
         self._recording = recording
         self.driver: str = driver
         self.bus: str = bus

@@ -133,11 +133,7 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     watch = ZeroWatch
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hand of the option ``model``, or of the frames that are heard.
-
-        Raises:
-            BusError: no hand is heard, or two.
-        """
+        """Return the hand of the option ``model``, or of the frames that are heard."""
         model = self.options.model
         of_tips = [Match(one) for ids in TIPS.values() for one in ids]
         with link.follow(*of_tips) as frames:
@@ -179,10 +175,9 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             )
         most = max((counted[one] for one in tips | pads), default=0)
         if most > _TWICE * self.options.learn_s / self.period_s + 1:
-            log.warning(
-                "%s: a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix:"
+            link.log.warning(
+                "a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix:"
                 " give each a bus of its own; if there is one hand, set its period_ms",
-                link.bus_name,
                 1e3 * self.options.learn_s / most,
                 1e3 * self.period_s,
             )

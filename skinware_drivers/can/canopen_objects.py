@@ -31,11 +31,7 @@ _NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
 
 
 class SdoAborted(BusError):
-    """The device refused to read or write an object.
-
-    Attributes:
-        code: CiA 301 abort code.
-    """
+    """The device refused to read or write an object; ``code``: CiA 301 abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         super().__init__(f"{what}: {SdoAbortedError.CODES.get(code, 'refused')} (abort code 0x{code:08X})")
@@ -43,11 +39,7 @@ class SdoAborted(BusError):
 
 
 class SdoClient:
-    """Access to one device's object dictionary; one transfer at a time.
-
-    Args:
-        node: node id, 1 to 127.
-    """
+    """Access to one device's object dictionary; one transfer at a time. ``node``: node id, 1 to 127."""
 
     def __init__(self, link: Link, node: int) -> None:
         self.node = node
@@ -55,13 +47,6 @@ class SdoClient:
         self._busy = asyncio.Lock()
 
     async def read(self, index: int, subindex: int = 0) -> bytes:
-        """Return the bytes of an object.
-
-        Raises:
-            SdoAborted: the device refuses.
-            HandshakeTimeout: no answer.
-            BusSendError: as ``Link.send``.
-        """
         target = struct.pack("<HB", index, subindex)
         async with self._busy:
             answer = await self._ask(target, bytes([sdo.REQUEST_UPLOAD]) + target + bytes(4), sdo.RESPONSE_UPLOAD)
@@ -136,13 +121,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class Tpdo:
-    """One TPDO.
+    """One TPDO, with its mapped objects in order.
 
     Attributes:
-        number: from 1.
         identifier: of its frames, with ``EXTENDED_FLAG`` if it has 29 bits.
         transmission: transmission type: 0 to 240 upon SYNC, 254 and 255 by event or event timer.
-        entries: the mapped objects, in order.
     """
 
     number: int
@@ -154,11 +137,8 @@ class Tpdo:
     def make(number: int, cob_id: int, transmission: int, entries: Iterable[int]) -> Tpdo | None:
         """Return the TPDO of numbers in the object dictionary; None if it is not in use.
 
-        Args:
-            number: from 1.
-            cob_id: 0x1800 + number - 1, subindex 1.
-            transmission: the same object, subindex 2.
-            entries: 0x1A00 + number - 1: index << 16 | subindex << 8 | bits.
+        ``cob_id`` and ``transmission`` are in 0x1800 + number - 1, subindices 1 and 2; ``entries`` (index << 16 |
+        subindex << 8 | bits) in 0x1A00 + number - 1.
         """
         mapped = tuple(Entry(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries)
         if cob_id & _NOT_IN_USE or not mapped:
@@ -190,14 +170,7 @@ def tpdo_numbers(dictionary: ObjectDictionary) -> list[int]:
 
 
 class PdoMap:
-    """The frames, types and patches of all nodes of a bus.
-
-    Args:
-        default_type: type of objects whose name contains none.
-
-    Raises:
-        ConfigurationError: no mapped object is a number, or sensors of one type differ in scale.
-    """
+    """The frames, types and patches of all nodes of a bus; objects whose name contains no type are of a default."""
 
     def __init__(self, dictionary: ObjectDictionary, nodes: Mapping[int, Sequence[Tpdo]], default_type: str) -> None:
         self._dictionary = dictionary
@@ -210,10 +183,17 @@ class PdoMap:
         self.dtype: np.dtype[Any] = _common_dtype(known)
         self.types: list[SensorType] = self._types(known)
         self.layout = Layout(tuple(self._frames(nodes)))
-        self.patches: tuple[Patch, ...] = tuple(
-            Patch(f"node {node}", [self._module(node, tpdo) for tpdo in tpdos], key=node)
-            for node, tpdos in nodes.items()
-        )
+        patches = []
+        for node, tpdos in nodes.items():
+            modules = []
+            for tpdo in tpdos:
+                channels: list[Sensor | None] = []
+                for entry in tpdo.entries:
+                    variable, uid = self._sensors[entry], node << 24 | entry.index << 8 | entry.subindex
+                    channels.append(None if variable is None else Sensor(self._type_name(variable), uid))
+                modules.append(Module(channels, key=tpdo.number, kind="tpdo"))
+            patches.append(Patch(f"node {node}", modules, key=node))
+        self.patches: Sequence[Patch] = patches
 
     def _variable(self, entry: Entry) -> ODVariable | None:
         """Return the sensor behind a mapped object; None if it is no sensor."""
@@ -242,14 +222,6 @@ class PdoMap:
                 CATALOGUE[name].measured(unit=unit, scale=same[0].factor, minimum=min(ends), maximum=max(ends))
             )
         return types
-
-    def _module(self, node: int, tpdo: Tpdo) -> Module:
-        channels = []
-        for entry in tpdo.entries:
-            variable = self._sensors[entry]
-            uid = node << 24 | entry.index << 8 | entry.subindex
-            channels.append(None if variable is None else Sensor(self._type_name(variable), uid))
-        return Module(channels, key=tpdo.number, kind="tpdo")
 
     def _frames(self, nodes: Mapping[int, Sequence[Tpdo]]) -> Iterable[Frame]:
         """Yield one kind of frame for all nodes with one TPDO at predefined identifiers, else one for each node."""
@@ -297,7 +269,6 @@ class PdoMap:
 
 
 def _capacity(variable: ODVariable) -> tuple[float, float]:
-    """Return the least and greatest raw value of a data type."""
     if variable.data_type in datatypes.FLOAT_TYPES:
         return -np.inf, np.inf
     bits = len(variable)

@@ -10,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from typing import Annotated
 
@@ -27,7 +26,6 @@ from skinware_drivers import Link, Match, Notice, Options, Patch, Poll
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.canopen_objects import PdoMap, SdoAborted, SdoClient, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.fields import Reply
-from skinware_drivers.link import Heard
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -35,6 +33,7 @@ FIRST_NODE, LAST_NODE = 1, 127
 _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
 _BOOT_UP, _OPERATIONAL = 0, 5
 _LAST_SYNCHRONOUS = 240
+_NODES_SEND = (0x700, 0x180, 0x280, 0x380, 0x480)
 _MOST_ERRORS_LOGGED = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
@@ -93,7 +92,10 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         The TPDOs of the EDS are assumed by a listener, and for named nodes that do not answer while others do.
         """
         if link.listen_only:
-            heard = self.options.nodes or _nodes_heard(await link.listen(self.options.learn_s))
+            heard = set(self.options.nodes)
+            if not heard:  # nodes with heartbeats, and with TPDOs of the predefined connection set
+                identifiers = {frame.identifier for frame in await link.listen(self.options.learn_s)}
+                heard = {i & 0x7F for i in identifiers if i < 0x800 and i & 0x780 in _NODES_SEND and i & 0x7F}
             self._tpdos = {node: self._default(node) for node in sorted(heard)}
         else:
             asked = self.options.nodes or range(FIRST_NODE, LAST_NODE + 1)
@@ -133,19 +135,13 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         return await self._is_there(patch.key)
 
     async def revive(self, link: Link, patch: Patch) -> None:
-        """Set up and start one node.
-
-        Raises:
-            MappingChanged: its TPDOs have changed.
-        """
         if await self._read_tpdos(patch.key) != self._tpdos[patch.key]:
-            log.error("%s: the TPDOs of %s have changed: start the driver again", link.bus_name, patch.name)
+            link.log.error("the TPDOs of %s have changed: start the driver again", patch.name)
             raise MappingChanged(f"{patch.name}: other TPDOs than before")
         await self._configure(link, patch.key)
         await link.send(0x000, bytes((_START, patch.key)))
 
     async def attend(self, link: Link) -> None:
-        """Follow boot-up, heartbeat and EMCY of all nodes."""
         nodes = {patch.key: _NodeState(patch, self.tell) for patch in self.patches}
         matches = [Match(base + node) for node in nodes for base in (0x700, 0x080)]
         loss_s = max(_LOST_HEARTBEATS * self.options.heartbeat_ms / 1e3, _LEAST_HEARTBEAT_LOSS_S)
@@ -211,20 +207,12 @@ class _NodeState:
         self._errors: set[int] = set()
 
     def hear(self, frame: Reply) -> None:
-        """Take a heartbeat, a boot-up message, or an EMCY."""
         if frame.identifier < 0x700:
             self._hear_emergency(frame.payload)
-        elif len(frame.payload) == 1:
-            self._hear_state(frame.payload[0] & 0x7F)
-
-    def look(self, time_s: float, loss_s: float) -> None:
-        """Report the node as lost if its heartbeat is overdue; a heartbeat must have been heard before."""
-        if self._heard_s is not None and time_s - self._heard_s > loss_s:
-            self._heard_s = None
-            self._is_operational = False
-            self._tell(self._patch, Notice.LOST)
-
-    def _hear_state(self, state: int) -> None:
+            return
+        if len(frame.payload) != 1:
+            return
+        state = frame.payload[0] & 0x7F
         if state == _BOOT_UP:
             self._heard_s = None
             self._errors.clear()
@@ -234,6 +222,13 @@ class _NodeState:
             if self._is_operational and state != _OPERATIONAL:
                 self._tell(self._patch, Notice.LOST)
         self._is_operational = state == _OPERATIONAL
+
+    def look(self, time_s: float, loss_s: float) -> None:
+        """Report the node as lost if its heartbeat is overdue; a heartbeat must have been heard before."""
+        if self._heard_s is not None and time_s - self._heard_s > loss_s:
+            self._heard_s = None
+            self._is_operational = False
+            self._tell(self._patch, Notice.LOST)
 
     def _hear_emergency(self, payload: bytes) -> None:
         if len(payload) != 8:
@@ -258,10 +253,3 @@ def _read_eds(path: str, node: int) -> ObjectDictionary:
         raise ConfigurationError(f"EDS {source}: {error.strerror}") from None
     except Exception as error:  # noqa: BLE001 - the exceptions of the parser are not documented
         raise ConfigurationError(f"EDS {source} cannot be read: {error}") from None
-
-
-def _nodes_heard(heard: Counter[Heard]) -> set[int]:
-    """Return the node ids in heartbeats and in TPDOs of the predefined connection set."""
-    functions = (0x700, 0x180, 0x280, 0x380, 0x480)
-    identifiers: Iterable[int] = (frame.identifier for frame in heard)
-    return {i & 0x7F for i in identifiers if i < 0x800 and i & 0x780 in functions and i & 0x7F}

@@ -21,7 +21,6 @@ program asked for them. Usually the hand's own program asks, and this driver sen
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -39,8 +38,6 @@ from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, TouchQuestion, e
 from skinware_drivers.hand import Hand
 from skinware_drivers.link import Heard
 from skinware_drivers.polling import ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 RIGHT, LEFT = 0x27, 0x28
 _KIND_OF_TOUCH, _SERIAL_NUMBER = 0xB0, 0xC0
@@ -123,11 +120,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         ]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hands that answer, or whose touch is heard.
-
-        Raises:
-            BusError: there is no hand, no touch that can be read, or the hands differ.
-        """
         found = await self._find(link, self._wanted)
         if not found:
             names = ", ".join(map(identifier_text, self._wanted))
@@ -158,10 +150,9 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
                 frame = await others.get()
                 if not has_warned and frame.payload in questions:
                     has_warned = True
-                    log.warning(
-                        "%s: another program asks %s for its touch, too: answers to both get mixed up, and questions"
+                    link.log.warning(
+                        "another program asks %s for its touch, too: answers to both get mixed up, and questions"
                         " collide with answers; leave out ask=yes, and this driver shows what the other one asks for",
-                        link.bus_name,
                         _name(frame.identifier),
                     )
 
@@ -181,11 +172,6 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return self.options.ask and not link.listen_only
 
     def _take(self, found: Mapping[int, _Found]) -> None:
-        """Describe these hands.
-
-        Raises:
-            BusError: they have different kinds of touch.
-        """
         if len({of.touch for of in found.values()}) > 1:
             kinds = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
             raise BusError(
@@ -232,11 +218,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         return found
 
     async def _ask_hand(self, link: Link, hand: int) -> _Found | None:
-        """Return the kind of touch for which this hand answers; None if it does not answer.
-
-        Raises:
-            BusError: it has no touch that can be read.
-        """
+        """Return the kind of touch for which this hand answers; None if it does not answer."""
         names: Sequence[str] = (self.options.touch,)
         if self.options.touch == "auto":
             names = await self._likely(link, hand)

@@ -5,7 +5,6 @@ All frames to and from a hand have one identifier; byte 0 is the command. Source
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,6 +29,7 @@ _HAND, _COMMAND = Bits(0, 11), Bits(0, 8, byte=0)
 _LONGEST_REPLY_S, _LONGEST_RUNS_S, _RUNS_WAIT_S = 0.008, 0.02, 0.05
 _RUN, _SUMS, _ASKS_FOR_RUNS = 5, 0xFF, 4
 _DENSE_PITCH_M = 0.0015
+_PERIOD_S = 0.05  # a usual time between two updates
 _VENDOR = 0x27027 << 12
 TANGENTIAL = SensorType("tangential_force", _VENDOR | 1, "counts", minimum=0, maximum=255)
 DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0, maximum=254)
@@ -51,52 +51,29 @@ class TouchQuestion(NamedTuple):
     patience_s: float = 0.02
 
     def end(self, hand: int) -> Match:
-        """Return the match for the last frame of the reply of a hand."""
         return Match(hand, prefix=self.last, shortest=self.shortest)
 
 
-class TouchKind(ABC):
-    """One kind of touch.
+@dataclass(frozen=True)
+class _Matrices:
+    """A matrix for each part.
 
     Attributes:
-        period_s: a usual time between two updates.
+        finger: rows and columns of a finger's matrix.
+        palm: rows and columns of the palm's matrix.
     """
 
-    types: Sequence[SensorType]
-    period_s = 0.05
-
-    @abstractmethod
-    def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
-        """Return the modules of a hand that has these parts; ``hand`` is its identifier."""
-
-    @abstractmethod
-    def layout(self, identifier: Identifier) -> Layout:
-        """Return the layout of the frames of hands with such identifiers."""
-
-    @abstractmethod
-    def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
-        """Return the questions for these parts, in order."""
-
-    @abstractmethod
-    def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
-        """Return nominal places of a hand's sensors."""
-
-    @abstractmethod
-    def known(self, heard: Beginnings) -> int:
-        """Return how many of a hand's frames fit this kind of touch."""
-
-
-class _OfMatrices(TouchKind):
-    """A matrix for each part."""
-
+    finger: tuple[int, int]
+    palm: tuple[int, int]
     types = (FORCE,)
+    period_s = _PERIOD_S
     pitch_m = PITCH_M
 
-    @abstractmethod
     def size(self, part: str) -> tuple[int, int]:
-        """Return rows and columns of a part's matrix."""
+        return self.palm if part == "palm" else self.finger
 
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
+        """Return the modules of a hand that has these parts; ``hand`` is its identifier."""
         found = []
         for part in parts:
             rows, columns = self.size(part)
@@ -113,63 +90,42 @@ class _OfMatrices(TouchKind):
         return Geometry.joined(found)
 
 
-@dataclass(frozen=True)
-class RowMatrices(_OfMatrices):
-    """A matrix for each part, one frame for each of its rows, in order (second generation).
-
-    Attributes:
-        rows: of a matrix, at most 12.
-        columns: of a matrix, at most 6.
-    """
-
-    rows: int
-    columns: int
-
-    def size(self, part: str) -> tuple[int, int]:  # noqa: ARG002
-        return self.rows, self.columns
+class RowMatrices(_Matrices):
+    """One frame for each row, in order (second generation): at most 12 rows of at most 6, also of the palm."""
 
     def layout(self, identifier: Identifier) -> Layout:
         """Return a layout that publishes a matrix when all its rows have come, the first one first."""
+        n_rows, n_columns = self.finger
         rows = [
             Frame(
-                f"row {row} of {self.rows}",
+                f"row {row} of {n_rows}",
                 [identifier, Byte(1, row << 4)],
-                [2 + self.columns],
-                Values(2, "u1", self.columns, to=range(row * self.columns, (row + 1) * self.columns)),
+                [2 + n_columns],
+                Values(2, "u1", n_columns, to=range(row * n_columns, (row + 1) * n_columns)),
                 patch=_HAND,
                 module=_COMMAND,
                 flags=[_SATURATED],
             )
-            for row in range(self.rows)
+            for row in range(n_rows)
         ]
         return Layout([_other(identifier), *rows], Cycle([row.name for row in rows], maximum_age_s=_LONGEST_REPLY_S))
 
     def questions(self, parts: Sequence[str]) -> list[TouchQuestion]:
         commands = [MATRIX + PARTS.index(part) for part in parts]
-        size, last = self.rows << 4 | self.columns, self.rows - 1 << 4
-        return [TouchQuestion(bytes((command, size)), bytes((command, last)), 2 + self.columns) for command in commands]
+        n_rows, n_columns = self.finger
+        size, last = n_rows << 4 | n_columns, n_rows - 1 << 4
+        return [TouchQuestion(bytes((command, size)), bytes((command, last)), 2 + n_columns) for command in commands]
 
     def known(self, heard: Beginnings) -> int:
-        """Return the number of rows; 0 if a program asks for runs, which look like rows of six."""
-        return 0 if _of_matrices(heard, _ASKS_FOR_RUNS) else _of_matrices(heard, 2 + self.columns)
+        """Return how many rows were heard; 0 if a program asks for runs, which look like rows of six."""
+        return 0 if _of_matrices(heard, _ASKS_FOR_RUNS) else _of_matrices(heard, 2 + self.finger[1])
 
 
-@dataclass(frozen=True)
-class RunMatrices(_OfMatrices):
-    """A matrix for each part, in runs of five values that go on from one row to the next (third generation, G20).
+class RunMatrices(_Matrices):
+    """Runs of five values that go on from one row to the next (third generation, G20)."""
 
-    Attributes:
-        finger: rows and columns of a finger's matrix.
-        palm: rows and columns of the palm's matrix.
-    """
-
-    finger: tuple[int, int]
-    palm: tuple[int, int]
     period_s = 0.1
     pitch_m = _DENSE_PITCH_M
-
-    def size(self, part: str) -> tuple[int, int]:
-        return self.palm if part == "palm" else self.finger
 
     def layout(self, identifier: Identifier) -> Layout:
         """Return a layout that publishes a matrix when all its runs have come, in order; sums are skipped."""
@@ -210,7 +166,7 @@ def _runs(name: str, when: Sequence[Condition], rows: int, columns: int) -> list
 
 
 @dataclass(frozen=True)
-class FingerValues(TouchKind):
+class FingerValues:
     """Four values for each finger; a frame has one of them for all fingers (first generation).
 
     Attributes:
@@ -218,6 +174,7 @@ class FingerValues(TouchKind):
     """
 
     command: int
+    period_s = _PERIOD_S
     types = (FORCE, TANGENTIAL, DIRECTION, PROXIMITY.measured(unit="counts", minimum=0, maximum=255))
 
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
@@ -250,9 +207,10 @@ class FingerValues(TouchKind):
         return sum(n for (first, length), n in heard.items() if first in commands and length in (6, 7))
 
 
+TouchKind = RowMatrices | RunMatrices | FingerValues
 TOUCH: dict[str, TouchKind] = {
-    "12x6": RowMatrices(12, 6),
-    "10x4": RowMatrices(10, 4),
+    "12x6": RowMatrices((12, 6), (12, 6)),
+    "10x4": RowMatrices((10, 4), (10, 4)),
     "fingers": FingerValues(0x20),
     "fingers_90": FingerValues(0x90),
     "hand_23x9": RunMatrices((23, 9), (28, 20)),

@@ -80,12 +80,6 @@ class PythonCanBus(Bus):
         self._echoes: deque[tuple[int, int, bytes]] = deque()  # of sent frames: time, identifier, payload
 
     def open(self) -> None:
-        """Open the interface and start taking its messages.
-
-        Raises:
-            ConfigurationError: the interface refuses one of the options (the first time only).
-            BusNotAvailable: the interface's library, adapter or channel is missing.
-        """
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
         if self.payload_size > 8:
             keywords.setdefault("fd", True)
@@ -112,18 +106,15 @@ class PythonCanBus(Bus):
         )
 
     def check(self) -> None:
-        """Check that messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is not None and messages.failure is not None and not messages.queue:
             why = f"bus {self.interface}:{self.channel} failed: {messages.failure}"
             raise BusNotAvailable(why, reason=BusReason.FAILED)
 
     def fileno(self) -> int:
-        """An eventfd that is readable while messages wait, -1 while closed."""
         return self._messages.fd if self._messages is not None else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the queued messages; see :class:`skinware_drivers.bus.Bus`."""
         messages = self._messages
         if messages is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
@@ -153,7 +144,6 @@ class PythonCanBus(Bus):
         return count
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         bus = self.may_send_by(self._bus)
         message = can.Message(
             arbitration_id=identifier & ~EXTENDED_FLAG,
@@ -232,11 +222,7 @@ class _MessageQueue:
         os.close(self.fd)
 
     def _take_all(self) -> None:
-        """Take messages. One that the library refuses is counted, unless all that follow are refused, too.
-
-        Raises:
-            Exception: of the library, when its interface has failed.
-        """
+        """Take messages. One that the library refuses is counted, unless all that follow are refused, too."""
         failures = 0
         while not self._closing.is_set():
             try:
@@ -249,27 +235,26 @@ class _MessageQueue:
                     raise
                 self._counters.refused += 1
                 continue
-            if message is not None:
-                failures = 0
-                self._take(message)
-
-    def _take(self, message: can.Message) -> None:
-        if len(self.queue) >= _QUEUE_FRAMES:
-            self._counters.dropped += 1
-            return
-        identifier = message.arbitration_id
-        for is_so, flag in (
-            (message.is_extended_id and not message.is_error_frame, EXTENDED_FLAG),
-            (message.is_remote_frame, REMOTE_FLAG),
-            (message.is_error_frame, ERROR_FLAG),
-        ):
-            identifier |= flag if is_so else 0
-        payload = b"" if message.is_remote_frame else bytes(message.data)
-        flags = IS_FD if message.is_fd else 0
-        if message.is_fd:
-            flags |= (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)
-        self.queue.append((now_ns(), identifier, payload, flags))
-        os.eventfd_write(self.fd, 1)
+            if message is None:
+                continue
+            failures = 0
+            if len(self.queue) >= _QUEUE_FRAMES:
+                self._counters.dropped += 1
+                continue
+            identifier = message.arbitration_id
+            for is_so, flag in (
+                (message.is_extended_id and not message.is_error_frame, EXTENDED_FLAG),
+                (message.is_remote_frame, REMOTE_FLAG),
+                (message.is_error_frame, ERROR_FLAG),
+            ):
+                identifier |= flag if is_so else 0
+            payload = b"" if message.is_remote_frame else bytes(message.data)
+            flags = 0
+            if message.is_fd:
+                flags = IS_FD | (_SWITCHED if message.bitrate_switch else 0)
+                flags |= _PASSIVE if message.error_state_indicator else 0
+            self.queue.append((now_ns(), identifier, payload, flags))
+            os.eventfd_write(self.fd, 1)
 
 
 def _typed(text: str) -> int | float | bool | str:

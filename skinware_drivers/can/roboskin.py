@@ -8,9 +8,8 @@ robotology/icub-firmware embot_app_application_theSkin.cpp.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 import numpy as np
@@ -55,8 +54,6 @@ from skinware_drivers.can.roboskin_setup import (
 )
 from skinware_drivers.description import SkinTables
 from skinware_drivers.link import Heard
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _AFTER_CONFIGURATION_S = 0.5
 _BETWEEN_SPECIALS_S = 0.01
@@ -103,7 +100,16 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         if self.options.boards:
             await self._ask_named(link)
         else:
-            self._take_found(link, {b.address: b.board_type for b in await discover(link) if not b.is_loader})
+            known = self._board_type
+            found = [b for b in await discover(link) if not b.is_loader and FIRST_BOARD <= b.address <= LAST_BOARD]
+            self._board_type = {board.address: board.board_type for board in found}
+            self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
+            for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
+                link.log.warning(  # START makes a strain board send
+                    "board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
+                    board,
+                    self._board_type[board],
+                )
         if not self._has_warned:
             set_ups = self._set_ups(self._boards)
             for set_up in set_ups:
@@ -220,7 +226,6 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 await _send(link, set_up.board, set_up.inertial_set_up())
 
     async def _switch(self, link: Link, patch: Patch, on: bool) -> None:
-        """Make the sensors of one patch send or be silent."""
         (set_up,) = self._set_ups([board_of(patch)])
         if is_inertial(patch):
             await _send(link, set_up.board, set_up.inertial_set_up() if on else ())
@@ -244,46 +249,29 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         if len(missing) == len(self._boards):
             raise HandshakeTimeout(f"none of the boards {', '.join(map(str, self._boards))} answers")
 
-    def _take_found(self, link: Link, board_types: Mapping[int, int]) -> None:
-        """Take the boards that have skin; others are left alone, as START makes a strain board send."""
-        known = self._board_type
-        self._board_type = {
-            board: board_types[board] for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in board_types
-        }
-        self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in BOARD_TYPES)
-        for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
-            log.warning(
-                "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
-                link.bus_name or "bus",
-                board,
-                self._board_type[board],
-            )
-
     def _warn(self, link: Link, set_up: BoardSetUp) -> None:
         """Log triangles that are off, and inertial sensors of another kind than the options say."""
-        where = f"{link.bus_name}: board {set_up.board}"
         off = set(range(TRIANGLES)) - set_up.enabled
         if set_up.wiped:
-            log.warning(
-                "%s: triangles %s are off: its special configuration switched them off,"
+            link.log.warning(
+                "board %d: triangles %s are off: its special configuration switched them off,"
                 " and nothing switches them on again",
-                where,
+                set_up.board,
                 runs_text(set_up.wiped),
             )
         if off - set_up.wiped:
-            log.info("%s: triangles %s are off, as configured", where, runs_text(off - set_up.wiped))
+            link.log.info("board %d: triangles %s are off, as configured", set_up.board, runs_text(off - set_up.wiped))
         known = self._board_type.get(set_up.board)
         kind = "mtb3" if known == MTB3_TYPE else "mtb4"
         if set_up.inertial and known is not None and kind != self.options.inertial_scale:
-            log.warning(
-                "%s: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
-                where,
+            link.log.warning(
+                "board %d: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
+                set_up.board,
                 kind.upper(),
                 self.options.inertial_scale.upper(),
             )
 
     def patches_set_up(self, boards: Iterable[int]) -> list[Patch]:
-        """Return the patches of these boards, as the options set them up."""
         patches = []
         for set_up in self._set_ups(sorted(boards)):
             is_old = self.options.old_style and not self._is_mtb4(set_up.board)

@@ -70,9 +70,6 @@ async def discover(link: Link) -> list[Board]:
     """Return the boards that answer a discovery, boot loaders too. It silences every MTB3 that is sending.
 
     An answer is FF type major minor from a boot loader; the application adds its build.
-
-    Raises:
-        BusSendError: the bus is down, or opened to listen only.
     """
     answers = await link.collect(0x70F, _DISCOVERY, Match(0x700, 0x70F, _DISCOVERY), duration_s=_DISCOVERY_S)
     found = {}
@@ -88,10 +85,6 @@ async def read_version(link: Link, address: int) -> bytes:
     """Return the answer of an application to GET_FW_VERSION: 1C type major minor build ..., usually eight bytes.
 
     It is asked by unicast, as an MTB3 ignores the broadcast, and does no harm to a board that sends.
-
-    Raises:
-        HandshakeTimeout: no answer.
-        BusSendError: the bus is down, or opened to listen only.
     """
     reply = Match(0x200 | address << 4, 0x7FF, bytes((_GET_FW_VERSION,)))
     request = bytes((_GET_FW_VERSION, 2, 0))
@@ -99,23 +92,13 @@ async def read_version(link: Link, address: int) -> bytes:
 
 
 async def ask_versions(link: Link, addresses: Iterable[int] = ADDRESSES) -> list[Board]:
-    """Return the boards whose applications answer; see :func:`read_version`.
-
-    Raises:
-        BusSendError: the bus is down, or opened to listen only.
-    """
+    """Return the boards whose applications answer; see :func:`read_version`."""
     answers = await asyncio.gather(*(_ask_version(link, address) for address in addresses))
     return [board for board in answers if board is not None]
 
 
 async def move_board(link: Link, old: int, new: int) -> Board:
-    """Give a board another address, which it stores, and check that it took it.
-
-    Raises:
-        ConfigurationError: the address is impossible, or belongs to another board; nothing was sent.
-        HandshakeTimeout: the board does not answer, before or afterwards.
-        BusError: it still answers at its old address.
-    """
+    """Give a board another address, which it stores, and check that it took it."""
     if new not in ADDRESSES:
         raise ConfigurationError(f"address {new}: boards have 1 to 14 (0 is the host, 15 everybody)")
     if new == old:

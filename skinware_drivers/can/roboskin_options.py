@@ -59,11 +59,6 @@ class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shift: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
     cdc_offset: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
 
-    @property
-    def sets_triangles(self) -> bool:
-        """Whether something is sent to the board; ``kind`` and ``thermal`` are for the driver alone."""
-        return not (self.enabled is None and self.shift is None and self.cdc_offset is None)
-
 
 class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Boards that are set up in another way than the rest of the bus. Attributes that are None are as for the rest.
@@ -87,8 +82,6 @@ class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver, for every board of a bus."""
-
     boards: Annotated[
         tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: all that answer")
     ] = ()
@@ -124,7 +117,14 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        _check_addresses(self)
+        special = [board for entry in self.special_boards for board in entry.boards]
+        for board in (*self.boards, *special, *(m.board for m in self.modules)):
+            if not FIRST_BOARD <= board <= LAST_BOARD:
+                raise ConfigurationError(
+                    f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
+                )
+        if len(set(self.boards)) < len(self.boards):
+            raise ConfigurationError(f"boards {self.boards}: an address occurs twice")
         for kind in (self.kind, *(m.kind for m in self.modules)):
             if kind and kind not in NON_TACTILE:
                 raise ConfigurationError(f"kind {kind!r}: choose one of {', '.join(NON_TACTILE)}")
@@ -143,17 +143,6 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The sets of inertial sensors that boards send."""
         own = [special.inertial for special in self.special_boards if special.inertial is not None]
         return [inertial for inertial in (self.inertial, *own) if inertial]
-
-
-def _check_addresses(options: RoboskinOptions) -> None:
-    special = [board for entry in options.special_boards for board in entry.boards]
-    for board in (*options.boards, *special, *(m.board for m in options.modules)):
-        if not FIRST_BOARD <= board <= LAST_BOARD:
-            raise ConfigurationError(
-                f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
-            )
-    if len(set(options.boards)) < len(options.boards):
-        raise ConfigurationError(f"boards {options.boards}: an address occurs twice")
 
 
 def _check_inertial(inertial: Inertial, scale: str) -> None:

@@ -122,7 +122,7 @@ class BoardSetUp:
                 self._set_board(special)
                 self.special_board.append(self._board_configuration())
         for module in modules:
-            if module.sets_triangles:
+            if not (module.enabled is None and module.shift is None and module.cdc_offset is None):
                 self._set_triangles(module)
                 wanted |= self._on
         return wanted

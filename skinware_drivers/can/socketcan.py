@@ -25,8 +25,7 @@ from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
 from skinware_drivers.can.controller import CONTROLLER_STATES, NO_CAN, ControllerHealth, read_controller, wire_bits
-from skinware_drivers.can.recvmmsg import rows_of
-from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
+from skinware_drivers.can.receiving import Stamper, Stamping, has_hardware_stamps, rows_of
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 
@@ -104,11 +103,6 @@ class SocketCanBus(KernelBus):
         self._speed_up = 1.0
 
     def open(self) -> None:
-        """Open and bind the socket.
-
-        Raises:
-            BusNotAvailable: no CAN in the kernel, no such interface, not a CAN interface, down, or not permitted.
-        """
         try:
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -141,7 +135,12 @@ class SocketCanBus(KernelBus):
 
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
-        self.granted_buffer = _enlarge_buffer(sock, self._wanted.buffer)
+        wanted = self._wanted.buffer // 2  # the kernel doubles it
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)
+        except PermissionError:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
+        self.granted_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         wants_hardware = self._wanted.timestamps != "software"
         self._stamper = Stamper(wants_hardware and has_hardware_stamps(sock, self.channel))
         self._stamper.switch_on(sock)
@@ -177,7 +176,6 @@ class SocketCanBus(KernelBus):
         self._filters = filters
 
     def check(self) -> None:
-        """Ask the kernel for the state of interface and controller; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None or not self._is_bound:
             return
         name = str(self._socket.getsockname()[0])
@@ -195,11 +193,9 @@ class SocketCanBus(KernelBus):
         return self._health.reason(time_ns)
 
     def fileno(self) -> int:
-        """The socket, -1 while closed."""
         return self._socket.fileno() if self._socket else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that have arrived; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
         if not batch.free:
@@ -221,7 +217,11 @@ class SocketCanBus(KernelBus):
         self.counters.frames += kept
         if self.bit_rate:
             self.wire_bits += wire_bits(batch.wire[first : first + kept], self._speed_up)
-        self._read_memory()
+        # how full the receive buffer is, and how many frames did not fit
+        data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+        words = array.array("I", data)
+        self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
+        self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
         return kept
 
     @property
@@ -230,20 +230,19 @@ class SocketCanBus(KernelBus):
         return not self._stamper.hardware
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)
         source.fd, source.stream, source.tap = self._socket.fileno(), None, self.tap.address
         source.headers, source.control = rows.headers_address, rows.control.ctypes.data
-        source.offset_ns, source.last_poll_ns = self._stamper.state
+        source.offset_ns, source.last_poll_ns = self._stamper.offset_ns, self._stamper.last_poll_ns
         source.dropped_before, source.dropped, source.frames = self._dropped_before, self.counters.dropped, 0
         source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
         source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
         return True
 
     def take_back(self, source: Source) -> None:
-        self._stamper.state = source.offset_ns, source.last_poll_ns
+        self._stamper.offset_ns, self._stamper.last_poll_ns = source.offset_ns, source.last_poll_ns
         self.counters.frames += source.frames
         self.counters.dropped = source.dropped
         self.wire_bits += source.wire_bits
@@ -252,12 +251,16 @@ class SocketCanBus(KernelBus):
             self._health.heard_data()
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         sock = self.may_send_by(self._socket)
         if len(payload) <= 8:
             frame = struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")
         else:
-            frame = self._fd_frame(identifier, payload)
+            longest = _FD_LENGTHS[-1]
+            length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
+            if length is None:
+                raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {longest}")
+            flags = _CANFD_BRS if self._wanted.bitrate_switch == "on" else 0
+            frame = struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(longest, b"\0")
         sent_ns = now_ns()  # not later than an answer
         try:
             sock.send(frame)
@@ -269,13 +272,6 @@ class SocketCanBus(KernelBus):
         if self.tap.is_open:
             flags = frame[_FLAGS_AT] if len(payload) > 8 else 0
             self.tap.keep_frame(sent_ns, identifier, payload, flags=flags, is_sent=True)
-
-    def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
-        length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
-        if length is None:
-            raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {_FD_LENGTHS[-1]}")
-        flags = _CANFD_BRS if self._wanted.bitrate_switch == "on" else 0
-        return struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(_FD_LENGTHS[-1], b"\0")
 
     def close(self) -> None:
         if self._socket is not None:
@@ -296,11 +292,6 @@ class SocketCanBus(KernelBus):
             self.counters.bus_offs = self._health.bus_offs
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of frames; return 0 if more frames may come.
-
-        Raises:
-            BusNotAvailable: the interface went down or away.
-        """
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:
@@ -333,28 +324,11 @@ class SocketCanBus(KernelBus):
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]
         return len(good)
 
-    def _read_memory(self) -> None:
-        """Read how full the receive buffer is, and how many frames did not fit."""
-        if self._socket is not None:
-            data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
-            words = array.array("I", data)
-            self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
-            self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
-
 
 def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:
     everything = (Filter(0, 0),)  # an empty list would let nothing through
     packed = b"".join(struct.pack("=II", *one) for one in filters or everything)
     sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
-
-
-def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:
-    """Request a receive buffer, by force if permitted; return the granted bytes (the kernel doubles the value)."""
-    try:
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted // 2)
-    except PermissionError:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
-    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
 def _is_up(sock: socket.socket, interface: str) -> bool:

@@ -59,7 +59,6 @@ class XelaOptions(Options, frozen=True):
             known |= taken
 
     def identifiers(self, first: int) -> list[int]:
-        """Return the identifiers of a board's taxels, in order."""
         if self.ids == "consecutive":
             return [first + taxel for taxel in range(self.rows * self.columns)]
         return [first | row << 4 | column for column in range(self.columns) for row in range(self.rows)]

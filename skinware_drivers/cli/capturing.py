@@ -49,14 +49,7 @@ _END_S = 30.0
 
 
 class Capture:
-    """A recorder in a process of its own.
-
-    Attributes:
-        result: ``bytes``, ``missed`` and ``problem``, after the end.
-
-    Raises:
-        ConfigurationError: the driver cannot be recorded; the message says why.
-    """
+    """A recorder in a process of its own; ``result`` has ``bytes``, ``missed`` and ``problem`` after the end."""
 
     def __init__(self, path: Path, driver: str, namespace: str) -> None:
         self.path = path
@@ -97,14 +90,7 @@ class Capture:
 
 @contextmanager
 def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture], None]) -> Iterator[Capture]:
-    """Capture a driver while a block runs; start the driver inside.
-
-    Args:
-        on_end: called with the capture when its file is complete.
-
-    Raises:
-        ConfigurationError: the driver cannot be recorded.
-    """
+    """Capture a driver while a block runs; start it inside. ``on_end`` is called when the file is complete."""
     capture = Capture(path, driver, namespace)
     try:
         yield capture
@@ -114,7 +100,6 @@ def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture]
 
 
 def _record(path: Path, driver: str, namespace: str) -> None:
-    """Record until standard input is closed."""
     from skinware.errors import SkinwareError
 
     problem, size, missed = "", 0, 0

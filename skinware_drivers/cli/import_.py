@@ -26,7 +26,8 @@ _HEADINGS = {
 }
 
 
-@cli.group("skin-import")
+@click.group("skin-import", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Create configurations for skin-driver from the files of other systems."""
 
@@ -106,7 +107,7 @@ def icub(
         return
     _report(notes.all(), verbose)
     if output is None:
-        echo(_configuration(done.parts[0], root), nl=False)
+        echo(done.parts[0].configuration(root=root), nl=False)
         if done.parts[0].groups:
             echo("skin-import: -o DIR writes a geometry file too", err=True)
         return
@@ -148,16 +149,13 @@ def _root(text: str | None) -> str:
     return f"yarp://{rest}"
 
 
-def _configuration(part: ImportedPart, root: str, geometry: str = "") -> str:
-    return part.yarp_configuration(root, geometry) if root else part.configuration(geometry)
-
-
 def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) -> list[dict[str, str]]:
     texts: dict[Path, str] = {}
     written = []
     for part in parts:
         files = {"config": folder / f"{part.name}.toml"}
-        geometry = part.yarp_geometry() if root else part.geometry() if part.groups else ""
+        has_places = any(port.groups for port in part.yarp) if root else part.groups
+        geometry = part.geometry(by_port=bool(root)) if has_places else ""
         regions = part.regions_text(by_port=bool(root))
         if geometry:
             files["geometry"] = folder / f"{part.name}.geometry.toml"
@@ -165,7 +163,7 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) 
         if regions:
             files["regions"] = folder / f"{part.name}.regions.toml"
             texts[files["regions"]] = regions
-        texts[files["config"]] = _configuration(part, root, files["geometry"].name if geometry else "")
+        texts[files["config"]] = part.configuration(files["geometry"].name if geometry else "", root)
         written.append({kind: str(path) for kind, path in files.items()})
     in_the_way = [str(path) for path in texts if path.exists()]
     if in_the_way and not force:
@@ -181,7 +179,7 @@ def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, st
 
     parts = []
     for number, part in enumerate(done.parts):
-        files = written[number] if written else {"configuration_text": _configuration(part, root)}
+        files = written[number] if written else {"configuration_text": part.configuration(root=root)}
         parts.append({**part.figures(), **files})
     return {"parts": parts, "notes": notes, "files": [shown(path) for path in done.files]}
 

@@ -28,11 +28,7 @@ _PAYLOAD = 64
 
 
 def speed(text: str) -> float:
-    """Return a factor above 0; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
+    """Return a factor above 0; for ``click.option(type=...)``."""
     factor = cli.seconds(text)
     if not factor:
         raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
@@ -48,7 +44,7 @@ def speed(text: str) -> float:
     "skin-replay walk.mcap --wire --bus vcan0      the frames on the recorded bus, for any program",
 )
 @click.argument("file", type=cli.FILE)
-@cli.names_argument
+@click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
@@ -137,11 +133,6 @@ def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace
 
 
 def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[Wire, Bus]]:
-    """Return recorded wires, each with the bus to send it on.
-
-    Raises:
-        ConfigurationError: a recorded bus does not exist, is ambiguous, or is named twice.
-    """
     from skinware.errors import ConfigurationError
     from skinware.wire import MOST_BYTES
     from skinware_drivers.registry import make_bus
@@ -185,11 +176,6 @@ class WireSender:
         self.failed: int = 0
 
     def open(self) -> None:
-        """Open the buses.
-
-        Raises:
-            BusNotAvailable: one does not exist.
-        """
         for _, bus in self._pairs:
             bus.open()
 

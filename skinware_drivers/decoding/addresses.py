@@ -88,16 +88,28 @@ class Addresses:
                 frame = frames[number]
                 if frame.extended:
                     continue
-                for identifier in _standard_identifiers(frame):
+                everything = np.arange(STANDARD_IDENTIFIERS)
+                match = np.ones(STANDARD_IDENTIFIERS, bool)
+                for condition in frame.when:
+                    if isinstance(condition, Identifier):
+                        match &= everything & condition.mask == condition.value
+                for identifier in np.flatnonzero(match).tolist():
                     entry = self._find(bus, frame, identifier)
                     if entry is not None:
                         slot = bus * STANDARD_IDENTIFIERS + identifier
                         entries[slot] = entry
                         possible[slot] = (*possible[slot], number)
-            for same in _of_one_address(frames, (number for number in kinds if frames[number].extended)):
+            # kinds of frame of 29 bits, grouped by the conditions and keys of their identifiers
+            alike: dict[tuple[object, ...], list[int]] = {}
+            for number in kinds:
+                frame = frames[number]
+                if frame.extended:
+                    conditions = frozenset(c for c in frame.when if isinstance(c, Identifier))
+                    alike.setdefault((conditions, frame.patch, frame.module), []).append(number)
+            for same in alike.values():
                 self.forms.append(Form(bus, frames[same[0]], tables, len(entries)))
                 entries += self.forms[-1].entries
-                possible += [same] * len(self.forms[-1].entries)
+                possible += [tuple(same)] * len(self.forms[-1].entries)
         self.entry: npt.NDArray[np.int64] = np.array(entries, np.int64)
         sets = {kinds: row for row, kinds in enumerate(dict.fromkeys(possible))}
         self.candidates: npt.NDArray[np.uint16] = np.array([sets[kinds] for kinds in possible], np.uint16)
@@ -180,23 +192,3 @@ def bits_of(identifier: int, bits: Bits | int | None) -> int:
 def _sorted(slots: dict[int, int]) -> tuple[Indices, Indices]:
     codes = np.array(sorted(slots), np.int64)
     return codes, np.array([slots[code] for code in codes.tolist()], np.int64)
-
-
-def _of_one_address(frames: Sequence[Frame], numbers: Iterable[int]) -> list[tuple[int, ...]]:
-    """Return the kinds of frame, grouped by the conditions and keys of their identifiers."""
-    alike: dict[tuple[object, ...], list[int]] = {}
-    for number in numbers:
-        frame = frames[number]
-        conditions = frozenset(c for c in frame.when if isinstance(c, Identifier))
-        alike.setdefault((conditions, frame.patch, frame.module), []).append(number)
-    return [tuple(same) for same in alike.values()]
-
-
-def _standard_identifiers(frame: Frame) -> list[int]:
-    everything = np.arange(STANDARD_IDENTIFIERS)
-    match = np.ones(STANDARD_IDENTIFIERS, bool)
-    for condition in frame.when:
-        if isinstance(condition, Identifier):
-            match &= everything & condition.mask == condition.value
-    found: list[int] = np.flatnonzero(match).tolist()
-    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import repeat
+from itertools import chain, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -104,75 +104,64 @@ class UpdateMaker(NamedTuple):
         period_s: nominal time between two of them; None: the driver's.
     """
 
-    modules: Sequence[int]
+    modules: frozenset[int]
     channels: frozenset[int]
     period_s: float | None
 
 
-class Groups:
-    """The update groups of a skin: sensors of a module that arrive together, with one time, age and period.
+def update_groups(tables: SkinTables, carriers: Sequence[UpdateMaker]) -> tuple[SkinTables, list[Indices]]:
+    """Find the update groups of a skin: sensors of a module that arrive together, with one time, age and period.
 
     A module that one kind of frame or one cycle fills is one group. Where several kinds fill it, one of them can fall
     silent while the others continue. Sensors that the same kinds carry are then a group.
 
-    Attributes:
-        tables: the same skin with the groups.
-        of_carrier: for each carrier (n_modules + 1, most) int64, groups that an update of a module belongs to;
-            ``n_groups``: none.
+    Returns:
+        The same skin with the groups; for each carrier (n_modules + 1, most) int64, groups that an update of a module
+        belongs to; ``n_groups``: none.
     """
+    structure = tables.structure
+    sensor_group = np.zeros(structure.n_sensors, np.int64)
+    group_module: list[int] = []
+    period_ns: list[int] = []
+    updated: list[list[list[int]]] = [[[] for _ in range(structure.n_modules)] for _ in carriers]
+    for module in range(structure.n_modules):
+        for carried_by, sensors in _divide(tables, module, carriers):
+            for number in carried_by:
+                updated[number][module].append(len(group_module))
+            sensor_group[sensors] = len(group_module)
+            declared_s = [carriers[number].period_s or 0.0 for number in carried_by]
+            own_ns = int(tables.module_period_ns[module])
+            period_ns.append(own_ns or round(min(declared_s, default=0.0) * NS_PER_S))
+            group_module.append(module)
+    grouped = structure.replace(sensor_group=sensor_group, group_module=group_module, group_period_ns=period_ns)
+    most = max((len(groups) for rows in updated for groups in rows), default=1)
+    of_carrier: list[Indices] = []
+    for rows in updated:
+        table = np.full((structure.n_modules + 1, most), len(group_module), np.int64)
+        for module, groups in enumerate(rows):
+            table[module, : len(groups)] = groups
+        of_carrier.append(table)
+    return replace(tables, structure=grouped), of_carrier
 
-    def __init__(self, tables: SkinTables, carriers: Sequence[UpdateMaker]) -> None:
-        structure = tables.structure
-        self._tables = tables
-        self._carriers_of: list[list[int]] = [[] for _ in range(structure.n_modules)]
-        for number, carrier in enumerate(carriers):
-            for module in carrier.modules:
-                self._carriers_of[module].append(number)
-        sensor_group = np.zeros(structure.n_sensors, np.int64)
-        group_module: list[int] = []
-        period_ns: list[int] = []
-        updated: list[list[list[int]]] = [[[] for _ in range(structure.n_modules)] for _ in carriers]
-        for module in range(structure.n_modules):
-            for carried_by, sensors in self._divide(module, carriers):
-                for number in carried_by:
-                    updated[number][module].append(len(group_module))
-                sensor_group[sensors] = len(group_module)
-                declared_s = [carriers[number].period_s or 0.0 for number in carried_by]
-                own_ns = int(tables.module_period_ns[module])
-                period_ns.append(own_ns or round(min(declared_s, default=0.0) * NS_PER_S))
-                group_module.append(module)
-        self.tables: SkinTables = replace(
-            tables,
-            structure=structure.replace(
-                sensor_group=sensor_group, group_module=group_module, group_period_ns=period_ns
-            ),
-        )
-        most = max((len(groups) for rows in updated for groups in rows), default=1)
-        self.of_carrier: list[Indices] = []
-        for rows in updated:
-            table = np.full((structure.n_modules + 1, most), len(group_module), np.int64)
-            for module, groups in enumerate(rows):
-                table[module, : len(groups)] = groups
-            self.of_carrier.append(table)
 
-    def _divide(self, module: int, carriers: Sequence[UpdateMaker]) -> list[tuple[tuple[int, ...], Indices]]:
-        """Return the groups of a module: the carriers that update each, and its sensors."""
-        mine = self._carriers_of[module]
-        sensors = np.arange(self._tables.structure.n_sensors)[self._tables.structure.module_index(module)]
-        if len(mine) < 2:
-            return [(tuple(mine), sensors)]
-        channel_of = {sensor: channel for channel, sensor in enumerate(self._tables.channel_to_sensor[module].tolist())}
-        found: dict[tuple[int, ...], list[int]] = {}
-        for sensor in sensors.tolist():
-            carried_by = tuple(number for number in mine if channel_of[sensor] in carriers[number].channels)
-            found.setdefault(carried_by, []).append(sensor)
-        never = found.pop((), [])  # no frame has them: they stay "never seen" in any group
-        for number in mine:
-            if not any(number in carried_by for carried_by in found):
-                found[(number,)] = []  # it has values of no sensor
-        first, *others = found.items()
-        groups = [(first[0], np.array(sorted([*first[1], *never]), np.int64))]
-        return groups + [(carried_by, np.array(own, np.int64)) for carried_by, own in others]
+def _divide(tables: SkinTables, module: int, carriers: Sequence[UpdateMaker]) -> list[tuple[tuple[int, ...], Indices]]:
+    """Return the groups of a module: the carriers that update each, and its sensors."""
+    mine = [number for number, carrier in enumerate(carriers) if module in carrier.modules]
+    sensors = np.arange(tables.structure.n_sensors)[tables.structure.module_index(module)]
+    if len(mine) < 2:
+        return [(tuple(mine), sensors)]
+    channel_of = {sensor: channel for channel, sensor in enumerate(tables.channel_to_sensor[module].tolist())}
+    found: dict[tuple[int, ...], list[int]] = {}
+    for sensor in sensors.tolist():
+        carried_by = tuple(number for number in mine if channel_of[sensor] in carriers[number].channels)
+        found.setdefault(carried_by, []).append(sensor)
+    never = found.pop((), [])  # no frame has them: they stay "never seen" in any group
+    for number in mine:
+        if not any(number in carried_by for carried_by in found):
+            found[(number,)] = []  # it has values of no sensor
+    first, *others = found.items()
+    groups = [(first[0], np.array(sorted([*first[1], *never]), np.int64))]
+    return groups + [(carried_by, np.array(own, np.int64)) for carried_by, own in others]
 
 
 class CompiledLayouts:
@@ -188,9 +177,6 @@ class CompiledLayouts:
         alone: by number of its kind, what reads a frame that is an update by itself.
         length_ok: (256, lengths) bool, by kind (the last row: any) and length (the last column: all longer ones).
         header: a payload byte and a table (256, lengths) of kinds; None if one byte does not determine the kind.
-
-    Raises:
-        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(
@@ -258,12 +244,17 @@ class CompiledLayouts:
         width = max((sum(len(self.kinds[number].channels) for number in members) for members in made_of), default=0)
         period_of: list[float] = [0.0 for _ in alone]
         period_of += [own_s if (own_s := cycle.period_s or 0.0) > (bus_s or 0.0) else 0.0 for cycle, _, bus_s in cycles]
-        carriers = [self._carrier(members, period_s) for members, period_s in zip(made_of, period_of, strict=True)]
-        groups = Groups(self.described, carriers)
-        self.tables = groups.tables
+        carriers = []
+        for members, period_s in zip(made_of, period_of, strict=True):
+            modules = (self.addresses.modules_of(number, self.frames[number]) for number in members)
+            declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
+            longest_s = max([*declared_s, period_s])
+            channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
+            carriers.append(UpdateMaker(frozenset(chain.from_iterable(modules)), channels, longest_s or None))
+        self.tables, groups = update_groups(self.described, carriers)
         made = [
             Assembly([self.kinds[n] for n in members], self.tables, width, own)
-            for members, own in zip(made_of, groups.of_carrier, strict=True)
+            for members, own in zip(made_of, groups, strict=True)
         ]
         self.alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
@@ -272,13 +263,6 @@ class CompiledLayouts:
             for cycle, members, period_s in cycles
         ]
         self.width = width
-
-    def _carrier(self, members: Sequence[int], period_s: float) -> UpdateMaker:
-        modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
-        declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
-        longest_s = max([*declared_s, period_s])
-        channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
-        return UpdateMaker(sorted(modules), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """Return a payload byte and a table over it and the length, if they determine the kind (a fast case)."""

@@ -12,12 +12,19 @@ import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware.status import Status
+from skinware.structure import Structure
 from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS
 from skinware_drivers.decoding.compiled import CompiledLayouts
-from skinware_drivers.decoding.device_numbers import DeviceStamps
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Layout
+from skinware_drivers.device_time import DeviceClock
+from skinware_drivers.fields import DeviceTime, SequenceNumber
+from skinware_drivers.layout import Frame, Layout
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+Indices = npt.NDArray[np.int64]
+Bytes = npt.NDArray[np.uint8]
 
 BUS_COUNTERS = ("unknown", "bad_length", "bad_content", "before_boot")
 """Per bus: frames with foreign identifiers, wrong lengths, or unknown contents; frames stamped before this machine
@@ -82,7 +89,7 @@ class SkinState:
     """Values, status and times of a skin; copied into the ring at publication.
 
     The arrays have one element more than there are sensors, groups or patches, for values without a sensor: that is
-    cheaper than to sort them out.
+    cheaper than to sort them out. ``values``, ``status``, ``group_time_ns`` ... are views without that element.
 
     Attributes:
         all_values: (n_sensors + 1,) of the structure's dtype.
@@ -107,38 +114,22 @@ class SkinState:
         self.all_patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
         self.group_patch = structure.group_patch.astype(np.intp)
         self.is_prompt: npt.NDArray[np.bool_] = np.ones(structure.n_groups, bool)
+        self.values, self.status, self.group_time_ns = (
+            self.all_values[:-1],
+            self.all_status[:-1],
+            self.all_group_time_ns[:-1],
+        )
+        self.patch_time_ns = self.all_patch_time_ns[:-1]
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
 
     @property
-    def values(self) -> npt.NDArray[Any]:
-        """(n_sensors,) of the structure's dtype."""
-        return self.all_values[:-1]
-
-    @property
-    def status(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8."""
-        return self.all_status[:-1]
-
-    @property
-    def group_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_groups,) int64."""
-        return self.all_group_time_ns[:-1]
-
-    @property
     def updated(self) -> npt.NDArray[np.bool_]:
-        """(n_groups,) bool."""
         return self.all_updated[:-1]
 
     @property
     def touched(self) -> npt.NDArray[np.bool_]:
-        """(n_groups,) bool."""
         return self.all_touched[:-1]
-
-    @property
-    def patch_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_patches,) int64."""
-        return self.all_patch_time_ns[:-1]
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:
@@ -151,13 +142,75 @@ class SkinState:
         self.is_prompt[:] = self._structure.group_period_ns <= period_ns * _PROMPT
 
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 NONE_YET = -1
 _MUCH_HASTE, _NEVER_AGAIN = 200, -(1 << 62)
 """Frames that come too soon, with no whole cycle between, before a warning is logged; and their number afterwards."""
 
-Indices = npt.NDArray[np.int64]
+
+def read_numbers(payload: Bytes, sequence: SequenceNumber) -> Indices:
+    """Return (n,) the sequence number in each of n payloads; ``payload``: (n, size) uint8."""
+    word = _words(payload, sequence)
+    if sequence.mask is not None:
+        word = (word & word.dtype.type(sequence.mask)) >> word.dtype.type(sequence.shift)
+    plain: Indices = word.astype(np.int64)
+    return plain
+
+
+def _words(payload: Bytes, where: SequenceNumber | DeviceTime) -> npt.NDArray[Any]:
+    return np.ascontiguousarray(payload[:, where.offset : where.end]).view(where.dtype)[:, 0]
+
+
+class DeviceStamps:
+    """The clocks of all patches; a patch is one device.
+
+    Attributes:
+        times: kinds of frame with a stamp, and the place of the stamp.
+        clocks: by patch, of those that have sent a stamp.
+    """
+
+    def __init__(self, frames: Sequence[Frame], structure: Structure) -> None:
+        self.times = [(number, frame.time) for number, frame in enumerate(frames) if frame.time is not None]
+        self._structure = structure
+        self._module_patch = structure.module_patch.astype(np.intp)
+        self._warned: set[int] = set()
+        self.clocks: dict[int, DeviceClock] = {}
+
+    def apply(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
+        """Replace the times at which frames were received by those at which they were stamped.
+
+        Args:
+            kind: (n,) uint8, kind of each frame.
+            module: (n,) its module; those from ``n_modules`` on are none.
+            payload: (n, size) uint8.
+            time_ns: (n,) int64, CLOCK_MONOTONIC ns, changed in place.
+        """
+        if not self.times:
+            return
+        stamp = np.full(len(kind), -1, np.int64)
+        sent: dict[int, DeviceTime] = {}
+        for number, time in self.times:
+            rows = np.flatnonzero((kind == number) & (module < len(self._module_patch)))
+            if len(rows):
+                stamp[rows] = _words(payload[rows], time).astype(np.int64) % time.turn
+                sent.update(dict.fromkeys(np.unique(self._module_patch[module[rows]]).tolist(), time))
+        rows = np.flatnonzero(stamp >= 0)
+        patch = self._module_patch[module[rows]]
+        for number, time in sent.items():
+            own = rows[patch == number]
+            if number not in self.clocks:
+                self.clocks[number] = DeviceClock(time.unit_s, time.turn)
+            time_ns[own] = self.clocks[number].convert(stamp[own], time_ns[own])
+            if self.clocks[number].stops and number not in self._warned:
+                self._warned.add(number)
+                log.warning(
+                    "%s: the clock of %s stands still, or is far too slow: its samples have the times of their"
+                    " receipt; logged once",
+                    self._structure.buses[self._structure.patch_bus[number]],
+                    self._structure.patch_name[number].decode(),
+                )
+
+    def forget(self, patch: int) -> None:
+        self.clocks.pop(patch, None)
 
 
 class Decoder:
@@ -170,9 +223,6 @@ class Decoder:
         last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
-
-    Raises:
-        ConfigurationError: the buses have more kinds of frame than a driver can have.
     """
 
     def __init__(

@@ -1,24 +1,151 @@
-"""Read position files and drawings of skinGui, and find the places and kinds of a part's triangles."""
+"""Read position files and drawings of skinGui, and find the places and kinds of a part's triangles.
+
+Source: robotology/icub-main app/skinGui/conf/positions. Lines ``name FRAME``, ``spatial_sampling taxel|triangle``,
+``taxel2Repr (...)``, then ``[calibration]`` and per channel ``x y z nx ny nz``, in metres in the frame of the link. In
+``taxel2Repr``, -1 stands for a channel that is not a taxel, -2 for a thermal pad (some files write -1 for both).
+
+In some files ``taxel2Repr`` is shorter than the list of places: beyond its end, a channel with a place is a taxel. Some
+have no normals (0 0 0), or normals of another length than 1; their places are used.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
-from skinware.geometry import GeometryGroup
+from skinware.geometry import GeometryGroup, Triple
 from skinware.tactile.regions import Region
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
 from skinware_drivers.icub.device import PortRange
 from skinware_drivers.icub.part import DevicePart
-from skinware_drivers.icub.positions import Pose, Positions, read_text
-from skinware_drivers.icub.xml_tree import Notes
+from skinware_drivers.icub.xml_tree import Notes, read_bytes
 from skinware_drivers.icub.xml_tree import number as whole_number
+
+_CALIBRATION = "[calibration]"
+_REPRESENTATIVES = re.compile(r"taxel2Repr\s*\(([^()]*)\)")
+_MOST_TAXELS = 1 << 16
+_FARTHEST_M = 10.0
+_DIGITS = 6
+
+Pose = tuple[Triple, Triple | None]
+"""Place, and normal of length 1 if it is known."""
+
+
+@dataclass(frozen=True)
+class Positions:
+    """A position file.
+
+    Attributes:
+        frame: the link with the coordinate frame of the numbers.
+        tactile: by channel, whether it is a taxel.
+        poses: by channel, in metres; None: the file has no place.
+    """
+
+    path: Path
+    frame: str
+    tactile: tuple[bool, ...]
+    poses: tuple[Pose | None, ...]
+
+    def non_tactile(self, first: int) -> tuple[int, ...]:
+        """Return the channels that are not taxels, of the triangle that begins at channel ``first``."""
+        return tuple(k for k, tactile in enumerate(self.tactile[first : first + CHANNELS]) if not tactile)
+
+
+def is_positions(text: str) -> bool:
+    return _CALIBRATION in text and "taxel2Repr" in text
+
+
+def read_text(path: Path) -> str:
+    """Read a text file; bytes that are not UTF-8 are kept as signs."""
+    return read_bytes(path).decode("utf-8", "replace")
+
+
+def read_positions(path: Path, notes: Notes) -> Positions:
+    """Read a position file; note oddities."""
+    text = read_text(path)
+    head, mark, body = text.partition(_CALIBRATION)
+    found = _REPRESENTATIVES.search(head)
+    if not mark or found is None:
+        raise ConfigurationError(f"{path}: not a position file: it has no taxel2Repr (...) before [calibration]")
+    words = found[1].replace(",", " ").split()
+    if len(words) > _MOST_TAXELS:
+        raise ConfigurationError(f"{path}: taxel2Repr has {len(words)} numbers, more than a skin has taxels")
+    try:
+        representatives = [whole_number(word) for word in words]
+    except ValueError as error:
+        raise ConfigurationError(f"{path}: taxel2Repr: {error}") from None
+    fields = {}
+    for line_number, line in enumerate(_REPRESENTATIVES.sub("", head).splitlines(), 1):
+        key, _, value = line.strip().partition(" ") if " " in line.strip() else line.strip().partition("\t")
+        if key in ("name", "spatial_sampling"):
+            fields[key] = value.strip()
+        elif key:
+            notes.add("unknown", path, "not understood", line=line_number, element=line.strip()[:60])
+    if fields.get("spatial_sampling", "taxel") != "taxel":
+        text = "the file asks for one place per triangle; its places, one per channel, are kept"
+        notes.add("info", path, text, element=f"spatial_sampling {fields['spatial_sampling']}")
+    if not fields.get("name"):
+        notes.add("missing", path, "no frame is named, so the axes of these numbers are unknown", element="name")
+    poses = _poses(body, head.count("\n"), path, notes)
+    return _fit(path, fields.get("name", ""), representatives, poses, notes)
+
+
+def _poses(body: str, line_before: int, path: Path, notes: Notes) -> list[Pose | None]:
+    poses: list[Pose | None] = []
+    for line_number, line in enumerate(body.splitlines(), line_before + 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if len(poses) >= _MOST_TAXELS:
+            raise ConfigurationError(f"{path}: more lines than a skin has taxels")
+        pose, why = _pose(line)
+        if why:
+            notes.add("unknown", path, why, line=line_number, element=line.strip()[:60])
+        poses.append(pose)
+    return poses
+
+
+def _pose(line: str) -> tuple[Pose | None, str]:
+    words = line.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return None, "not six numbers; no place"
+    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
+        return None, "not six numbers; no place"
+    x, y, z, *normal = numbers
+    if max(map(abs, (x, y, z))) > _FARTHEST_M:
+        return None, f"farther than {_FARTHEST_M:g} m from the link: not in metres? no place"
+    if not any(numbers):
+        return None, ""
+    length = math.hypot(*normal)
+    if not 0 < length < math.inf:
+        return ((x, y, z), None), ""
+    nx, ny, nz = (round(component / length, _DIGITS) for component in normal)
+    return ((x, y, z), (nx, ny, nz)), ""
+
+
+def _fit(path: Path, frame: str, representatives: list[int], poses: list[Pose | None], notes: Notes) -> Positions:
+    count = max(len(representatives), len(poses)) // CHANNELS * CHANNELS
+    if not count:
+        raise ConfigurationError(f"{path}: no whole triangle in taxel2Repr and [calibration]")
+    for what, rest in (("taxel2Repr", representatives[count:]), ("[calibration]", poses[count:])):
+        if rest:
+            notes.add("odd", path, f"{len(rest)} entries after the last whole triangle; left out", element=what)
+    poses = [*poses[:count], *[None] * (count - len(poses))]
+    tactile = [representative >= 0 for representative in representatives[:count]]
+    tactile += [pose is not None for pose in poses[len(tactile) :]]
+    normals = [pose[1] for pose in poses if pose is not None]
+    if None in normals:
+        notes.add("info", path, f"{normals.count(None)} of {len(normals)} places have no normal")
+    return Positions(path, frame, tuple(tactile), tuple(poses))
+
 
 _SENSORS = "[SENSORS]"
 Shape = tuple[str, tuple[int, ...]]
@@ -49,19 +176,11 @@ class Drawing:
 
 
 def is_drawing(text: str) -> bool:
-    """Return whether a text looks like a drawing of skinGui."""
     return _SENSORS in text and "robotPart" in text
 
 
-def read_drawing(path: Path, notes: Notes) -> Drawing:
-    """Read a drawing; note lines that are not understood.
-
-    Raises:
-        ConfigurationError: the file is not a drawing.
-    """
-    text = read_text(path)
-    if not is_drawing(text):
-        raise ConfigurationError(f"{path}: not a drawing of skinGui: it has no robotPart and [SENSORS]")
+def read_drawing(path: Path, text: str, notes: Notes) -> Drawing:
+    """Read a drawing; note lines that are not understood."""
     drawing = Drawing(path, "")
     in_sensors, unused = False, set[str]()
     for line_number, line in enumerate(text.splitlines(), 1):
@@ -126,15 +245,10 @@ class Body:
     drawn: dict[str, set[Place]] = field(default_factory=dict)
     groups: dict[Place, list[GeometryGroup]] = field(default_factory=dict)
 
-    def groups_of(self, patches: Sequence[int]) -> list[GeometryGroup]:
-        """Return the places on some patches, with the keys of a driver that has these buses in this order."""
-        return [
-            msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
-            for bus, patch in enumerate(patches)
-            for place, groups in self.groups.items()
-            if place[0] == patch
-            for group in groups
-        ]
+
+def on_bus(bus: int, groups: Iterable[GeometryGroup]) -> list[GeometryGroup]:
+    """Return places whose uids have no bus yet, with the keys that a driver gives its bus of this number."""
+    return [msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid)) for group in groups]
 
 
 def read_body(
@@ -162,7 +276,7 @@ def triangles_of(part: DevicePart, port: PortRange, notes: Notes) -> dict[int, P
         local = port.local_first + index - port.first
         if board >= len(order):
             text = f"goes to {port.last}, but the {len(order)} boards have {len(order) * _OF_A_BOARD} values"
-            notes.add("odd", port.element.file, text, line=port.element.line, element=port.element.label)
+            notes.at(port.element, "odd", text)
             break
         if rest % CHANNELS == 0 and local % CHANNELS == 0:
             triangles[local // CHANNELS] = (*order[board], rest // CHANNELS)
@@ -185,8 +299,18 @@ def _place(body: Body, port: PortRange, positions: Positions, triangles: Mapping
         groups = body.groups.setdefault(place, [])
         for type_name, of_type in (("pressure", set(range(CHANNELS)) - thermal), ("temperature", thermal)):
             known = {k: pose for k in sorted(of_type) if (pose := poses[k]) is not None}
+            normals = [normal for _, normal in known.values()]
             if known:
-                groups.append(_group(port, place, type_name, positions.frame, known))
+                groups.append(
+                    GeometryGroup(
+                        type=type_name,
+                        frame=positions.frame,
+                        uid=tuple(place[1] << 16 | place[2] << 8 | channel for channel in known),
+                        position_m=tuple(position for position, _ in known.values()),
+                        normal=tuple(normal or _NO_NORMAL for normal in normals) if any(normals) else None,
+                        name=f"{port.name}, board {place[1]}, triangle {place[2]}",
+                    )
+                )
         if not groups:
             without_a_place.append(place)
     if lost:
@@ -194,18 +318,6 @@ def _place(body: Body, port: PortRange, positions: Positions, triangles: Mapping
         notes.add("odd", positions.path, text)
     if without_a_place:
         notes.add("info", positions.path, f"taxels without a place: {places_text(without_a_place)}")
-
-
-def _group(port: PortRange, place: Place, type_name: str, frame: str, known: Mapping[int, Pose]) -> GeometryGroup:
-    normals = [normal for _, normal in known.values()]
-    return GeometryGroup(
-        type=type_name,
-        frame=frame,
-        uid=tuple(place[1] << 16 | place[2] << 8 | channel for channel in known),
-        position_m=tuple(position for position, _ in known.values()),
-        normal=tuple(normal or _NO_NORMAL for normal in normals) if any(normals) else None,
-        name=f"{port.name}, board {place[1]}, triangle {place[2]}",
-    )
 
 
 def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
@@ -244,11 +356,6 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
         for which, what in ((drawn - on, "drawn, but off"), (on - drawn, "on, but not drawn")):
             if which:
                 notes.add("odd", name, f"{what}: {places_text(which)}", element="skinGui's drawing")
-
-
-def places_of(part: DevicePart, ports: Sequence[PortRange]) -> dict[str, set[Place]]:
-    quiet = Notes()
-    return {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
 
 
 def places_text(places: Sequence[Place] | set[Place]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.icub.xml_tree import Element, Level, Notes, ValueReader, read_xml, words
+from skinware_drivers.icub.xml_tree import Element, Notes, ValueReader, read_xml, words
 
 _MOST_INCLUDES = 200
 _LONGEST_CHAIN = 8
@@ -44,11 +44,7 @@ class DeviceReader:
         self._seen: set[int] = set()
 
     def devices(self, path: Path) -> Iterator[Element]:
-        """Return the elements ``device`` of a file and its included files, without those found before.
-
-        Raises:
-            ConfigurationError: the file itself is not XML.
-        """
+        """Return the elements ``device`` of a file and its included files, without those found before."""
         root = self._read(path)
         if root.tag != "params":  # parameters belong to the including element
             yield from self._devices(root, [path.resolve()])
@@ -92,7 +88,12 @@ class DeviceReader:
                 child.understood = True
                 self._fill(group, child, trail, count)
             elif child.tag == "param":
-                self._put(group.params, child)
+                first = group.params.setdefault(child.name, child)
+                if first is not child:
+                    child.understood = True
+                if first.text.split() != child.text.split():
+                    again, counts = (" ".join(param.text.split()) for param in (child, first))
+                    self._notes.at(child, "odd", f"given again as {again!r}; the first counts ({counts!r})")
             elif child.tag == "group":
                 child.understood = True
                 inner = group.groups.setdefault(child.name, Group(child))
@@ -108,35 +109,23 @@ class DeviceReader:
             else:
                 group.others.append(child)
 
-    def _put(self, params: dict[str, Element], param: Element) -> None:
-        first = params.setdefault(param.name, param)
-        if first is not param:
-            param.understood = True
-        if first.text.split() != param.text.split():
-            again, counts = (" ".join(element.text.split()) for element in (param, first))
-            text = f"given again as {again!r}; the first counts ({counts!r})"
-            self._notes.add("odd", param.file, text, line=param.line, element=param.label)
-
     def _include(self, element: Element, target: str, trail: list[Path], *, is_needed: bool) -> Element | None:
         """Return the root of an included file; None if there is none, which is noted."""
         path = _find(target, element.file)
         if path is None:
-            self._note(element, "missing" if is_needed else "info", f"{target!r} is not there")
+            self._notes.at(element, "missing" if is_needed else "info", f"{target!r} is not there")
             return None
         if path.resolve() in trail:
-            self._note(element, "odd", f"{target!r} includes itself; left out")
+            self._notes.at(element, "odd", f"{target!r} includes itself; left out")
             return None
         if len(trail) >= _LONGEST_CHAIN:
-            self._note(element, "odd", f"{target!r}: files include each other {_LONGEST_CHAIN} deep; left out")
+            self._notes.at(element, "odd", f"{target!r}: files include each other {_LONGEST_CHAIN} deep; left out")
             return None
         try:
             return self._read(path)
         except ConfigurationError as error:
-            self._note(element, "missing", f"{target!r} cannot be read: {error}")
+            self._notes.at(element, "missing", f"{target!r} cannot be read: {error}")
             return None
-
-    def _note(self, element: Element, level: Level, text: str) -> None:
-        self._notes.add(level, element.file, text, line=element.line, element=element.tag)
 
     def _read(self, path: Path) -> Element:
         key = path.resolve()
@@ -200,66 +189,53 @@ class PortRange:
     local_first: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Wrapper:
-    """The ports of one skin device.
+    """The ports of one skin device, in the order of the file, and the remarks on them."""
 
-    Attributes:
-        ports: in the order of the file.
-    """
-
+    element: Element
     device: str
     ports: tuple[PortRange, ...]
+    notes: Notes
 
 
-def read_wrapper(group: Group, notes: Notes) -> Wrapper:
+def read_wrapper(group: Group) -> Wrapper:
     """Read a wrapper; note values that make no sense."""
-    return _WrapperReader(notes).read(group)
+    notes = Notes()
+    reader = ValueReader(notes)
+    ports = [port for element in group.lists.get("ports", ()) if (port := _port(element, reader)) is not None]
+    if not ports:
+        notes.at(group.element, "missing", "no usable port in a paramlist 'ports'")
+    networks = group.lists.get("networks", [])
+    names = []
+    for element in networks:
+        element.understood = True
+        names += words(element.text)
+    if len(names) > 1:
+        notes.at(networks[0], "odd", f"several devices ({', '.join(names)}): the ports are taken for the first")
+    for name, why in _UNUSED.items():
+        if name in group.params:
+            group.params[name].understood = True
+            notes.at(group.params[name], "info", why)
+    for action in group.actions:
+        action.understood = True
+    rest = [*group.params.values(), *group.others, *(inner.element for inner in group.groups.values())]
+    rest += [e for name, elements in group.lists.items() if name not in ("ports", "networks") for e in elements]
+    for element in rest:
+        if not element.understood:
+            notes.at(element, "unknown", f"not understood{f': {element.text!r}' if element.text else ''}")
+    return Wrapper(group.element, names[0] if names else "", tuple(ports), notes)
 
 
-class _WrapperReader(ValueReader):
-    def read(self, group: Group) -> Wrapper:
-        ports: list[PortRange] = []
-        for element in group.lists.get("ports", ()):
-            port = self._port(element)
-            if port is not None:
-                ports.append(port)
-        if not ports:
-            self.note("missing", group.element, "no usable port in a paramlist 'ports'")
-        networks = group.lists.get("networks", [])
-        names = []
-        for element in networks:
-            element.understood = True
-            names += words(element.text)
-        if len(names) > 1:
-            self.note("odd", networks[0], f"several devices ({', '.join(names)}): the ports are taken for the first")
-        for name, why in _UNUSED.items():
-            if name in group.params:
-                group.params[name].understood = True
-                self.note("info", group.params[name], why)
-        for action in group.actions:
-            action.understood = True
-        for element in self._rest(group):
-            if not element.understood:
-                self.note("unknown", element, f"not understood{f': {element.text!r}' if element.text else ''}")
-        return Wrapper(names[0] if names else "", tuple(ports))
-
-    def _port(self, element: Element) -> PortRange | None:
-        row = self.numbers(element)
-        if row is None:
-            return None
-        if len(row) != 4:
-            self.refuse(element, f"{len(row)} numbers, not 4 (wholeStart wholeEnd localStart localEnd)")
-            return None
-        first, last, local_first, local_last = row
-        if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
-            self.refuse(element, f"{element.text!r}: the two ranges differ in length")
-            return None
-        return PortRange(element.name, element, first, last, local_first)
-
-    @staticmethod
-    def _rest(group: Group) -> list[Element]:
-        rest = [*group.params.values(), *group.others]
-        rest += [inner.element for inner in group.groups.values()]
-        rest += [e for name, elements in group.lists.items() if name not in ("ports", "networks") for e in elements]
-        return rest
+def _port(element: Element, reader: ValueReader) -> PortRange | None:
+    row = reader.numbers(element)
+    if row is None:
+        return None
+    if len(row) != 4:
+        reader.refuse(element, f"{len(row)} numbers, not 4 (wholeStart wholeEnd localStart localEnd)")
+        return None
+    first, last, local_first, local_last = row
+    if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
+        reader.refuse(element, f"{element.text!r}: the two ranges differ in length")
+        return None
+    return PortRange(element.name, element, first, last, local_first)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
-
-import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
@@ -16,26 +15,30 @@ from skinware.text import nearest_name
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import (
     Drawing,
+    Positions,
     check_drawings,
     is_drawing,
-    places_of,
+    is_positions,
+    on_bus,
     read_body,
     read_drawing,
+    read_positions,
+    read_text,
     regions_of,
+    triangles_of,
 )
 from skinware_drivers.icub.device import WRAPPER, DeviceReader, PortRange, Wrapper, read_wrapper
-from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, read_part
-from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
+from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, DevicePart, PartReader
 from skinware_drivers.icub.translate import (
+    PartPort,
     TranslatedBus,
     configuration_text,
     enabled_places,
     service_name,
     translate,
-    yarp_configuration_text,
+    yarp_ports,
 )
-from skinware_drivers.icub.xml_tree import Element, Level, Notes, shown
-from skinware_drivers.icub.yarp import PartPort, yarp_ports
+from skinware_drivers.icub.xml_tree import Element, Notes, shown
 
 _SUFFIXES = (".xml", ".txt", ".ini")
 _MOST_FILES = 20_000
@@ -64,9 +67,19 @@ class ImportedPart:
     triangles: int
     placed: int
 
-    def configuration(self, geometry: str = "") -> str:
-        """Return its configuration file; ``geometry`` is the name of the file with the places of the sensors."""
+    def configuration(self, geometry: str = "", root: str = "") -> str:
+        """Return its configuration file.
+
+        Args:
+            geometry: name of the file with the places of the sensors.
+            root: read its compensated ports, whose names begin so: ``yarp:///icub/skin``; empty: its boards.
+        """
         where = shown(self.part.element.file.name)
+        if root:
+            lines = [f"The ports of {shown(self.part.name)}, made by skin-import from {where}."]
+            lines += ['For what its boards send, leave _comp out of the names and add values = "raw".']
+            ports = [(f"{root}/{port.name}_comp", "", port.options) for port in self.yarp]
+            return configuration_text("yarp", self.name, ports, lines, geometry)
         lines = [f"{shown(self.part.name)} ({self.part.device_type}), made by skin-import from {where}."]
         if self.ports:
             lines.append(f"Body parts: {shown(', '.join(port.name for port in self.ports))}.")
@@ -75,33 +88,17 @@ class ImportedPart:
                 "The robot reads these boards through an Ethernet board. This driver needs the CAN bus itself."
             )
             lines.append("It must be the only one that sets the boards up.")
-        return configuration_text(self.name, self.buses, "\n".join(lines), geometry)
+        buses = [(bus.name, bus.comment, bus.options) for bus in self.buses]
+        return configuration_text("roboskin", self.name, buses, lines, geometry)
 
-    def geometry(self) -> str:
-        lines = f"Places of the sensors of {self.name}, made by skin-import: its driver publishes them."
-        return geometry_to_toml(self.groups, lines)
-
-    def yarp_configuration(self, root: str, geometry: str = "") -> str:
-        """Return a configuration file that reads its compensated ports.
-
-        Args:
-            root: beginning of the names of the ports' buses, as ``yarp:///icub/skin``.
-            geometry: name of the file with the places of the sensors.
-        """
-        where = shown(self.part.element.file.name)
-        lines = f"The ports of {shown(self.part.name)}, made by skin-import from {where}.\nFor what its boards send, "
-        lines += 'leave _comp out of the names and add values = "raw".'
-        buses = [(f"{root}/{port.name}_comp", port.options) for port in self.yarp]
-        return yarp_configuration_text(self.name, buses, lines, geometry)
-
-    def yarp_geometry(self) -> str:
-        groups = [
-            msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
-            for bus, port in enumerate(self.yarp)
-            for group in port.groups
-        ]
-        lines = f"Places of the sensors of {self.name} by their ports, made by skin-import: its driver publishes them."
-        return geometry_to_toml(groups, lines) if groups else ""
+    def geometry(self, *, by_port: bool = False) -> str:
+        """Return a file with the places of its sensors, with the keys of its ports or buses."""
+        groups, by = self.groups, ""
+        if by_port:
+            groups = [group for bus, port in enumerate(self.yarp) for group in on_bus(bus, port.groups)]
+            by = " by their ports"
+        lines = f"Places of the sensors of {self.name}{by}, made by skin-import: its driver publishes them."
+        return geometry_to_toml(groups, lines)
 
     def regions_text(self, *, by_port: bool) -> str:
         """Return a file of regions: the ports, or the body parts; empty if no body part is known."""
@@ -130,18 +127,8 @@ class ImportedPart:
 
 @dataclass
 class Import:
-    """The result of an import."""
-
     parts: list[ImportedPart]
     files: list[Path]
-
-
-@dataclass
-class _Sources:
-    devices: list[Element] = field(default_factory=list)
-    positions: list[Path] = field(default_factory=list)
-    drawings: list[Path] = field(default_factory=list)
-    files: list[Path] = field(default_factory=list)
 
 
 def import_files(
@@ -165,165 +152,151 @@ def import_files(
     Raises:
         ConfigurationError: a file cannot be read, or there is no skin device, or none with a given name.
     """
-    reader = DeviceReader(notes)
-    sources = _Sources()
+    files = _Sources(dict(positions or {}), notes)
     for path in paths:
-        _gather(path, reader, sources, notes)
-    devices = _pick(sources.devices, only)
+        files.add(path)
+    devices = [device for device in files.devices if device.attributes.get("type") in DEVICE_TYPES]
+    if not devices:
+        raise ConfigurationError(f"no device of type {' or '.join(DEVICE_TYPES)} in what was read")
+    for name in only:
+        if not any(device.name == name for device in devices):
+            others = nearest_name(name, sorted(device.name for device in devices))
+            raise ConfigurationError(f"--part {name}: there is none{others}")
+    devices = [device for device in devices if not only or device.name in only]
     if bus_names and len(devices) > 1:
         raise ConfigurationError(f"--bus names buses of one part, but there are {len(devices)}; choose one with --part")
-    wrappers = _Wrappers(reader, sources.devices)
-    files = _BodyFiles(sources, dict(positions or {}), notes)
+    wrappers = [
+        read_wrapper(files.reader.group_of(device))
+        for device in files.devices
+        if device.attributes.get("type") == WRAPPER
+    ]
+    used: list[Wrapper] = []
     parts: list[ImportedPart] = []
     for device in devices:
-        part = read_part(device.name or "skin", device.attributes["type"], reader.group_of(device), notes)
-        ports = wrappers.ports_of(part, notes)
+        part = PartReader(device.name or "skin", device.attributes["type"], files.reader.group_of(device), notes).read()
+        wrapper = _wrapper_of(part, wrappers, notes)
+        used += [wrapper] if wrapper else []
+        ports = wrapper.ports if wrapper else ()
         body = read_body(part, ports, *files.of_ports(ports), notes)
         buses = translate(part, body, bus_names or {}, notes, wants_names=wants_buses)
         if not buses:
             continue
-        enabled, places = enabled_places(buses), places_of(part, ports)
+        quiet = Notes()
+        places = {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
+        enabled = enabled_places(buses)
         check_drawings(body, places, enabled, notes)
         name = service_name(part.name, {each.name for each in parts})
         placed = sum(len(group.uid) for place in enabled for group in body.groups.get(place, ()))
         patches = [bus.patch for bus in buses]
-        groups, regions = body.groups_of(patches), regions_of(name, places, enabled, patches)
+        groups = [
+            group
+            for bus, patch in enumerate(patches)
+            for place, of_place in body.groups.items()
+            if place[0] == patch
+            for group in on_bus(bus, of_place)
+        ]
+        regions = regions_of(name, places, enabled, patches)
         yarp = yarp_ports(part, ports, buses, body, notes)
         parts.append(ImportedPart(name, part, ports, buses, yarp, groups, regions, len(enabled), placed))
     if not only:
-        wrappers.name_unused(notes)
+        _name_unused(files.devices, [wrapper for wrapper in wrappers if wrapper not in used], notes)
     files.name_unused({port.name for part in parts for port in part.ports})
-    return Import(parts, sources.files)
+    return Import(parts, files.read)
 
 
-def _gather(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes) -> None:
-    if not path.is_dir():
-        _take(path, reader, sources, notes)
-        return
-    for file in _files_in(path):
-        try:
-            _take(file, reader, sources, notes, is_asked_for=False)
-        except ConfigurationError as error:
-            notes.add("missing", file, f"cannot be used: {error}")
+def _wrapper_of(part: DevicePart, wrappers: Sequence[Wrapper], notes: Notes) -> Wrapper | None:
+    """Return the wrapper with the ports of a device; with several robots, the one in the nearest folder."""
+    where = part.element.file.resolve().parts
+
+    def shared(wrapper: Wrapper) -> int:
+        pairs = zip(where, wrapper.element.file.resolve().parts, strict=False)
+        return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+    of_part = [wrapper for wrapper in wrappers if wrapper.device == part.name]
+    if not of_part:
+        text = "no skinWrapper with its ports, so its body parts and the places of its taxels are unknown"
+        notes.at(part.element, "missing", text)
+        return None
+    nearest = max(of_part, key=shared)
+    notes.take(nearest.notes)
+    return nearest
 
 
-def _files_in(folder: Path) -> list[Path]:
-    found: list[Path] = []
-    for where, folders, names in os.walk(folder):
-        folders.sort()
-        found += [Path(where, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
-        if len(found) > _MOST_FILES:
-            raise ConfigurationError(f"{folder}: more than {_MOST_FILES} files: give the folder of one robot")
-    return found
+def _name_unused(devices: Sequence[Element], wrappers: Sequence[Wrapper], notes: Notes) -> None:
+    """Note the wrappers of no imported device, and devices that are related to skin and not imported."""
+    for wrapper in wrappers:
+        notes.at(wrapper.element, "missing", f"there is no skin device {wrapper.device!r}; its ports are not used")
+    for element in devices:
+        kind = element.attributes.get("type", "")
+        if kind in (WRAPPER, *DEVICE_TYPES) or not any(word in kind.lower() for word in _RELATED_DEVICES):
+            continue
+        text, is_skin = f"a device of type {kind!r} is not imported", "skin" in kind.lower()
+        if not is_skin:
+            text += "; for inertial sensors, see the option inertial of the driver"
+        notes.at(element, "unknown" if is_skin else "info", text)
 
 
-def _take(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes, *, is_asked_for: bool = True) -> None:
-    sources.files.append(path)
-    if path.suffix.lower() not in (".txt", ".ini"):
-        sources.devices += reader.devices(path)
-        return
-    text = read_text(path)
-    if is_positions(text):
-        sources.positions.append(path)
-    elif is_drawing(text):
-        sources.drawings.append(path)
-    elif is_asked_for:
-        raise ConfigurationError(f"{path}: neither a position file nor a drawing of skinGui")
-    else:
-        notes.add("info", path, "neither a position file nor a drawing of skinGui")
+class _Sources:
+    """The devices, position files and drawings in files and folders, and the position files that a person chose."""
 
-
-def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
-    found = [device for device in devices if device.attributes.get("type") in DEVICE_TYPES]
-    if not found:
-        raise ConfigurationError(f"no device of type {' or '.join(DEVICE_TYPES)} in what was read")
-    for name in names:
-        if not any(device.name == name for device in found):
-            others = nearest_name(name, sorted(device.name for device in found))
-            raise ConfigurationError(f"--part {name}: there is none{others}")
-    return [device for device in found if not names or device.name in names]
-
-
-class _Wrappers:
-    """The skinWrappers, and their ports of skin devices."""
-
-    def __init__(self, reader: DeviceReader, devices: Sequence[Element]) -> None:
-        self._wrappers: list[tuple[Element, Wrapper, Notes]] = []
-        self._others: list[Element] = []
-        for device in devices:
-            device_type = device.attributes.get("type", "")
-            if device_type == WRAPPER:
-                own = Notes()
-                self._wrappers.append((device, read_wrapper(reader.group_of(device), own), own))
-            elif device_type not in DEVICE_TYPES and any(word in device_type.lower() for word in _RELATED_DEVICES):
-                self._others.append(device)
-        self._used: set[int] = set()
-
-    def ports_of(self, part: DevicePart, notes: Notes) -> Sequence[PortRange]:
-        """Return the ports of a device; with several robots, those of the wrapper in the nearest folder."""
-        where = part.element.file.resolve().parts
-        of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
-        if not of_part:
-            text = "no skinWrapper with its ports, so its body parts and the places of its taxels are unknown"
-            notes.add("missing", part.element.file, text, line=part.element.line, element=part.element.label)
-            return ()
-        element, wrapper, own = max(of_part, key=lambda entry: _shared(where, entry[0].file.resolve().parts))
-        self._used.add(id(element))
-        notes.take(own)
-        return wrapper.ports
-
-    def name_unused(self, notes: Notes) -> None:
-        for element, wrapper, _ in self._wrappers:
-            if id(element) not in self._used:
-                text = f"there is no skin device {wrapper.device!r}; its ports are not used"
-                notes.add("missing", element.file, text, line=element.line, element=element.label)
-        for element in self._others:
-            text = f"a device of type {element.attributes['type']!r} is not imported"
-            is_skin = "skin" in element.attributes["type"].lower()
-            if not is_skin:
-                text += "; for inertial sensors, see the option inertial of the driver"
-            notes.add("unknown" if is_skin else "info", element.file, text, line=element.line, element=element.label)
-
-
-def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    """Return the number of folders that two paths share."""
-    return next((n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
-
-
-class _BodyFiles:
-    def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
+    def __init__(self, chosen: Mapping[str, Path], notes: Notes) -> None:
+        self.reader = DeviceReader(notes)
+        self.devices: list[Element] = []
+        self.read: list[Path] = []
         self._chosen, self._notes = chosen, notes
-        self._positions = sources.positions
+        self._positions: list[Path] = []
         self._drawings: list[tuple[Drawing, Notes]] = []
-        for path in sources.drawings:
-            own = Notes()
-            self._drawings.append((read_drawing(path, own), own))
         self._used: set[Path] = set()
 
+    def add(self, path: Path) -> None:
+        if not path.is_dir():
+            self._take(path)
+            return
+        found: list[Path] = []
+        for where, folders, names in os.walk(path):
+            folders.sort()
+            found += [Path(where, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
+            if len(found) > _MOST_FILES:
+                raise ConfigurationError(f"{path}: more than {_MOST_FILES} files: give the folder of one robot")
+        for file in found:
+            try:
+                self._take(file, is_asked_for=False)
+            except ConfigurationError as error:
+                self._notes.add("missing", file, f"cannot be used: {error}")
+
+    def _take(self, path: Path, *, is_asked_for: bool = True) -> None:
+        self.read.append(path)
+        if path.suffix.lower() not in (".txt", ".ini"):
+            self.devices += self.reader.devices(path)
+            return
+        text = read_text(path)
+        if is_positions(text):
+            self._positions.append(path)
+        elif is_drawing(text):
+            own = Notes()
+            self._drawings.append((read_drawing(path, text, own), own))
+        elif is_asked_for:
+            raise ConfigurationError(f"{path}: neither a position file nor a drawing of skinGui")
+        else:
+            self._notes.add("info", path, "neither a position file nor a drawing of skinGui")
+
     def of_ports(self, ports: Sequence[PortRange]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
+        """Return positions and drawings by body part; with several of one part, and none chosen, none."""
         positions, drawings = {}, {}
         for port in ports:
             path = self._chosen.get(port.name) or self._positions_of(port)
             if path is not None:
                 self._used.add(path)
                 positions[port.name] = read_positions(path, self._notes)
-            drawing = self._drawing_of(port)
-            if drawing is not None:
-                drawings[port.name] = drawing
+            found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
+            self._used.update(drawing.path for drawing, _ in found)
+            if len(found) > 1:
+                names = ", ".join(drawing.path.name for drawing, _ in found)
+                self._notes.at(port.element, "odd", f"several drawings, none used: {names}")
+            elif found:
+                drawings[port.name], own = found[0]
+                self._notes.take(own)
         return positions, drawings
-
-    def name_unused(self, ports: set[str]) -> None:
-        """Note the files of body parts that are not imported.
-
-        Raises:
-            ConfigurationError: the user chose a file for an unknown body part.
-        """
-        for name in self._chosen:
-            if name not in ports:
-                raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")
-        for path in [*self._positions, *(drawing.path for drawing, _ in self._drawings)]:
-            if path not in self._used:
-                self._notes.add("info", path, "no body part of this name is imported")
 
     def _positions_of(self, port: PortRange) -> Path | None:
         """Find it by the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
@@ -332,23 +305,20 @@ class _BodyFiles:
         candidates = exact if len(exact) == 1 else [*exact, *similar]
         if len(candidates) > 1:
             names = ", ".join(path.name for path in candidates)
-            self._note(
-                port,
-                "todo",
-                f"several position files ({names}), none used: choose one with --positions {port.name}=FILE",
-            )
+            text = f"several position files ({names}), none used: choose one with --positions {port.name}=FILE"
+            self._notes.at(port.element, "todo", text)
             return None
         return candidates[0] if candidates else None
 
-    def _drawing_of(self, port: PortRange) -> Drawing | None:
-        found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
-        self._used.update(drawing.path for drawing, _ in found)
-        if len(found) > 1:
-            self._note(port, "odd", f"several drawings, none used: {', '.join(d.path.name for d, _ in found)}")
-            return None
-        for _, own in found:
-            self._notes.take(own)
-        return found[0][0] if found else None
+    def name_unused(self, ports: set[str]) -> None:
+        """Note the files of body parts that are not imported.
 
-    def _note(self, port: PortRange, level: Level, text: str) -> None:
-        self._notes.add(level, port.element.file, text, line=port.element.line, element=port.element.label)
+        Raises:
+            ConfigurationError: a person chose a file for an unknown body part.
+        """
+        for name in self._chosen:
+            if name not in ports:
+                raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")
+        for path in [*self._positions, *(drawing.path for drawing, _ in self._drawings)]:
+            if path not in self._used:
+                self._notes.add("info", path, "no body part of this name is imported")

@@ -50,13 +50,6 @@ class TriangleSet:
 
 
 @dataclass
-class OldBoard:
-    """The values of the old set-up for one board: parameters ``4C_*`` and ``4E_*``."""
-
-    values: dict[str, int]
-
-
-@dataclass
 class DevicePart:
     """A skin device.
 
@@ -69,7 +62,7 @@ class DevicePart:
         period_ms, skin_type, no_load, enabled, shift, cdc_offset: of boards and triangles without a set of their own.
         board_sets: boards that differ.
         triangle_sets: triangles that differ.
-        old: the old set-up of each board, if the files have no other.
+        old: the parameters ``4C_*`` and ``4E_*`` of each board, if the files have no other set-up.
     """
 
     name: str
@@ -85,20 +78,17 @@ class DevicePart:
     cdc_offset: int = 0x2200
     board_sets: list[BoardSet] = field(default_factory=list)
     triangle_sets: list[TriangleSet] = field(default_factory=list)
-    old: dict[int, OldBoard] = field(default_factory=dict)
+    old: dict[int, dict[str, int]] = field(default_factory=dict)
 
     @property
     def host_order(self) -> list[tuple[int, int]]:
-        """Return (patch, board) in the order of the host's index: the boards of the higher patch come first."""
+        """(patch, board) in the order of the host's index: the boards of the higher patch come first."""
         return [(patch, board) for patch in sorted(self.boards, reverse=True) for board in self.boards[patch]]
 
 
-def read_part(name: str, device_type: str, group: Group, notes: Notes) -> DevicePart:
+class PartReader(ValueReader):
     """Read a skin device; note values that make no sense."""
-    return _PartReader(name, device_type, group, notes).read()
 
-
-class _PartReader(ValueReader):
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
         super().__init__(notes)
         self._group = group
@@ -117,7 +107,15 @@ class _PartReader(ValueReader):
             self._read_defaults()
             self._read_board_sets()
             self._read_triangle_sets()
-        self._name_the_rest(self._group)
+        groups = self._group.groups
+        for name in sorted(_GROUPS_OF_THE_ROBOT & set(groups)):
+            for element in _elements_of(groups[name]):
+                element.understood = True
+            self._unused(groups[name].element, "of the robot's computer and its Ethernet boards")
+        for element in _elements_of(self._group):
+            if not element.understood:
+                element.understood = True
+                self.notes.at(element, "unknown", f"not understood{f': {element.text!r}' if element.text else ''}")
         return self._part
 
     # Boards and buses
@@ -142,12 +140,12 @@ class _PartReader(ValueReader):
             if name.startswith(_PATCH_PARAMETER) and number_text in ("1", "2"):
                 self._take_boards(int(number_text), element, name)
         if not self._part.boards:
-            self.note("missing", self._part.element, f"no {_PATCH_PARAMETER}1 or 2 in a group 'patches': no board")
+            self.notes.at(self._part.element, "missing", f"no {_PATCH_PARAMETER}1 or 2 in a group 'patches': no board")
 
     def _take_boards(self, patch: int, element: Element | None, name: str) -> None:
         found = self.numbers(element)
         if element is None:
-            self.note("missing", self._part.element, f"no {name}: no board")
+            self.notes.at(self._part.element, "missing", f"no {name}: no board")
         if element is None or found is None:
             return
         boards: list[int] = []
@@ -170,7 +168,7 @@ class _PartReader(ValueReader):
         part.skin_type = self._default(board, "skinType", part.skin_type)
         part.no_load = self._default(board, "noLoad", part.no_load)
         if part.skin_type not in _SKIN_TYPES:
-            self.note("odd", board["skinType"], f"no known firmware has the skin type {part.skin_type}")
+            self.notes.at(board["skinType"], "odd", f"no known firmware has the skin type {part.skin_type}")
         if "diagnostic" in board:
             self._unused(board["diagnostic"], "whether the robot's software logs faults; Skinware always shows them")
         triangle = self._params_of("defaultCfgTriangle")
@@ -185,7 +183,7 @@ class _PartReader(ValueReader):
     def _params_of(self, name: str) -> dict[str, Element]:
         group = self._group.groups.get(name)
         if group is None:
-            self.note("missing", self._part.element, f"no group {name!r}")
+            self.notes.at(self._part.element, "missing", f"no group {name!r}")
             return {}
         return group.params
 
@@ -197,7 +195,7 @@ class _PartReader(ValueReader):
         return found
 
     def _assume(self, name: str, value: object) -> None:
-        self.note("odd", self._part.element, f"no usable {name!r}; taken to be {value}, {_HOST_DEFAULTS}")
+        self.notes.at(self._part.element, "odd", f"no usable {name!r}; taken to be {value}, {_HOST_DEFAULTS}")
 
     def _sets(self, group_name: str, prefix: str, columns: str) -> list[tuple[Element, list[int]]]:
         group = self._group.groups.get(group_name)
@@ -205,17 +203,19 @@ class _PartReader(ValueReader):
             return []
         count = self.number(group.params.get("numOfSets"), 0, 1000)
         if count is None:
-            self.note("missing", group.element, "no usable numOfSets: the robot refuses such a file; no set is used")
+            self.notes.at(
+                group.element, "missing", "no usable numOfSets: the robot refuses such a file; no set is used"
+            )
             count = 0
         if prefix == "triangleSetCfg" and count > _MOST_TRIANGLE_SETS:
             text = f"the robot's software reads the first {_MOST_TRIANGLE_SETS} of these {count} sets; here, all count"
-            self.note("info", group.element, text)
+            self.notes.at(group.element, "info", text)
         width = len(columns.split())
         sets = []
         for number in range(1, count + 1):
             element = group.params.get(f"{prefix}{number}")
             if element is None:
-                self.note("missing", group.element, f"numOfSets is {count}, but there is no {prefix}{number}")
+                self.notes.at(group.element, "missing", f"numOfSets is {count}, but there is no {prefix}{number}")
                 continue
             row = self.numbers(element)
             if row is None:
@@ -257,7 +257,7 @@ class _PartReader(ValueReader):
                 self.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
             elif of_patch:
                 if enabled not in (0, 1):
-                    self.note("info", element, f"enabled = {enabled}: counts as 1, as on the robot")
+                    self.notes.at(element, "info", f"enabled = {enabled}: counts as 1, as on the robot")
                 triangles = tuple(range(first, last + 1))
                 self._part.triangle_sets.append(
                     TriangleSet(element, patch, board, triangles, bool(enabled), shift, cdc_offset)
@@ -269,7 +269,7 @@ class _PartReader(ValueReader):
         if self._can_device not in (None, number) and number not in self._other_patches:
             self._other_patches.add(number)
             text = f"for patch {number}, but canDeviceNum is {self._can_device}: the robot refuses such a file"
-            self.note("odd", element, f"{text}; it is taken to be for the only bus")
+            self.notes.at(element, "odd", f"{text}; it is taken to be for the only bus")
         return _ONLY_PATCH
 
     def _boards_of(self, element: Element, patch: int) -> tuple[int, ...]:
@@ -282,7 +282,7 @@ class _PartReader(ValueReader):
 
     def _read_old(self) -> None:
         boards = self._part.boards.get(_ONLY_PATCH, ())
-        self._part.old = {board: OldBoard(dict(OLD_DEFAULTS)) for board in boards}
+        self._part.old = {board: dict(OLD_DEFAULTS) for board in boards}
         for name, default in OLD_DEFAULTS.items():
             element = self._group.params.get(name)
             row = self.numbers(element)
@@ -290,10 +290,10 @@ class _PartReader(ValueReader):
                 continue
             if len(row) != len(boards):
                 text = f"{len(row)} values for {len(boards)} boards; the robot takes {default:#x} for the others"
-                self.note("odd", element, text)
+                self.notes.at(element, "odd", text)
             for board, value in zip(boards, row, strict=False):
                 if 0 <= value <= 255:
-                    self._part.old[board].values[name] = value
+                    self._part.old[board][name] = value
                 else:
                     self.refuse(element, f"{value} is not a byte")
 
@@ -301,17 +301,7 @@ class _PartReader(ValueReader):
 
     def _unused(self, element: Element, why: str) -> None:
         element.understood = True
-        self.note("info", element, why)
-
-    def _name_the_rest(self, group: Group) -> None:
-        for name in sorted(_GROUPS_OF_THE_ROBOT & set(group.groups)):
-            for element in _elements_of(group.groups[name]):
-                element.understood = True
-            self._unused(group.groups[name].element, "of the robot's computer and its Ethernet boards")
-        for element in _elements_of(group):
-            if not element.understood:
-                element.understood = True
-                self.note("unknown", element, f"not understood{f': {element.text!r}' if element.text else ''}")
+        self.notes.at(element, "info", why)
 
 
 OLD_DEFAULTS = {

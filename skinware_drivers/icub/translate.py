@@ -1,8 +1,9 @@
-"""Translate a part to a configuration, which the driver checks, and write it as text."""
+"""Translate a part to configurations, which the drivers ``roboskin`` and ``yarp`` check, and write them as text."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +12,10 @@ import msgspec
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
+from skinware.geometry import GeometryGroup
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import (
+    CHANNELS,
     NON_TACTILE,
     TRIANGLES,
     Kind,
@@ -22,10 +25,12 @@ from skinware_drivers.can.roboskin_options import (
     usual_kind,
 )
 from skinware_drivers.can.roboskin_setup import BoardSetUp
-from skinware_drivers.icub.body import Body, Place, places_text
+from skinware_drivers.description import Module
+from skinware_drivers.icub.body import Body, Place, places_text, triangles_of
+from skinware_drivers.icub.device import PortRange
 from skinware_drivers.icub.part import ETHERNET, DevicePart
-from skinware_drivers.icub.xml_tree import Notes
-from skinware_drivers.streams.yarp import YarpOptions
+from skinware_drivers.icub.xml_tree import Level, Notes
+from skinware_drivers.streams.yarp import Triangles, YarpOptions
 
 _HEXADECIMAL = ("cdc_offset", "no_load")
 _ALWAYS = ("boards", "period_ms", "skin_type", "no_load", "shift", "cdc_offset", "enabled", "values")
@@ -33,44 +38,25 @@ _ALWAYS = ("boards", "period_ms", "skin_type", "no_load", "shift", "cdc_offset",
 _TABLES = ("special_boards", "modules", "triangles")
 
 
-def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, geometry: str = "") -> str:
-    """Return the text of a file for ``skin-driver --config``."""
-    each = [(bus.name, bus.comment, bus.options) for bus in buses]
-    return _text("roboskin", name, each, comment, geometry)
-
-
-def yarp_configuration_text(
-    name: str, buses: Sequence[tuple[str, YarpOptions]], comment: str, geometry: str = ""
+def configuration_text(
+    driver: str, name: str, buses: Sequence[tuple[str, str, msgspec.Struct]], comment: Sequence[str], geometry: str = ""
 ) -> str:
-    """Return the text of a file for ``skin-driver --config`` with the driver ``yarp``.
-
-    Args:
-        buses: name and options of each port.
-    """
-    return _text("yarp", name, [(bus, "", options) for bus, options in buses], comment, geometry)
-
-
-def _text(driver: str, name: str, buses: Sequence[tuple[str, str, msgspec.Struct]], comment: str, geometry: str) -> str:
-    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    """Return the text of a file for ``skin-driver --config``; ``buses``: name, remark and options of each."""
+    lines = [f"# {line}".rstrip() for line in comment]
     lines += [f"driver = {_value(driver)}", f"name = {_value(name)}"]
     lines += [f"geometry = {_value(geometry)}"] if geometry else []
     for bus, to_fill_in, options in buses:
         lines += ["", "[[bus]]", f"name = {_value(bus)}" + (f"  # {to_fill_in}" if to_fill_in else "")]
-        lines += ["[bus.options]", *_option_lines(options)]
+        lines.append("[bus.options]")
+        for field in msgspec.structs.fields(options):
+            value = getattr(options, field.name)
+            if field.name not in _ALWAYS and value == field.default:
+                continue
+            if field.name in _TABLES:
+                lines += [f"{field.name} = [", *(f"  {_table(row)}," for row in value), "]"]
+            else:
+                lines.append(f"{field.name} = {_value(value, field.name)}")
     return "\n".join(lines) + "\n"
-
-
-def _option_lines(options: msgspec.Struct) -> list[str]:
-    lines = []
-    for field in msgspec.structs.fields(options):
-        value = getattr(options, field.name)
-        if field.name not in _ALWAYS and value == field.default:
-            continue
-        if field.name in _TABLES:
-            lines += [f"{field.name} = [", *(f"  {_table(row)}," for row in value), "]"]
-        else:
-            lines.append(f"{field.name} = {_value(value, field.name)}")
-    return lines
 
 
 def _table(row: msgspec.Struct) -> str:
@@ -105,11 +91,7 @@ _BUS_COMMENT = {
 
 @dataclass(frozen=True)
 class TranslatedBus:
-    """One bus of a part.
-
-    Attributes:
-        name: for ``--bus``; empty: to fill in.
-    """
+    """One bus of a part; ``name``: for ``--bus``; empty: to fill in."""
 
     patch: int
     name: str
@@ -132,7 +114,7 @@ def translate(
             options = _with_kinds(options, patch, body)
             RoboskinDriver(options)  # refuses impossible options
         except ConfigurationError as error:
-            _note(notes, "odd", part, f"patch {patch} is left out: {error}")
+            notes.at(part.element, "odd", f"patch {patch} is left out: {error}")
             continue
         name = bus_names.get(patch, part.bus_name)
         comment = "" if name else _BUS_COMMENT.get(part.device_type, _BUS_COMMENT[""]).format(patch=patch)
@@ -141,7 +123,7 @@ def translate(
     bare = enabled_places(buses) & body.bare
     if bare:
         text = "on, but without a taxel by the position files; if they show faults, add enabled = false to the modules"
-        _note(notes, "odd", part, f"{text}: {places_text(bare)}")
+        notes.at(part.element, "odd", f"{text}: {places_text(bare)}")
     for patch in bus_names:
         if patch not in part.boards:
             raise ConfigurationError(f"--bus {patch}={bus_names[patch]}: {part.name} has no patch {patch}")
@@ -151,9 +133,9 @@ def translate(
             "the boards are behind an Ethernet board: connect a CAN interface to the bus itself and fill in its name;"
             f" patch {', '.join(to_fill_in)}"
         )
-        _note(notes, "todo", part, text)
+        notes.at(part.element, "todo", text)
     elif to_fill_in:
-        _note(notes, "todo", part, "the files do not name a CAN interface of this machine: fill in the bus")
+        notes.at(part.element, "todo", "the files do not name a CAN interface of this machine: fill in the bus")
     return buses
 
 
@@ -167,7 +149,6 @@ def enabled_places(buses: list[TranslatedBus]) -> set[Place]:
 
 
 def service_name(name: str, taken: set[str]) -> str:
-    """Return the name of a device as the name of a service."""
     safe = re.sub(r"[^A-Za-z0-9_-]", "_", name).lstrip("_-")[:40] or "skin"
     found, number = safe, 2
     while found in taken:
@@ -199,7 +180,7 @@ def _old_options(part: DevicePart, patch: int, notes: Notes) -> RoboskinOptions:
     for board, settings in each.items():
         if (settings.shift, settings.cdc_offset) != (first.shift, first.cdc_offset):
             text = f"board {board} has another 4E_Shift or 4C_CDCOffset; those of board {boards[0]} are taken for all"
-            _note(notes, "odd", part, text)
+            notes.at(part.element, "odd", text)
     special = tuple(
         SpecialBoards((board,), **_taken(settings, _OF_A_BOARD))
         for board, settings in each.items()
@@ -221,25 +202,25 @@ def _taken(source: object, names: Sequence[str]) -> dict[str, Any]:
 
 class _OldSettings:
     def __init__(self, part: DevicePart, board: int, notes: Notes) -> None:
-        values = part.old[board].values
+        values = part.old[board]
         period_ms = float(_USUAL_OLD_PERIOD_MS)
         if values["4C_Timer"] & 0xF == _OWN_TIMER:
             period_ms = (values["4C_TimeL"] | values["4C_TimeH"] << 8) * _TICK_MS
         self.period_ms = min(max(round(period_ms), 1), 209)
         if self.period_ms != period_ms:
-            level = "info" if abs(self.period_ms - period_ms) < 1 else "odd"
-            _note(notes, level, part, f"board {board}: a period of {period_ms:g} ms becomes {self.period_ms} ms")
+            level: Level = "info" if abs(self.period_ms - period_ms) < 1 else "odd"
+            notes.at(part.element, level, f"board {board}: a period of {period_ms:g} ms becomes {self.period_ms} ms")
         parameter = values["4E_Param"]
         self.skin_type = parameter & 3 if parameter & _COMPENSATED else _NOT_COMPENSATED_TYPE
         if parameter & ~(_COMPENSATED | 3):
-            _note(
-                notes, "unknown", part, f"board {board}: 4E_Param {parameter:#x}: only bits 0, 1 and 3 are understood"
+            notes.at(
+                part.element, "unknown", f"board {board}: 4E_Param {parameter:#x}: only bits 0, 1 and 3 are understood"
             )
         if values["4E_Shift3_1"] != _AREA_SHIFTS:
             text = f"board {board}: 4E_Shift3_1 {values['4E_Shift3_1']:#x}: areas are not used, so 0x22 is sent"
-            _note(notes, "info", part, text)
+            notes.at(part.element, "info", text)
         if values["4E_Shift"] & 0xF0:
-            _note(notes, "odd", part, f"board {board}: 4E_Shift {values['4E_Shift']:#x}: its low four bits count")
+            notes.at(part.element, "odd", f"board {board}: 4E_Shift {values['4E_Shift']:#x}: its low four bits count")
         self.shift, self.no_load = values["4E_Shift"] & 0x0F, values["4E_NoLoad"]
         self.cdc_offset = values["4C_CDCOffsetL"] | values["4C_CDCOffsetH"] << 8
         mask = values["4E_EnaL"] | values["4E_EnaH"] << 8
@@ -273,22 +254,101 @@ def _check_set_up(part: DevicePart, patch: int, options: RoboskinOptions, body: 
                 f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, then off"
                 " by this set, and no set switches them on again: they stay off, as on the robot"
             )
-            notes.add("odd", element.file, text, line=element.line, element=element.label)
+            notes.at(element, "odd", text)
     on = {(patch, board, t) for board in options.boards for t in BoardSetUp(options, board).enabled}
     off = set(options.boards) - {board for _, board, _ in on}
     if off:
-        _note(notes, "odd", part, f"patch {patch}: no triangle is switched on: board {runs_text(off)}")
+        notes.at(part.element, "odd", f"patch {patch}: no triangle is switched on: board {runs_text(off)}")
     unknown = {place for place in on if place not in body.shapes and place not in body.bare}
     if unknown and part.old:
         text = (
             'the files do not say what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
             f" without it, skin type {options.skin_type} decides"
         )
-        _note(notes, "todo", part, text)
+        notes.at(part.element, "todo", text)
     elif special := {p for p in unknown if usual_kind(BoardSetUp(options, p[1]).skin_type, p[2]) != "triangle"}:
         text = f"fingertips or palms? No position file says, so they are taken to be fingertips: {places_text(special)}"
-        _note(notes, "todo", part, text)
+        notes.at(part.element, "todo", text)
 
 
-def _note(notes: Notes, level: Any, part: DevicePart, text: str) -> None:
-    notes.add(level, part.element.file, text, line=part.element.line, element=part.element.label)
+_CHANNEL = 0xFF
+
+
+@dataclass(frozen=True)
+class PartPort:
+    """One port of a part.
+
+    Attributes:
+        name: of the body part, the end of the port's name.
+        options: of the driver ``yarp``.
+        groups: places of its sensors; their uid lack the bus.
+    """
+
+    name: str
+    options: YarpOptions
+    groups: Sequence[GeometryGroup]
+
+    @property
+    def uids(self) -> list[int]:
+        """Return the uids of its sensors that feel touch, without the bus."""
+        return [
+            first + channel
+            for run in self.options.triangles
+            for _, first in run.places()
+            for channel in range(CHANNELS)
+            if channel not in run.non_tactile()
+        ]
+
+
+def yarp_ports(
+    part: DevicePart, ports: Sequence[PortRange], buses: Sequence[TranslatedBus], body: Body, notes: Notes
+) -> list[PartPort]:
+    """Return the ports of a part with a triangle that is switched on, in the order of the port map.
+
+    Args:
+        ports: as its wrapper maps them; several ranges may have one name.
+        buses: of the part, with the kinds of its triangles.
+    """
+    modules = {
+        (bus.patch, board, module.key): module
+        for bus in buses
+        for board in bus.options.boards
+        for patch in RoboskinDriver(bus.options).patches_set_up([board])
+        for module in patch.modules
+        if module.kind in NON_TACTILE
+    }
+    found = []
+    for name in dict.fromkeys(port.name for port in ports):
+        of_name = [port for port in ports if port.name == name]
+        length = max(port.local_first + port.last - port.first + 1 for port in of_name)
+        places = {number: place for port in of_name for number, place in triangles_of(part, port, Notes()).items()}
+        on = {number: place for number, place in sorted(places.items()) if place in modules}
+        try:
+            options = YarpOptions(length=length, triangles=tuple(_runs(on, modules)))
+        except ConfigurationError as error:
+            notes.add("odd", of_name[0].element.file, f"port {name} is left out: {error}")
+            continue
+        groups = [  # of sensors that feel touch, by their position in the vector
+            msgspec.structs.replace(group, uid=tuple(CHANNELS * number + (uid & _CHANNEL) for uid in group.uid))
+            for number, place in on.items()
+            for group in body.groups.get(place, ())
+            if group.type == "pressure"
+        ]
+        if on:
+            found.append(PartPort(name, options, groups))
+    return found
+
+
+def _runs(on: Mapping[int, Place], modules: Mapping[Place, Module]) -> list[Triangles]:
+    patches = Counter(board for _, board in {place[:2] for place in on.values()})
+    runs: dict[tuple[object, ...], list[int]] = {}
+    for number, place in on.items():
+        patch, board, triangle = place
+        module = modules[place]
+        thermal = tuple(k for k, sensor in enumerate(module.channels) if sensor and sensor.type_name == "temperature")
+        label = board if patches[board] == 1 else 100 * patch + board
+        runs.setdefault((label, CHANNELS * (number - triangle), module.kind, thermal), []).append(triangle)
+    return [
+        Triangles(label, first, tuple(triangles), kind, None if thermal == NON_TACTILE[kind] else thermal)  # type: ignore[arg-type, index]
+        for (label, first, kind, thermal), triangles in runs.items()
+    ]

@@ -13,17 +13,17 @@ import msgspec
 from skinware.errors import ConfigurationError
 from skinware.text import printable
 
+LARGEST_FILE = 4 << 20
+_DEEPEST = 40
+_LONGEST, _LONGEST_NUMBER = 400, 12
+
 Level = Literal["todo", "odd", "unknown", "missing", "info"]
 """``todo``: the user must fill in or decide; ``odd``: understood, but probably a mistake; ``unknown``: not understood;
 ``missing``: named, but does not exist; ``info``: nothing to do."""
 
 
 class Note(msgspec.Struct, frozen=True, order=True):
-    """A remark.
-
-    Attributes:
-        line: counted from 1; 0: the whole file.
-    """
+    """A remark; lines count from 1, and 0 is the whole file."""
 
     level: Level
     file: str
@@ -36,13 +36,36 @@ class Note(msgspec.Struct, frozen=True, order=True):
         return f"{place}: {self.element}: {self.text}" if self.element else f"{place}: {self.text}"
 
 
-_LONGEST = 400
-
-
 def shown(text: object) -> str:
     """Return a text of a foreign file for a terminal or a comment: without control characters, not too long."""
     visible = printable(str(text))
     return visible if len(visible) <= _LONGEST else f"{visible[:_LONGEST]} ..."
+
+
+@dataclass
+class Element:
+    """An element; ``tag`` has its prefix, and ``understood`` says that a reader has used it."""
+
+    tag: str
+    attributes: dict[str, str]
+    file: Path
+    line: int
+    children: list[Element] = field(default_factory=list)
+    text: str = ""
+    understood: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.attributes.get("name", "")
+
+    @property
+    def label(self) -> str:
+        return f'{self.tag} "{self.name}"' if self.name else self.tag
+
+    def walk(self) -> Iterator[Element]:
+        yield self
+        for child in self.children:
+            yield from child.walk()
 
 
 class Notes:
@@ -52,14 +75,14 @@ class Notes:
     def add(self, level: Level, file: Path | str, text: str, *, line: int = 0, element: str = "") -> None:
         self._notes[Note(level, shown(file), line, shown(element), shown(text))] = None
 
+    def at(self, element: Element, level: Level, text: str) -> None:
+        self.add(level, element.file, text, line=element.line, element=element.label)
+
     def take(self, other: Notes) -> None:
         self._notes.update(other._notes)
 
     def all(self) -> list[Note]:
         return list(self._notes)
-
-
-_LONGEST_NUMBER = 12
 
 
 def words(text: str) -> list[str]:
@@ -68,11 +91,7 @@ def words(text: str) -> list[str]:
 
 
 def number(text: str) -> int:
-    """Return a whole number as these files write it.
-
-    Raises:
-        ValueError: the text is not a whole number.
-    """
+    """Return a whole number as these files write it."""
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
         raise ValueError(f"{text[:20]!r} is not a whole number")
     try:
@@ -125,59 +144,15 @@ class ValueReader:
             value, clear = False, found == ["false"]
         if not clear:
             text = f"{element.text!r} is neither true nor false; taken to be {str(value).lower()}, as on the robot"
-            self.note("odd", element, text)
+            self.notes.at(element, "odd", text)
         return value
 
     def refuse(self, element: Element, why: str) -> None:
-        """Note that a value was not understood."""
-        self.note("unknown", element, f"{why}; left out")
-
-    def note(self, level: Level, element: Element, text: str) -> None:
-        """Note something about an element."""
-        self.notes.add(level, element.file, text, line=element.line, element=element.label)
-
-
-LARGEST_FILE = 4 << 20
-_DEEPEST = 40
-
-
-@dataclass
-class Element:
-    """An element.
-
-    Attributes:
-        tag: with its prefix, if any.
-        understood: a reader has used it.
-    """
-
-    tag: str
-    attributes: dict[str, str]
-    file: Path
-    line: int
-    children: list[Element] = field(default_factory=list)
-    text: str = ""
-    understood: bool = False
-
-    @property
-    def name(self) -> str:
-        return self.attributes.get("name", "")
-
-    @property
-    def label(self) -> str:
-        return f'{self.tag} "{self.name}"' if self.name else self.tag
-
-    def walk(self) -> Iterator[Element]:
-        yield self
-        for child in self.children:
-            yield from child.walk()
+        self.notes.at(element, "unknown", f"{why}; left out")
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read an ordinary file that is not too large.
-
-    Raises:
-        ConfigurationError: the file is not one.
-    """
+    """Read an ordinary file that is not too large."""
     try:
         if not path.is_file():
             raise ConfigurationError(f"{path}: not there, or not an ordinary file")
@@ -193,11 +168,6 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_xml(path: Path, notes: Notes) -> Element:
-    """Return the root element of a file.
-
-    Raises:
-        ConfigurationError: the file does not exist, is not XML, or defines entities; the message says where.
-    """
     return _TreeBuilder(path, notes).read(_without_odd_comments(read_bytes(path), path, notes))
 
 

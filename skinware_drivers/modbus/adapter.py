@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BusError, ConfigurationError
+from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.status import Status
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
@@ -122,8 +122,16 @@ class ModbusAdapter(Adapter[OptionsT]):
             if getattr(self, what) not in words:
                 raise ConfigurationError(f"{name}: {what} = {getattr(self, what)!r}: give {' or '.join(words)}")
         super().check()
-        if is_declared:
-            self._check_keys()
+        if not is_declared:
+            return
+        modules = {patch.key: [module.key for module in patch.modules] for patch in self.patches}
+        for block in self.registers:
+            if block.patch is not None and block.patch not in modules:
+                raise ConfigurationError(f"{block.name}: no patch has the key {block.patch}; there are: {[*modules]}")
+            patches = list(modules) if block.patch is None else [block.patch]
+            there = [key for patch in patches for key in modules[patch]]
+            if block.module is not None and block.module not in there:
+                raise ConfigurationError(f"{block.name}: no module has the key {block.module}; there are: {there}")
 
     def fit(self, bus: Bus) -> None:
         """Set what the bus asks for.
@@ -194,6 +202,18 @@ class ModbusAdapter(Adapter[OptionsT]):
         except ModbusException:
             return None
 
+    async def find_unit(self, link: Link, units: Sequence[int], address: int) -> int:
+        """Return the first of these units that answers a question for a register, or refuses it; else the last one."""
+        for unit in units[:-1]:
+            try:
+                await self.read(link, address, unit=unit)
+            except HandshakeTimeout:
+                continue
+            except ModbusException:
+                pass
+            return unit
+        return units[-1]
+
     async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:
         """Write registers (function 16): only those of the device's documentation, and only when a person wants it.
 
@@ -229,7 +249,7 @@ class ModbusAdapter(Adapter[OptionsT]):
             if not (cycles := max(times.values(), default=0)):
                 return
         if (cycle_s := passed_s / cycles) > _TOO_SLOW * self.period_s:
-            log.info("%s: a cycle takes about %.0f ms", link.bus_name, 1e3 * cycle_s)
+            link.log.info("a cycle takes about %.0f ms", 1e3 * cycle_s)
             self.period_s = _UNHURRIED * cycle_s
             self.use_registers(self.registers)
 
@@ -241,16 +261,6 @@ class ModbusAdapter(Adapter[OptionsT]):
         if code := wire.exception_of(reply.payload):
             raise ModbusException(f"{link.bus_name}, unit {unit}: {wire.exception_text(code)}", code)
         return reply.payload
-
-    def _check_keys(self) -> None:
-        modules = {patch.key: [module.key for module in patch.modules] for patch in self.patches}
-        for block in self.registers:
-            if block.patch is not None and block.patch not in modules:
-                raise ConfigurationError(f"{block.name}: no patch has the key {block.patch}; there are: {[*modules]}")
-            patches = list(modules) if block.patch is None else [block.patch]
-            there = [key for patch in patches for key in modules[patch]]
-            if block.module is not None and block.module not in there:
-                raise ConfigurationError(f"{block.name}: no module has the key {block.module}; there are: {there}")
 
     def _layout(self) -> Layout:
         name, declared = type(self).__name__, cast("object", self.registers)
@@ -286,25 +296,31 @@ class ModbusAdapter(Adapter[OptionsT]):
         return Layout(frames)
 
 
-class OrderWatch(ZeroWatch):
-    """Also log, once, why values above the greatest value of a taxel are suspect.
+class ExplainingWatch(ZeroWatch):
+    """Also log, once each, what status bits that came from the wire mean for a device.
 
-    Args:
-        full_scale: the greatest value of a taxel.
+    Attributes:
+        meanings: status bits, and what to log.
     """
 
-    def __init__(self, tables: SkinTables, full_scale: int) -> None:
+    meanings: ClassVar[Sequence[tuple[Status, str]]]
+
+    def __init__(self, tables: SkinTables) -> None:
         super().__init__(tables)
-        self._full_scale = full_scale
-        self._has_logged = False
+        self._unsaid = dict(self.meanings)
 
     def look(self, updates: Updates) -> None:
         super().look(updates)
-        is_sensor = updates.sensors < self.tables.structure.n_sensors
-        if not self._has_logged and (updates.status[is_sensor] & Status.SUSPECT).any():
-            self._has_logged = True
-            log.warning(
-                "values above %d, which no taxel has, are suspect; if there are many, the device may send the bytes of"
-                " registers in the other order: add byte_order=little to the options of the bus",
-                self._full_scale,
-            )
+        if not self._unsaid:
+            return
+        status = updates.status[updates.sensors < self.tables.structure.n_sensors]
+        for bit in [bit for bit in self._unsaid if (status & bit).any()]:
+            log.warning("%s", self._unsaid.pop(bit))
+
+
+def above_text(full_scale: int) -> str:
+    """Return the meaning of values above the greatest value of a taxel."""
+    return (
+        f"values above {full_scale}, which no taxel has, are suspect; if there are many, the device may send the bytes"
+        " of registers in the other order: add byte_order=little to the options of the bus"
+    )

@@ -16,8 +16,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware_drivers.bus import Bus, FrameBatch, KernelBus
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.gateway import Gateway
-from skinware_drivers.modbus.guests import Guests
+from skinware_drivers.modbus.gateway import Gateway, Guests
 from skinware_drivers.modbus.master import Listener, Master, Talk, Timing
 from skinware_drivers.modbus.native_master import NativeMaster
 from skinware_drivers.modbus.registers import Order, Wanted
@@ -39,8 +38,6 @@ _FRAME_BYTES = 3
 
 
 class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a Modbus bus, besides those of a serial line or a connection."""
-
     timeout_ms: Annotated[
         Annotated[float, Meta(gt=0)] | None, Meta(description="longest wait for a reply; default: of the driver")
     ] = None
@@ -59,11 +56,7 @@ class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    """Make the device's end, for emulators: a bus of bytes, which they take apart themselves.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
-    """
+    """Make the device's end, for emulators: a bus of bytes, which they take apart themselves."""
     if channel.startswith(_TCP):
         address = parse_address("modbus:tcp", channel.removeprefix(_TCP), default_port=DEFAULT_PORT, needs_host=False)
         return TcpServerBus(str(address), options, **more)
@@ -83,9 +76,6 @@ class ModbusBus(KernelBus):
 
     Args:
         channel: ``tcp://HOST[:PORT]``, or the path of a port.
-
-    Raises:
-        ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
     """
 
     medium: ClassVar[str] = "modbus"
@@ -152,9 +142,6 @@ class ModbusBus(KernelBus):
 
         Args:
             turnaround_s: pause after a reply; None: that of the standard on a serial line, none over TCP.
-
-        Raises:
-            ConfigurationError: a serial line has no unit 0.
         """
         self._baudrate = baudrate if self._address is not None else self._serial_options.baudrate or baudrate
         if turnaround_s is None:
@@ -187,12 +174,6 @@ class ModbusBus(KernelBus):
         return characters * _BITS_PER_CHARACTER / (self._serial_options.baudrate or baudrate)
 
     def open(self) -> None:
-        """Connect, or open the line for us alone.
-
-        Raises:
-            BusNotAvailable: it is missing, not permitted or taken; the message says what to do.
-            ConfigurationError: no such kind of port, or it has no such baud rate.
-        """
         if self._epoll is not None:
             return
         self._port = port = self._open_port()
@@ -237,16 +218,11 @@ class ModbusBus(KernelBus):
         self._wake()
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
         epoll = self._epoll
         return -1 if epoll is None else epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Take replies, ask what is due, and append the frames that are whole.
-
-        Raises:
-            BusNotAvailable: the port went away, or sends no Modbus.
-        """
+        """Take replies, ask what is due, and append the frames that are whole."""
         port, talk = self._port, self._talk
         if port is None or talk is None:
             raise BusNotAvailable(f"{self!r} is not open")
@@ -284,7 +260,6 @@ class ModbusBus(KernelBus):
         return not self.listen_only and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
-        """Let C ask; see :class:`skinware_drivers.bus.KernelBus`."""
         talk, port = self._talk, self._port
         if not isinstance(talk, NativeMaster) or not isinstance(port, DescriptorPort):
             return False
@@ -314,9 +289,6 @@ class ModbusBus(KernelBus):
         Args:
             identifier: the unit.
             payload: function and data of a read or write of registers.
-
-        Raises:
-            BusSendError: the bus is closed or only listens, too many messages wait, or this is no read or write.
         """
         self.may_send_by(self._port)
         message = wire.Message(identifier, payload)
@@ -336,7 +308,6 @@ class ModbusBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """Remarks on the port, for people."""
         notes = [] if self._port is None else [self._port.note, "" if self._gateway is None else self._gateway.note]
         return ", ".join(filter(None, notes))
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -28,7 +29,7 @@ from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.fields import Above, AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid, Place
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
+from skinware_drivers.modbus.adapter import ExplainingWatch, ModbusAdapter, above_text
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.options import Options
@@ -46,12 +47,6 @@ _MODELS: Mapping[int, Shape] = {0: "4x8", 1: "6x6"}
 
 
 class DfrobotOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or there are not as many shapes as units.
-    """
-
     units: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=31)], ...], Meta(min_length=1, description="numbers of the arrays")
     ] = (1,)
@@ -73,11 +68,13 @@ class DfrobotOptions(Options, frozen=True):
             raise ConfigurationError(f"option shapes: give one, or {len(self.units)}, one for each of the units")
 
 
-class DfrobotWatch(OrderWatch):
+class DfrobotWatch(ExplainingWatch):
     """Also log which arrays are not ready."""
 
+    meanings = ((Status.SUSPECT, above_text(_FULL_SCALE)),)
+
     def __init__(self, tables: SkinTables) -> None:
-        super().__init__(tables, _FULL_SCALE)
+        super().__init__(tables)
         self._is_logged: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
 
     def look(self, updates: Updates) -> None:
@@ -105,22 +102,31 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask each array for its shape, unless the options give it.
-
-        Raises:
-            BusError: an array does not answer, reports an unknown shape, or must not be asked.
-        """
+        """Ask each array for its shape, unless the options give it."""
         units, shapes = self.options.units, list(self.options.shapes)
         if not shapes:
             if link.listen_only:
                 raise BusError("arrays must be asked for their shape, listening is not enough: say option shapes")
             shapes = [await self._ask_shape(link, unit) for unit in units]
-        arrays = list(zip(units, shapes * len(units) if len(shapes) == 1 else shapes, strict=True))
         has_state = self.options.state and not link.listen_only  # another master may not read it
-        self.use_registers([_registers(unit, _GRIDS[shape], has_state=has_state) for unit, shape in arrays])
-        self.geometry = Geometry.joined([_places(unit, _GRIDS[shape]) for unit, shape in arrays])
-        self.patches = [_patch(unit, shape) for unit, shape in arrays]
-        return self.patches
+        unready = Flag(Status.NOT_CONNECTED, 0, ">u2", mask=0xFFFF, normal=_READY)
+        registers, patches, places = list[Registers](), list[Patch](), list[Geometry]()
+        for unit, shape in zip(units, shapes * len(units) if len(shapes) == 1 else shapes, strict=True):
+            grid = _GRIDS[shape]
+            # of each register the cell, row by row from the top, and of each cell the register: it is its own inverse
+            cells = np.arange(grid.rows * grid.columns).reshape(grid.rows, -1)[::-1].ravel().tolist()
+            if has_state:
+                block = Registers(_STATE_AT, 1 + len(cells), unit, READ_INPUT, to=[None, *cells], flags=[unready])
+            else:
+                block = Registers(_CELLS_AT, len(cells), unit, READ_INPUT, to=cells)
+            registers.append(replace(block, patch=unit))
+            uids = [unit << 8 | cell for cell in cells]
+            patches.append(Patch(f"unit {unit}", [Module([Sensor("pressure", uid) for uid in uids], kind=shape)], unit))
+            # no pitch is published, and how two arrays lie to each other is not known
+            places.append(grid.at(Place(f"unit_{unit}_nominal"), ["pressure"], uids))
+        self.use_registers(registers)
+        self.patches, self.geometry = patches, Geometry.joined(places)
+        return patches
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
@@ -140,30 +146,3 @@ class DfrobotDriver(ModbusAdapter[DfrobotOptions]):
                 + (", and byte_order=little as option of the bus" if model == 0x0100 else "")
             )
         return _MODELS[int(model)]
-
-
-def _order(grid: Grid) -> list[int]:
-    """Return the register of each cell, counted from the first, row by row from the top; it is its own inverse."""
-    return [int(cell) for cell in np.arange(grid.rows * grid.columns).reshape(grid.rows, -1)[::-1].ravel()]
-
-
-def _uids(unit: int, grid: Grid) -> list[int]:
-    return [unit << 8 | cell for cell in _order(grid)]
-
-
-def _registers(unit: int, grid: Grid, *, has_state: bool) -> Registers:
-    cells = _order(grid)
-    if not has_state:
-        return Registers(_CELLS_AT, len(cells), unit, READ_INPUT, to=cells, patch=unit)
-    unready = Flag(Status.NOT_CONNECTED, 0, ">u2", mask=0xFFFF, normal=_READY)
-    return Registers(_STATE_AT, 1 + len(cells), unit, READ_INPUT, to=[None, *cells], patch=unit, flags=[unready])
-
-
-def _patch(unit: int, shape: Shape) -> Patch:
-    sensors = [Sensor("pressure", uid) for uid in _uids(unit, _GRIDS[shape])]
-    return Patch(f"unit {unit}", [Module(sensors, kind=shape)], key=unit)
-
-
-def _places(unit: int, grid: Grid) -> Geometry:
-    """Return nominal places: no pitch is published, and how two arrays lie to each other is not known."""
-    return grid.at(Place(f"unit_{unit}_nominal"), ["pressure"], _uids(unit, grid))

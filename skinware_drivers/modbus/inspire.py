@@ -20,14 +20,13 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.fields import Above, AnyFlag, Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, OrderWatch
+from skinware_drivers.modbus.adapter import ExplainingWatch, ModbusAdapter, above_text
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.options import Options
-from skinware_drivers.polling import Watch
 
 _FIRST, _BYTES = 3000, 2
 _FULL_SCALE = 4096
@@ -74,33 +73,41 @@ class InspireOptions(Options, frozen=True):
     ] = False
 
 
+class InspireWatch(ExplainingWatch):
+    meanings = ((Status.SUSPECT, above_text(_FULL_SCALE)),)
+
+
 class InspireDriver(ModbusAdapter[InspireOptions]):
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
     dtype: npt.DTypeLike = np.uint16
     flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))
     address_step = _BYTES
+    watch = InspireWatch
 
     def __init__(self, options: InspireOptions) -> None:
         self.follows_line = options.period_ms is None
         if options.by_matrix:  # no address is computed, and no two matrices are read together
             self.address_step, self.largest_gap = 1, 0
-        self.registers = [
-            Registers(each.address, each.rows * each.columns, options.unit, to=_channels(each), patch=0, module=number)
-            for number, each in enumerate(_MATRICES)
-        ]
-        self.patches = [Patch(f"{options.side} hand", [_module(number) for number in range(len(_MATRICES))])]
-        self.geometry = _places(Hand(options.side))
+        registers, modules = list[Registers](), list[Module]()
+        for number, each in enumerate(_MATRICES):
+            count, name = each.rows * each.columns, f"{each.part} {each.name}".rstrip()
+            registers.append(Registers(each.address, count, options.unit, to=_channels(each), patch=0, module=number))
+            sensors = [Sensor("pressure", uid) for uid in _uids(each)]
+            modules.append(Module(sensors, number, f"{each.rows}x{each.columns}", name))
+        self.registers, self.patches = registers, [Patch(f"{options.side} hand", modules)]
+        hand, places = Hand(options.side), []  # the manual gives no lengths
+        for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
+            matrices = [matrix for matrix in _MATRICES if matrix.part == part]
+            grids = [Grid(matrix.rows, matrix.columns) for matrix in matrices]
+            for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
+                places.append(grid.at(centre, ["pressure"], _uids(matrix)))
+        self.geometry = Geometry.joined(places)
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Measure how long the hand takes for all its registers, then return it."""
         await self.learn_period(link)
         return self.patches
-
-    @classmethod
-    def watch(cls, tables: SkinTables) -> Watch:
-        """Watch for matrices that send only 0, and for values that no taxel has."""
-        return OrderWatch(tables, _FULL_SCALE)
 
 
 def _channels(matrix: _PadMatrix) -> list[int]:
@@ -113,21 +120,3 @@ def _uids(matrix: _PadMatrix) -> list[int]:
     """Return the number of each taxel's register, from 3000 on, row by row."""
     first = (matrix.address - _FIRST) // _BYTES
     return [first + int(place) for place in np.argsort(_channels(matrix))]
-
-
-def _module(number: int) -> Module:
-    matrix = _MATRICES[number]
-    sensors = [taxels(1, first_uid=uid)[0] for uid in _uids(matrix)]
-    name = f"{matrix.part} {matrix.name}".rstrip()
-    return Module(sensors, key=number, kind=f"{matrix.rows}x{matrix.columns}", name=name)
-
-
-def _places(hand: Hand) -> Geometry:
-    """Return nominal places: the manual gives no lengths."""
-    found = []
-    for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
-        matrices = [matrix for matrix in _MATRICES if matrix.part == part]
-        grids = [Grid(matrix.rows, matrix.columns) for matrix in matrices]
-        for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
-            found.append(grid.at(centre, ["pressure"], _uids(matrix)))
-    return Geometry.joined(found)

@@ -6,7 +6,6 @@ Both take bytes and return bytes and rows. They read no clock and know no port, 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
@@ -14,8 +13,8 @@ from typing import NamedTuple
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.guests import Guests, Retry
-from skinware_drivers.modbus.registers import Image, Overheard, Read, Row, Wanted
+from skinware_drivers.modbus.gateway import Guests, Retry
+from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -23,6 +22,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 ANSWERS = 0x700
 """Identifier of the frame that answers a driver's own question: this plus the unit. Its payload is the message."""
 _BUSY_NS, _SILENCE_NS = NS_PER_S // 100, NS_PER_S // 500
+_OVERHEARD_NS = NS_PER_S
+"""Registers that another master read longer ago are not joined with newer ones."""
 _MOST_TRIES = 3
 _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
@@ -37,34 +38,6 @@ class Timing(NamedTuple):
     timeout_ns: int
     turnaround_ns: int
     """From a reply to the next question."""
-
-
-class Talk(ABC):
-    """The conversation on one line.
-
-    Attributes:
-        rows: frames that have become whole; the reader removes them.
-    """
-
-    def __init__(self) -> None:
-        self.rows: deque[Row] = deque()
-
-    @abstractmethod
-    def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Take bytes that have come.
-
-        Raises:
-            ValueError: they are no Modbus, and bytes that follow could not be understood either.
-        """
-
-    @abstractmethod
-    def say(self, time_ns: int) -> bytes:
-        """Return the bytes to be sent now; none if nothing is due."""
-
-    @property
-    @abstractmethod
-    def due_ns(self) -> int | None:
-        """Time at which ``say`` has something to do; None: not before something is heard."""
 
 
 class Open(NamedTuple):
@@ -130,7 +103,7 @@ class Schedule:
         return others and of_unit is not None and time_ns < of_unit.until_ns
 
 
-class Master(Talk):
+class Master:
     """Ask for the registers of a schedule, and in between for what the driver and other programs ask.
 
     After a timeout, nothing is asked until the late reply has come or as much time again has passed. On a serial line,
@@ -141,6 +114,9 @@ class Master(Talk):
 
     Args:
         over_tcp: the line is a connection, not a serial line.
+
+    Attributes:
+        rows: frames that have become whole; the reader removes them.
     """
 
     def __init__(
@@ -154,8 +130,9 @@ class Master(Talk):
         begun_ns: int,
         guests: Guests | None = None,
     ) -> None:
-        super().__init__()
-        self._timing, self._counters, self._name, self._guests = timing, counters, name, guests
+        self.rows: deque[Row] = deque()
+        self._timing, self._counters, self._name = timing, counters, name
+        self._guests = guests or Guests(may_write=False, over_tcp=over_tcp)
         self._image = Image(wanted)
         self._schedule = Schedule(wanted.reads(), timing.period_ns, begun_ns)
         self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
@@ -176,23 +153,19 @@ class Master(Talk):
 
     @property
     def pending(self) -> int:
-        """Bytes that may still become part of a message."""
         return self._line.pending
-
-    @property
-    def _guests_wait(self) -> bool:
-        return self._guests is not None and self._guests.are_waiting
 
     @property
     def due_ns(self) -> int | None:
         """Time of a timeout, of the end of a pause, or of the beginning of a cycle."""
         if self._open is not None:
             return self._open.until_ns
-        if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests_wait:
+        if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests.are_waiting:
             return self._free_ns
         return max(self._free_ns, self._schedule.deadline_ns) if self._schedule.reads else None
 
     def say(self, time_ns: int) -> bytes:
+        """Return the bytes to be sent now; none if nothing is due."""
         if self._open is not None and time_ns >= self._open.until_ns:
             self._give_up(self._open, time_ns)
         if self._open is not None or time_ns < self._free_ns:
@@ -205,7 +178,7 @@ class Master(Talk):
             return self._ask(again.message, again.read, time_ns, again.tries)
         if self._commands:
             return self._ask(self._commands.popleft(), _COMMAND, time_ns)
-        if self._guests is not None and not (self._schedule.is_due(time_ns) and self._was_guest):
+        if not (self._schedule.is_due(time_ns) and self._was_guest):
             question = self._guests.next(time_ns)
             if question is not None:
                 self._was_guest = True
@@ -215,10 +188,20 @@ class Master(Talk):
         return b"" if read is None else self._ask(self._schedule.questions[read], read, time_ns)
 
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Look for the reply; see :meth:`Talk.heard`."""
+        """Take bytes that have come, and look for the reply.
+
+        Raises:
+            ValueError: they are no Modbus, and bytes that follow could not be understood either.
+        """
         if isinstance(self._line, wire.TcpMessages):
             for message in self._line.feed(chunk):
-                self._take_numbered(message, time_ns)
+                asked, late = self._open, self._late
+                if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
+                    self._take(asked, message, time_ns)
+                elif late is not None and message.number == late.message.number:
+                    self._take_late(late, message, time_ns)
+                else:
+                    self._counters.refused += 1
             return
         self._line.feed(chunk)
         asked = self._late or self._open
@@ -234,16 +217,12 @@ class Master(Talk):
             self._take(asked, found, time_ns)
             self._line.drop()  # no unit may speak unasked
         elif self._counters.framing.checksum_errors > damaged:
-            self._take_damaged(asked, time_ns)
-
-    def _take_numbered(self, message: Message, time_ns: int) -> None:
-        asked, late = self._open, self._late
-        if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
-            self._take(asked, message, time_ns)
-        elif late is not None and message.number == late.message.number:
-            self._take_late(late, message, time_ns)
-        else:
-            self._counters.refused += 1
+            # bytes as long as the reply, which are none: ask again, once the line is silent
+            self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
+            if asked.read == _GUEST:
+                self._guests.answer(None, time_ns)
+            elif asked.tries < _MOST_TRIES:
+                self._again = asked
 
     def _take(self, asked: Open, message: Message, time_ns: int) -> None:
         self._open = None
@@ -251,9 +230,10 @@ class Master(Talk):
         self._schedule.retries.pop(("unit", message.unit), None)
         if not wire.is_reply(asked.message.data, message.data):
             self._counters.framing.refused += 1
-            self._answer_guest(asked, None, time_ns)
+            if asked.read == _GUEST:
+                self._guests.answer(None, time_ns)
         elif asked.read == _GUEST:
-            self._answer_guest(asked, message.data, time_ns)
+            self._guests.answer(message.data, time_ns)
         elif asked.read == _COMMAND:
             self.rows.append(Row(time_ns, ANSWERS | message.unit, message.data))
         elif code := wire.exception_of(message.data):
@@ -283,18 +263,6 @@ class Master(Talk):
         if asked.read >= 0 and is_good:
             self._take_registers(asked.read, message, time_ns)
 
-    def _take_damaged(self, asked: Open, time_ns: int) -> None:
-        """Ask again, once the line is silent, after bytes that are as long as the reply and are none."""
-        self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
-        if asked.read == _GUEST:
-            self._answer_guest(asked, None, time_ns)
-        elif asked.tries < _MOST_TRIES:
-            self._again = asked
-
-    def _answer_guest(self, asked: Open, reply: bytes | None, time_ns: int) -> None:
-        if asked.read == _GUEST and self._guests is not None:
-            self._guests.answer(reply, time_ns)
-
     def _take_exception(self, asked: Open, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
@@ -304,7 +272,13 @@ class Master(Talk):
         if not retry.times:
             read = self._schedule.reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
-            log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), _advice(code, read))
+            advice = ""
+            if code == wire.NO_FUNCTION:
+                other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
+                advice = f"; it was asked with function {read.function}: try {other}"
+            elif code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
+                advice = "; addresses count from 0: a manual's 30001 or 40001 is 0"
+            log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), advice)
         retry.failed(time_ns)
 
     def _give_up(self, asked: Open, time_ns: int) -> None:
@@ -312,7 +286,8 @@ class Master(Talk):
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
             self._schedule.retry("unit", asked.message.unit).failed(time_ns)
-        self._answer_guest(asked, None, time_ns)
+        if asked.read == _GUEST:
+            self._guests.answer(None, time_ns)
         self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns
         self._drop_from_line()
 
@@ -332,26 +307,28 @@ class Master(Talk):
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 
 
-class Listener(Talk):
+class Listener:
     """Pair the questions of another master with their replies, on a line that it taps; it sends nothing.
 
-    A reply does not say which registers it holds, so a reply is dropped if its question was not heard.
+    A reply does not say which registers it holds, so a reply is dropped if its question was not heard. When that master
+    asks our first question, its cycle begins: replies from before are not joined with later ones.
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:
-        super().__init__()
+        self.rows: deque[Row] = deque()
         self._counters = counters
-        self._overheard = Overheard(wanted)
+        self._image = Image(wanted)
+        reads = wanted.reads()
+        self._first = (reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
         self._line = wire.RtuMessages(counters.framing)
         self._asked: Message | None = None
 
-    @property
-    def due_ns(self) -> int | None:
-        return None
+    due_ns = None
+    """It never has something to say."""
 
     @property
     def pending(self) -> int:
-        """Bytes that may still become part of a message."""
         return self._line.pending
 
     def say(self, time_ns: int) -> bytes:  # noqa: ARG002
@@ -371,13 +348,11 @@ class Listener(Talk):
         if wire.exception_of(reply.data):
             self._counters.errors += 1
         elif asked.data[0] in wire.READS and wire.is_reply(asked.data, reply.data):
-            self.rows += self._overheard.take(asked, reply.data[2:], time_ns)
+            if (asked.unit, asked.data) == self._first:
+                self._cycle_ns = time_ns
+            since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
+            self.rows += self._image.overhear(asked.unit, asked.data, reply.data[2:], time_ns, since_ns)
 
 
-def _advice(code: int, read: Read) -> str:
-    if code == wire.NO_FUNCTION:
-        other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
-        return f"; it was asked with function {read.function}: try {other}"
-    if code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
-        return "; addresses count from 0: a manual's 30001 or 40001 is 0"
-    return ""
+Talk = Master | Listener
+"""The conversation on one line."""

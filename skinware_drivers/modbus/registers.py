@@ -15,15 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware_drivers.fields import AnyFlag, Packed
 from skinware_drivers.layout import Values
-from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, Message, question_to_read
+from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
 
 Order = Literal["big", "little"]
 _LAST_ADDRESS = 0xFFFF
-_OVERHEARD_NS = NS_PER_S
-"""Registers that another master read longer ago are not joined with newer ones."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,6 @@ class Registers:
 
     @property
     def name(self) -> str:
-        """For messages."""
         return f"registers {self.address} of unit {self.unit}"
 
     def check(self, step: int = 1) -> None:
@@ -106,11 +102,7 @@ class Registers:
 
 @dataclass(frozen=True)
 class Read:
-    """One question of a cycle.
-
-    Attributes:
-        first: its first register in that area.
-    """
+    """One question of a cycle; ``first``: its first register in that area."""
 
     unit: int
     function: int
@@ -221,8 +213,12 @@ class Image:
         self.areas: list[Area] = [Area(area) for area in wanted.areas()]
         self.told_ns: npt.NDArray[np.int64] = np.zeros(len(wanted.blocks), np.int64)
         for number, block in enumerate(wanted.blocks):
-            area, first = next(found for found in map(self._place, self.areas, [block] * len(self.areas)) if found)
-            area.blocks.append((number, first, block))
+            for area in self.areas:
+                first, odd = divmod(block.address - area.where.address, wanted.step)
+                is_in = not odd and 0 <= first <= area.where.count - block.count
+                if is_in and _key(area.where) == _key(block):
+                    area.blocks.append((number, first, block))
+                    break
 
     def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
         """Store registers that were read; return the frames that are whole now.
@@ -261,12 +257,6 @@ class Image:
                 rows += self.put(number, place + begin, data[2 * begin : 2 * end], time_ns, since_ns)
         return rows
 
-    def _place(self, area: Area, block: Registers) -> tuple[Area, int] | None:
-        where = area.where
-        first, odd = divmod(block.address - where.address, self._wanted.step)
-        is_in = _key(where) == _key(block) and not odd and 0 <= first <= where.count - block.count
-        return (area, first) if is_in else None
-
     def _bytes(self, registers: npt.NDArray[np.uint8], block: Registers) -> bytes:
         """Return the bytes in the order of the layout: the most significant byte first."""
         if self._wanted.byte_order == "little":
@@ -274,36 +264,8 @@ class Image:
         data = registers.tobytes()
         if self._wanted.word_order == "little":
             for run in block.runs:
-                data = data[: run.offset] + _turned(data[run.offset : run.end], run) + data[run.end :]
+                words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
+                if words > 1:
+                    turned = np.frombuffer(data[run.offset : run.end], ">u2").reshape(-1, words)[:, ::-1].tobytes()
+                    data = data[: run.offset] + turned + data[run.end :]
         return data
-
-
-def _turned(data: bytes, run: Values) -> bytes:
-    """Return the values of a run with their registers in the other order."""
-    words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
-    return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()
-
-
-class Overheard:
-    """Join what another master reads.
-
-    When that master asks our first question, its cycle begins: replies from before are not joined with later ones.
-    """
-
-    def __init__(self, wanted: Wanted) -> None:
-        self._image = Image(wanted)
-        reads = wanted.reads()
-        self._first = (reads[0].unit, reads[0].question) if reads else None
-        self._cycle_ns = 0
-
-    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
-        """Take a reply; return the frames that are whole now.
-
-        Args:
-            registers: bytes of the registers in the reply.
-            time_ns: when it came.
-        """
-        if (asked.unit, asked.data) == self._first:
-            self._cycle_ns = time_ns
-        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
-        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)

@@ -15,7 +15,6 @@ A proximity has 32 bits, the high word first, as bc_stark_sdk 2.0.8 reads it. On
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
@@ -23,25 +22,22 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE, FORCE_Z, PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Module, Patch, Sensor, taxels
 from skinware_drivers.fields import AnyFlag, Flag, Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
+from skinware_drivers.modbus.adapter import ExplainingWatch, ModbusAdapter
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
-from skinware_drivers.polling import Notice, ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
+from skinware_drivers.polling import Notice
 
 _Side = Literal["right", "left"]
 _UNITS: dict[_Side, int] = {"right": 127, "left": 126}
@@ -98,18 +94,7 @@ class _Content(NamedTuple):
     registers: Sequence[Registers]
 
 
-def _content(edition: EditionName, unit: int, *, kind: int = 0, with_status: bool = True) -> _Content:
-    """Return the content of an edition.
-
-    Args:
-        kind: of the values of the Pressure edition: 0 raw, 1 pressure (kPa), 2 force (mN).
-        with_status: read along the status that fingers report.
-    """
-    make = {"touch": _touch, "pressure": _pressure, "force3d": _force3d, "array_pressure": _array_pressure}[edition]
-    return make(unit, kind, with_status)
-
-
-def _touch(unit: int, _kind: int, with_status: bool) -> _Content:
+def _touch(unit: int, with_status: bool) -> _Content:
     force = FORCE_Z.measured(scale=1e-2, minimum=0)
     types = (force, _TANGENTIAL, _DIRECTION, PROXIMITY.measured(unit="counts", minimum=0))
     modules, registers = list[Module](), list[Registers]()
@@ -138,8 +123,8 @@ def _of_touch(
     return Registers(_FORCES_AT, 30, unit, READ_INPUT, patch=0, module=module, flags=flags, values=values)
 
 
-def _pressure(unit: int, kind: int, _with_status: bool) -> _Content:
-    """Nine points on each finger and 46 on the palm, and the sum of each of them."""
+def _pressure(unit: int, kind: int) -> _Content:
+    """Nine points on each finger and 46 on the palm: raw (kind 0), kPa (1) or mN (2); and the sum of each of them."""
     point = _POINTS_OF_PRESSURE[kind]
     parts = [*((f"{finger} tip", 9) for finger in FINGERS), ("palm", 46)]
     modules, registers, first = list[Module](), list[Registers](), 6010
@@ -153,7 +138,7 @@ def _pressure(unit: int, kind: int, _with_status: bool) -> _Content:
     return _Content((point, _SUM), modules, registers)
 
 
-def _force3d(unit: int, _kind: int, _with_status: bool) -> _Content:
+def _force3d(unit: int) -> _Content:
     """Three forces at 31 points of four fingers, and their sums: x and y in the bytes of a register, z in the next."""
     axes = tuple(axis.measured(unit="counts") for axis in FORCE)
     modules, registers = list[Module](), list[Registers]()
@@ -176,7 +161,7 @@ def _of_forces(unit: int, module: int, address: int, points: int) -> Registers:
     return Registers(address, 2 * points, unit, READ_INPUT, patch=0, module=module, values=values)
 
 
-def _array_pressure(unit: int, _kind: int, _with_status: bool) -> _Content:
+def _array_pressure(unit: int) -> _Content:
     """Three forces and two moments of five fingers; suspect until the sensors are warm (8021)."""
     types = (*(axis.measured(unit="counts", minimum=0) for axis in FORCE), *_MOMENTS)
     cold = Flag(Status.SUSPECT, 2, ">u2", mask=0xFFFF, normal=1)
@@ -206,19 +191,14 @@ class Revo2Options(Options, frozen=True):
     ] = False
 
 
-class Revo2Watch(ZeroWatch):
-    """Also log, once, why there are no data."""
+_NO_DATA = (
+    "fingers have no data: touch is not switched on (--enable, or the operation enable), or the hand says that there is"
+    " no sensor (4225 to 4229)"
+)
 
-    _has_logged = False
 
-    def look(self, updates: Updates) -> None:
-        super().look(updates)
-        if not self._has_logged and (updates.status & Status.NOT_CONNECTED).any():
-            self._has_logged = True
-            log.warning(
-                "fingers have no data: touch is not switched on (--enable, or the operation enable), or the hand says"
-                " that there is no sensor (4225 to 4229)"
-            )
+class Revo2Watch(ExplainingWatch):
+    meanings = ((Status.NOT_CONNECTED, _NO_DATA),)
 
 
 class _SaidEdition(NamedTuple):
@@ -244,18 +224,15 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand for its side and edition; while only listening, use the options.
-
-        Raises:
-            BusError: it does not answer, or has no sensors that this driver reads.
-        """
+        """Ask the hand for its side and edition; while only listening, use the options."""
         options, side = self.options, self.options.side
         if not link.listen_only:
-            self._unit = await self._find_unit(link)
+            if self.options.unit is None and self.options.side is None:
+                self._unit = await self.find_unit(link, tuple(_UNITS.values()), _EDITION_AT)
             side = side or await self._ask_side(link)
             self._said, self._is_asked = await self._look(link), True
             names = await self._ask_names(link)
-            log.info("%s: unit %d, %s hand, edition %s, %s", link.bus_name, self._unit, side, self._said.edition, names)
+            link.log.info("unit %d, %s hand, edition %s, %s", self._unit, side, self._said.edition, names)
         self._declare(self._said, side or "right", with_status=options.status and not link.listen_only)
         self.use_registers(self.registers)
         return self.patches
@@ -271,7 +248,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             await asyncio.sleep(pause_s)
             is_off = False
             if self._is_asked and (said := await self._look(link)) != self._said:
-                log.warning("%s: the hand sends something else now: %s", link.bus_name, said)
+                link.log.warning("the hand sends something else now: %s", said)
                 self.tell(self.patches[0], Notice.CHANGED)
             elif self.options.enable and (is_off := await self._is_off(link)):
                 self.tell(self.patches[0], Notice.RESTARTED)
@@ -304,17 +281,6 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         address, count = registers
         await self.write(link, address, [1] * count, unit=self._unit)
         await asyncio.sleep(takes_s)
-
-    async def _find_unit(self, link: Link) -> int:
-        if self.options.unit is not None or self.options.side is not None:
-            return self._unit
-        try:
-            await self.read(link, _EDITION_AT, unit=_UNITS["right"])
-        except ModbusException:
-            pass
-        except HandshakeTimeout:
-            return _UNITS["left"]
-        return _UNITS["right"]
 
     async def _ask_side(self, link: Link) -> _Side:
         said = await self.read_or_none(link, _SIDE_AT, unit=self._unit)
@@ -353,7 +319,12 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
         return ", ".join(found)
 
     def _declare(self, said: _SaidEdition, side: _Side, *, with_status: bool) -> None:
-        what = _content(said.edition, self._unit, kind=said.kind, with_status=with_status)
+        if said.edition == "touch":
+            what = _touch(self._unit, with_status)
+        elif said.edition == "pressure":
+            what = _pressure(self._unit, said.kind)
+        else:
+            what = (_force3d if said.edition == "force3d" else _array_pressure)(self._unit)
         self.types: Sequence[SensorType] = what.types
         self.registers: Sequence[Registers] = what.registers
         self.patches: Sequence[Patch] = [Patch(f"{side} hand", what.modules)]

@@ -13,7 +13,6 @@ of zones, and whether counts or forces. Sources:
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -32,14 +31,12 @@ from skinware_drivers.fields import Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Values
 from skinware_drivers.link import Link
-from skinware_drivers.modbus.adapter import ModbusAdapter, ModbusException
+from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.modbus.wire import READ_HOLDING, READ_INPUT
 from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _UNITS = (1, 126, 127)
 _LOOK_S, _AGAIN_S = 1.0, 0.05
@@ -78,9 +75,6 @@ class Mapping:
     zero: int
     in_register: int
     types: Sequence[SensorType]
-
-    def count_fits(self, pad: int, count: int) -> bool:
-        return 1 <= count <= self.in_register * (self.pads[pad + 1] - self.pads[pad])
 
 
 _MATRIX_COUNTS = (53, 56, 22, *(22, 27) * 4)
@@ -135,12 +129,6 @@ def places(mapping: str, side: str, pad: int, count: int) -> tuple[Grid, Sequenc
 
 
 class Revo3Options(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or ``points`` are not eleven numbers.
-    """
-
     side: Annotated[_Side | None, Meta(description="which hand it is; default: ask the hand")] = None
     unit: Annotated[
         Annotated[int, Meta(ge=1, le=254)] | None,
@@ -212,24 +200,22 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         super().__init__(options)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand for the form of its data, then measure how long it needs for all of them.
-
-        Raises:
-            BusError: it does not answer, sends data that this driver does not read, or must not be asked.
-        """
+        """Ask the hand for the form of its data, then measure how long it needs for all of them."""
         options, side = self.options, self.options.side
         if link.listen_only:
             if options.mapping is None:
                 raise BusError("a hand must be asked for its mapping, listening is not enough: say mapping")
             said = _unasked(options.mapping)
         else:
-            self._unit = await self._find_unit(link)
+            if self.options.unit is None:
+                self._unit = await self.find_unit(link, _UNITS, _FAMILY_AT)
             side = side or await self._ask_side(link)
             self._said = said = await self._look(link)
+        pads, in_register = said.mapping.pads, said.mapping.in_register
         for pad, count in enumerate(options.points or said.counts):
-            if not said.has_sums and not said.mapping.count_fits(pad, count):
+            if not said.has_sums and not 1 <= count <= in_register * (pads[pad + 1] - pads[pad]):
                 raise BusError(f"{link.bus_name}: {count} taxels in the {_PADS[pad]} do not fit mapping {said.name}")
-        log.info("%s: unit %d, %s hand, %s", link.bus_name, self._unit, side or "right", said.text)
+        link.log.info("unit %d, %s hand, %s", self._unit, side or "right", said.text)
         self._declare(said, side or "right", options.points)
         self.use_registers(self.registers)
         await self.learn_period(link)
@@ -247,7 +233,7 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
                 pause_s = _AGAIN_S  # it may have restarted: ask that first, once it answers again
                 continue
             if self._said is not None and said != self._said:
-                log.warning("%s: the hand sends something else now: %s", link.bus_name, said.text)
+                link.log.warning("the hand sends something else now: %s", said.text)
                 self.tell(self.patches[0], Notice.CHANGED)
 
     @operation(sets_up=True)
@@ -263,18 +249,6 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
     @property
     def _mapping(self) -> Mapping:
         return (self._said or _unasked(self.options.mapping)).mapping
-
-    async def _find_unit(self, link: Link) -> int:
-        units = _UNITS if self.options.unit is None else (self.options.unit,)
-        for unit in units[:-1]:
-            try:
-                await self.read(link, _FAMILY_AT, unit=unit)
-            except ModbusException:
-                return unit
-            except HandshakeTimeout:
-                continue
-            return unit
-        return units[-1]
 
     async def _ask_side(self, link: Link) -> _Side:
         side = await self.read_or_none(link, _SIDE_AT, unit=self._unit)

@@ -62,11 +62,6 @@ class Message(NamedTuple):
 
 
 def question_to_read(function: int, address: int, count: int) -> bytes:
-    """Return the question for registers.
-
-    Raises:
-        ValueError: there is no such question.
-    """
     if function not in READS or not 1 <= count <= MOST_REGISTERS or not 0 <= address <= 0xFFFF:
         raise ValueError(f"function {function}, {count} registers from {address}: there is no such question")
     return struct.pack(">BHH", function, address, count)
@@ -117,7 +112,6 @@ def is_reply(question: bytes, reply: bytes) -> bool:
 
 
 def exception_of(reply: bytes) -> int:
-    """Return the code of an exception; 0: the reply is none."""
     return reply[1] if reply[0] & FAILED and len(reply) > 1 else 0
 
 
@@ -158,11 +152,7 @@ class TcpMessages(_Messages):
     """Find the messages in the bytes of a connection."""
 
     def feed(self, chunk: bytes) -> Iterator[Message]:
-        """Yield the messages that a chunk completes.
-
-        Raises:
-            ValueError: the bytes are no Modbus, and no later message can be found either.
-        """
+        """Yield the messages that a chunk completes."""
         self._counters.bytes_in += len(chunk)
         self._rest += chunk
         while len(self._rest) >= _MBAP.size:
@@ -211,7 +201,11 @@ class RtuMessages(_Messages):
             whole = [size for size in sizes if 0 < size <= len(here)]
             for size in whole:
                 if CRC16_MODBUS.of(here[: size - _CRC]) == int.from_bytes(here[size - _CRC : size], "little"):
-                    return self._take(place, size)
+                    self._skip(place)
+                    self._rest = rest[place + size :]
+                    self._counters.frame_bytes += size
+                    self._counters.frames += 1
+                    return Message(here[0], here[1 : size - _CRC])
             was_damaged |= bool(whole)
             if any(size > len(here) for size in sizes):
                 break
@@ -219,13 +213,6 @@ class RtuMessages(_Messages):
         self._counters.checksum_errors += was_damaged and place > 0
         self._skip(place)
         return None
-
-    def _take(self, place: int, size: int) -> Message:
-        self._skip(place)
-        frame, self._rest = self._rest[:size], self._rest[size:]
-        self._counters.frame_bytes += size
-        self._counters.frames += 1
-        return Message(frame[0], frame[1:-_CRC])
 
 
 @functools.lru_cache(256)

@@ -13,9 +13,5 @@ _FILE = Path(__file__).with_name("libskinware_drivers.so")
 
 
 def library() -> skinware.native.Library:
-    """Return the library of the data path.
-
-    Raises:
-        PlatformError: it cannot be loaded; the message has a remedy.
-    """
+    """Return the library of the data path."""
     return skinware.native.load(_FILE, ABI)

@@ -24,11 +24,7 @@ _SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
 
 
 def check_values(frame: Frame) -> None:
-    """Refuse values that the data path cannot read together.
-
-    Raises:
-        ConfigurationError: the message has a remedy.
-    """
+    """Refuse values that the data path cannot read together."""
     dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
     kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
     unknown = next((dtype for dtype in dtypes if dtype.str[1:] not in _TYPES), None)
@@ -44,11 +40,7 @@ def check_values(frame: Frame) -> None:
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
-    """Fill in the part of a plan that is about frames and updates.
-
-    Raises:
-        ConfigurationError: a frame has values that C does not read.
-    """
+    """Fill in the part of a plan that is about frames and updates."""
     compiled, structure, state = decoder.compiled, decoder.tables.structure, decoder.state
     addresses = compiled.addresses
     for frame in compiled.frames:
@@ -166,7 +158,16 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         structs.ByteCondition,
         (structs.ByteCondition(c.offset, c.mask, c.value) for c in frame.when if isinstance(c, Byte)),
     )
-    kind.n_runs, kind.runs = arrays.structs(structs.Run, _runs(frame))
+    runs, column = [], 0
+    for run in frame.runs:
+        if isinstance(run.dtype, Packed):
+            how = run.dtype
+            packed = how.bits, how.order == "little", how.signed, how.skip
+            runs.append(structs.Run(run.offset, run.count, _PACKED, 0, column, *packed))
+        else:
+            runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
+        column += run.count
+    kind.n_runs, kind.runs = arrays.structs(structs.Run, runs)
     values = decoder.tables.structure.dtype
     if not isinstance(frame.values, Expand):
         dtypes = (np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs)
@@ -178,19 +179,6 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         kind.key_mask, kind.n_keys, kind.module_by_key = (1 << bits.width) - 1, table.shape[1], arrays.at(table)
     kind.sequence = _number(frame.sequence)
     return kind
-
-
-def _runs(frame: Frame) -> list[structs.Run]:
-    runs, column = [], 0
-    for run in frame.runs:
-        if isinstance(run.dtype, Packed):
-            how = run.dtype
-            packed = how.bits, how.order == "little", how.signed, how.skip
-            runs.append(structs.Run(run.offset, run.count, _PACKED, 0, column, *packed))
-        else:
-            runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
-        column += run.count
-    return runs
 
 
 def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.native import read_structs
+from skinware.native.structs import read_structs
 from skinware_drivers.wire_tap import Kept
 
 _HEADERS = ("path.h", "inside.h", "framing.h", "flow.h")
@@ -24,7 +24,6 @@ _classes = read_structs([Path(__file__).with_name(name) for name in _HEADERS], _
 
 
 def __getattr__(name: str) -> Any:
-    """Return the class of a struct."""
     if name not in _classes:
         raise AttributeError(f"the headers have no struct for {name}")
     return _classes[name]
@@ -45,11 +44,7 @@ class Arrays:
         self._kept: list[object] = []
 
     def at(self, array: npt.NDArray[Any]) -> int:
-        """Return the address of an array that Python goes on using.
-
-        Raises:
-            ValueError: its elements do not lie one after the other.
-        """
+        """Return the address of an array that Python goes on using."""
         if not array.flags.c_contiguous:
             raise ValueError(f"an array of {array.shape} {array.dtype} whose elements lie apart")
         self._kept.append(array)

@@ -80,9 +80,6 @@ class ConfigFile:
 
     Args:
         path: of the file; None: all settings have their defaults.
-
-    Raises:
-        ConfigurationError: there is no such file, it is no TOML, or a key or value is wrong.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -116,9 +113,6 @@ class ConfigFile:
         Args:
             struct: the driver's ``Options``.
             given: texts by name of option, as of a command line.
-
-        Raises:
-            ConfigurationError: an unknown option or a wrong value.
         """
         number, of_bus = next(
             ((i, bus.options) for i, bus in enumerate(self.settings.bus) if bus.name == bus_name), (0, {})

@@ -113,7 +113,7 @@ class PathHooks:
             "heard": lambda: self.listeners.heard(),
             "damaged": self._on_damage,
         }
-        if self._decoder.device_stamps.are_sent:
+        if self._decoder.device_stamps.times:
             called["tell_times"] = self._on_times
         if getattr(self._publisher.watch.look, "__func__", None) is not Watch.look:
             called["look"] = self._on_look
@@ -148,7 +148,8 @@ class PathHooks:
                 return 0
             self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
             try:
-                self._words.must_leave |= leaves
+                if leaves:
+                    self._words.must_leave = True
                 return hook(*arguments) or 0
             except BaseException as error:  # noqa: BLE001
                 self.error = error

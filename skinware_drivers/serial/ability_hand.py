@@ -12,7 +12,6 @@ temperatures. Answers of kind 2 have no touch.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -29,8 +28,6 @@ from skinware_drivers.fields import Bits, Identifier, Packed, Sentinel
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Expand, Frame, Layout, Values
 from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
 _FINGERS = ("index", "middle", "ring", "little", "thumb")
@@ -96,7 +93,11 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
             for key, name in enumerate(_FINGERS)
         ]
         self.patches = (Patch(f"{options.side} hand", modules),)
-        self.geometry = _places(Hand(options.side), kind.name)
+        hand, found = Hand(options.side), []
+        for key, name in enumerate(_FINGERS):
+            [place] = hand.down(name, [_SITES])
+            found.append(_SITES.at(place, [kind.name], range(_N * key, _N * (key + 1)), _CELLS))
+        self.geometry = Geometry.joined(found)
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -105,10 +106,7 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
     async def attend(self, link: Link) -> None:
         with link.follow(_WITHOUT_TOUCH) as heard:
             await heard.get()
-        log.warning(
-            "%s: the hand sends answers without touch: another program asks for them (its reply mode is 2)",
-            link.bus_name,
-        )
+        link.log.warning("the hand sends answers without touch: another program asks for them (its reply mode is 2)")
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
@@ -116,14 +114,6 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
         address = AbilityHandOptions().address
         await link.request(address, _READ_NO_TOUCH, _WITHOUT_TOUCH, timeout_s=_IDENTIFY_S)
         return f"Ability Hand at address {address:#x}"
-
-
-def _places(hand: Hand, type_name: str) -> Geometry:
-    found = []
-    for number, finger in enumerate(_FINGERS):
-        [place] = hand.down(finger, [_SITES])
-        found.append(_SITES.at(place, [type_name], range(_N * number, _N * (number + 1)), _CELLS))
-    return Geometry.joined(found)
 
 
 def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:

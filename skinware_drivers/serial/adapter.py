@@ -11,8 +11,7 @@ import numpy as np
 from skinware.errors import BusError
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.fields import Identifier, Match
-from skinware_drivers.layout import Frame
+from skinware_drivers.fields import Identifier
 from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import Poll
 from skinware_drivers.serial.bus import SerialBus
@@ -60,7 +59,11 @@ class SerialAdapter(Adapter[OptionsT]):
             return 0.0
         size = _size(self.commands or self.framing, poll.identifier, poll.payload)
         if (answer := poll.answer) is not None:
-            lengths = [min(frame.length, default=0) for frame in self.layout.frames if _may_be(frame, answer)]
+            lengths = []
+            for frame in self.layout.frames:
+                conditions = [condition for condition in frame.when if isinstance(condition, Identifier)]
+                if all((c.value ^ answer.value) & c.mask & answer.mask == 0 for c in conditions):
+                    lengths.append(min(frame.length, default=0))
             payload = answer.prefix.ljust(min(lengths, default=0), b"\0")
             size += _size(self.framing, answer.value, payload)
         return _BITS_PER_BYTE * size / self._line.baudrate
@@ -74,11 +77,6 @@ class SerialAdapter(Adapter[OptionsT]):
         self.framing = framing
         if self._line is not None:
             self._line.use(framing, self.commands, self.baudrate)
-
-
-def _may_be(frame: Frame, answer: Match) -> bool:
-    conditions = [condition for condition in frame.when if isinstance(condition, Identifier)]
-    return all((c.value ^ answer.value) & c.mask & answer.mask == 0 for c in conditions)
 
 
 def _size(encoding: Encoding, identifier: int, payload: bytes) -> int:

@@ -18,7 +18,6 @@ program does not say of which unit the device's time is: option ``time_unit_us``
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -33,8 +32,6 @@ from skinware_drivers.fields import DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _BEGIN = b"\xf0\xc4"
 _IN_A_MS = 10
 _LONGEST_MS = 0xFFFF // _IN_A_MS
@@ -47,12 +44,6 @@ _ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unkno
 
 
 class AgniOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     period_ms: Annotated[
         int, Meta(ge=0, le=_LONGEST_MS, description="time between two messages; 0: leave the device's own")
     ] = 0
@@ -92,11 +83,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self.dtype = np.dtype(options.values).newbyteorder("=")
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the device for its sensors; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the device for its sensors; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a device reports the length of its messages only on request: listening is not enough")
         if self._patch is not None:
@@ -125,7 +112,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
                 Frame(f"sensor {number}", [Identifier(number)], [_TIME + length], values, module=number, time=time)
             )
             first_uid += count
-        log.info("%s: device %d with %d sensors", link.bus_name, device, n_sensors)
+        link.log.info("device %d with %d sensors", device, n_sensors)
         self.layout = Layout(frames)
         totals = {number: 3 + _TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
         self.change_framing(_framing({**totals, 0: 7 + 4 * n_sensors, _ALIVE: 4, _ERROR: 5}, 2))
@@ -140,7 +127,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         return f"AGNI device {device} with {n_sensors} sensors"
 
     async def configure(self, link: Link) -> None:
-        """Set the period of all sensors, if the options want one."""
         if self._period_ms:
             each = b"".join(
                 struct.pack("<BH", sensor, _IN_A_MS * self._period_ms) for sensor in range(1, self._n_sensors + 1)
@@ -171,7 +157,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         with link.follow(Match(_ERROR)) as heard:
             while True:
                 error = (await heard.get()).payload[0]
-                log.warning("%s: the device received %s", link.bus_name, _ERRORS.get(error, f"error {error:#04x}"))
+                link.log.warning("the device received %s", _ERRORS.get(error, f"error {error:#04x}"))
 
     @operation()
     async def period(self, link: Link, patches: Sequence[Patch], ms: int) -> None:  # noqa: ARG002
@@ -193,6 +179,5 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     @staticmethod
     async def _ask(link: Link, tries: int = _TRIES) -> bytes:
-        """Return the configuration."""
         reply = await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S, tries=tries)
         return reply.payload

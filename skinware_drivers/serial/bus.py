@@ -38,9 +38,6 @@ class SerialBus(KernelBus):
     Args:
         channel: path or URL; empty if the options name a USB device.
         payload_size: bytes of the longest body that fits into a batch; longer ones are counted as refused.
-
-    Raises:
-        ConfigurationError: an option is unknown or has a bad value.
     """
 
     medium: ClassVar[str] = "serial"
@@ -88,12 +85,7 @@ class SerialBus(KernelBus):
         self._restart()
 
     def open(self) -> None:
-        """Open the port exclusively, raw, with empty buffers.
-
-        Raises:
-            BusNotAvailable: missing, not permitted or taken; the message says what to do.
-            ConfigurationError: no such kind of port, or it has no such baud rate.
-        """
+        """Open the port exclusively, raw, with empty buffers."""
         if self._port is not None:
             return
         port = self._open_port()
@@ -111,15 +103,10 @@ class SerialBus(KernelBus):
         return open_port(path, self._serial_options, self.baudrate)
 
     def fileno(self) -> int:
-        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
         return -1 if self._epoll is None else self._epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that have arrived, at most ``batch.free``; if others remain, the bus stays readable.
-
-        Raises:
-            BusNotAvailable: the port went away, or must be opened again before frames can be found.
-        """
+        """Append the frames that have arrived, at most ``batch.free``; if others remain, the bus stays readable."""
         if self._port is None:
             raise BusNotAvailable(f"{self!r} is not open")
         if self._unsent:
@@ -141,7 +128,6 @@ class SerialBus(KernelBus):
         return isinstance(self._stream, NativeStream) and isinstance(self._port, DescriptorPort | None)
 
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        """Describe to C code how to receive; see :class:`skinware_drivers.bus.KernelBus`."""
         stream, port = self._stream, self._port
         if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
             return False
@@ -162,21 +148,12 @@ class SerialBus(KernelBus):
         self._judge(now_ns())
 
     def nothing_received(self, number: int) -> int:
-        """Interpret an error of the kernel in the place of bytes; return 0 if more may come.
-
-        Raises:
-            BusNotAvailable: the port went away.
-        """
         if self._handed is None:
             return 0
         raise self._handed[1].gone(number)
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame; bytes that the port does not take at once follow later.
-
-        Raises:
-            BusSendError: closed, opened to listen only, no such frame, or the port takes no more bytes.
-        """
+        """Send one frame; bytes that the port does not take at once follow later."""
         try:
             self._send(identifier, payload)
         except BusSendError:
@@ -199,7 +176,6 @@ class SerialBus(KernelBus):
 
     @property
     def note(self) -> str:
-        """Advice about the port."""
         return "" if self._port is None else self._port.note
 
     def _restart(self) -> None:

@@ -211,11 +211,7 @@ class Delimited(Framing):
         return DelimitedFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a frame as it is sent; the header is zero except for the identifier.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
+        """Return a frame as it is sent; the header is zero except for the identifier."""
         check_body(identifier, payload, self.identifier, self.minimum_body, self.maximum_body)
         header = bytearray(self.body_start)
         if self.identifier is not None:

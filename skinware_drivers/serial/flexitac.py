@@ -15,7 +15,6 @@ Cells of a sound pad rest at 10 to 40 counts (PyFlexiTac), and cells with broken
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -33,8 +32,6 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Packet, Recurring, SerialAdapter, TextMatrix
 from skinware_drivers.serial.framing import Framing
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _MARKER = b"\xaa\x55"
 _SIZES = {256: (16, 16), 384: (12, 32), 512: (16, 32), 1024: (32, 32)}
 """Rows and columns of the boards that are published, by their number of cells."""
@@ -46,12 +43,6 @@ _FRAME = "pad_nominal"
 
 
 class FlexiTacOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     size: Annotated[
         str, Meta(pattern=r"^(\d{1,2}x\d{1,2})?$", description="ROWSxCOLUMNS, as 12x32; default: by listening")
     ] = ""
@@ -104,15 +95,10 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return -(-self._hearing.maximum_body // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Listen for the number of cells.
-
-        Raises:
-            BusError: no matrix is heard, its size is unknown, or another than the option's.
-        """
         self._heard = None
         self._heard = heard = await self.hear_size(link)
         rows, columns = self._agreed(link, heard)
-        log.info("%s: a matrix of %d x %d cells", link.bus_name, rows, columns)
+        link.log.info("a matrix of %d x %d cells", rows, columns)
         of_size = [Byte(0, rows), Byte(1, columns)] if self.options.firmware == "text" else []
         cells = Values(len(of_size), "u1", rows * columns)
         flags = [Sentinel(Status.OUT_OF_RANGE, 255)]
@@ -126,7 +112,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
-        """Listen for a matrix of a known size."""
         heard = await cls(FlexiTacOptions()).hear_size(link)
         return None if heard.shape is None else f"FlexiTac with {_in_words([heard.shape])} cells"
 
@@ -137,11 +122,6 @@ class FlexiTacDriver(SerialAdapter[FlexiTacOptions]):
         return False
 
     async def hear_size(self, link: Link) -> HeardSize:
-        """Listen for a matrix and return its size.
-
-        Raises:
-            HandshakeTimeout: no matrix is heard.
-        """
         self.change_framing(self._hearing)
         try:
             with link.follow(Match(0, 0)) as heard:

@@ -14,7 +14,7 @@ Frames are found one by one, in plain Python over ``bytes`` methods: docs/decisi
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Literal, NamedTuple
@@ -88,6 +88,10 @@ class Framed(NamedTuple):
     end: int
 
 
+Splitting = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
+"""(identifier, body) of a frame -> (identifier, body) of each frame that it becomes."""
+
+
 def fill_rows(wire: npt.NDArray[np.void], frames: Sequence[Framed]) -> None:
     """Fill (n,) rows of a batch with frames whose bodies fit into their payloads."""
     width = wire["payload"].shape[1]
@@ -140,10 +144,14 @@ class Framer(ABC):
 
     Attributes:
         counters: counts of bytes and frames; framers that follow each other on one line can share them.
+        splitting: what each frame becomes, with the end of the whole; the counters count whole frames.
+        is_lost: no more frames can be found, so that the bus must be opened again; False for most framings.
     """
 
     def __init__(self) -> None:
         self.counters: FramerCounters = FramerCounters()
+        self.splitting: Splitting | None = None
+        self.is_lost: bool = False
         self._rest = b""
         self._before = 0  # bytes of the stream before the rest
         self._wanted = 0  # bytes without which the rest cannot be judged
@@ -157,11 +165,6 @@ class Framer(ABC):
     def pending(self) -> int:
         """Bytes that may still become part of a frame."""
         return len(self._rest)
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether no more frames can be found, so that the bus must be opened again; False for most framings."""
-        return False
 
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
         """Note that the host sends a question: bytes held back are no part of the answer."""
@@ -178,7 +181,10 @@ class Framer(ABC):
         self._rest = stream[done:]
         self._before += done
         self.counters.frames += len(found)
-        return found
+        if self.splitting is None:
+            return found
+        split = self.splitting
+        return [Framed(*part, frame.end) for frame in found for part in split(frame.identifier, frame.body)]
 
     @abstractmethod
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:

@@ -46,11 +46,7 @@ class LengthFirst(Framing):
         return _Steps(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a question, which need not be as long as an answer.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
+        """Return a question, which need not be as long as an answer."""
         check_body(identifier, payload, self.identifier, 0, (1 << 8 * self.length.size) - 1 - self.header)
         frame = bytearray(self.header)
         self.length.put(frame, self.header + len(payload))
@@ -67,10 +63,6 @@ class _Steps(Framer):
         self._is_in_step = True
         self._vain = 0  # questions in a row whose answers put it out of step
 
-    @property
-    def is_lost(self) -> bool:
-        return self._vain >= _MOST_IN_VAIN
-
     def asked(self) -> None:
         """Drop half an answer to an earlier question: no answer to this one completes it."""
         if self._rest:
@@ -79,6 +71,7 @@ class _Steps(Framer):
             self._rest, self._wanted = b"", 0
         if not self._is_in_step:
             self._vain += 1
+            self.is_lost = self._vain >= _MOST_IN_VAIN
             self._is_in_step = not self.is_lost
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
@@ -134,11 +127,7 @@ class Recurring(Framing):
         return _RecurringFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a frame as it is sent.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
+        """Return a frame as it is sent."""
         check_body(identifier - self.identifier, payload, None, self.minimum_body, self.maximum_body)
         return self.marker + payload
 
@@ -219,11 +208,7 @@ class TextMatrix(Framing):
         return _TextMatrixFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return the lines of a matrix.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
+        """Return the lines of a matrix."""
         check_body(identifier - self.identifier, payload, None, 3, self.maximum_body)
         rows, columns, *numbers = payload
         if len(numbers) != rows * columns or not self.is_possible(rows, columns):

@@ -28,11 +28,7 @@ _COUNTED = {name: name for name in ("bytes_in", "frame_bytes", "idle_bytes", "sk
 
 
 def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Stream:
-    """Return a stream in C if C can find these frames, else in Python.
-
-    Args:
-        payload_size: bytes of the longest body; frames with longer ones are counted as refused.
-    """
+    """Return a stream in C if C can find these frames, else in Python; bodies beyond ``payload_size`` are refused."""
     made = NativeStream if can_compile(framing) else PythonStream
     return made(framing, payload_size, counters)
 
@@ -85,25 +81,16 @@ def _compile(framing: Framing, arrays: structs.Arrays) -> structs.Framing:
     if framing.checksum is not None:
         compiled.checksum = _checksum(framing.checksum, arrays)
     if isinstance(framing, Delimited):
-        _compile_delimited(framing, compiled, arrays)
-    else:
-        _compile_packet(framing, compiled, arrays)
-    return compiled
-
-
-def _compile_delimited(framing: Delimited, compiled: structs.Framing, arrays: structs.Arrays) -> None:
-    stuffing = framing.stuffing
-    compiled.shortest = framing.minimum_body + framing.overhead
-    compiled.longest = framing.maximum_body + framing.overhead
-    compiled.delimiter, compiled.longest_segment = stuffing.delimiter, stuffing.longest(compiled.longest)
-    compiled.form = _COBS if isinstance(stuffing, Cobs) else _LINES
-    if isinstance(stuffing, Escaped):
-        compiled.form, compiled.escape = _ESCAPED, stuffing.escape
-        meaning = [stuffing.meaning.get(byte, -1) for byte in range(_BYTE_VALUES)]
-        compiled.meaning = arrays.of(meaning, np.int16)
-
-
-def _compile_packet(framing: Packet, compiled: structs.Framing, arrays: structs.Arrays) -> None:
+        stuffing = framing.stuffing
+        compiled.shortest = framing.minimum_body + framing.overhead
+        compiled.longest = framing.maximum_body + framing.overhead
+        compiled.delimiter, compiled.longest_segment = stuffing.delimiter, stuffing.longest(compiled.longest)
+        compiled.form = _COBS if isinstance(stuffing, Cobs) else _LINES
+        if isinstance(stuffing, Escaped):
+            compiled.form, compiled.escape = _ESCAPED, stuffing.escape
+            meaning = [stuffing.meaning.get(byte, -1) for byte in range(_BYTE_VALUES)]
+            compiled.meaning = arrays.of(meaning, np.int16)
+        return compiled
     compiled.form = _PACKETS
     compiled.shortest, compiled.longest, compiled.behind = framing.shortest, framing.longest, framing.behind
     compiled.n_sync, compiled.sync = _pattern(framing.sync, arrays)
@@ -121,6 +108,7 @@ def _compile_packet(framing: Packet, compiled: structs.Framing, arrays: structs.
     compiled.confirms_each = framing.confirmed == "each"
     compiled.checksum_at = framing.checksum_place(0)
     compiled.covered_from, compiled.covered_to = framing.covered(0)
+    return compiled
 
 
 def _field(field: Field) -> structs.WireField:
@@ -152,11 +140,7 @@ def _checksum(checksum: Checksum, arrays: structs.Arrays) -> structs.Checksum:
 
 
 class NativeStream(Stream):
-    """A stream whose frames C finds, also while the event loop rests.
-
-    Args:
-        framing: of the line; ``can_compile`` must be true for it.
-    """
+    """A stream whose frames C finds, also while the event loop rests: if ``can_compile`` is true for its framing."""
 
     def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:
         super().__init__(counters)
@@ -222,7 +206,6 @@ class NativeStream(Stream):
         return ctypes.addressof(self._stream)
 
     def count(self) -> None:
-        """Take over the counters of C."""
         counters, stream = self.counters, self._stream
         counters.frames = stream.frames
         counters.refused += stream.too_long - self._too_long  # the bus itself may refuse something, too

@@ -24,8 +24,6 @@ _READ_TIMEOUT_S = 0.1
 
 
 class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a serial bus."""
-
     baudrate: Annotated[
         Annotated[int, Meta(ge=1)] | None, Meta(description="bits per second; default: the driver's")
     ] = None
@@ -41,12 +39,7 @@ class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def find_port(channel: str, options: SerialOptions) -> str:
-    """Return the present path or URL: a USB device may have another path than the last time.
-
-    Raises:
-        BusNotAvailable: no such device is plugged in, or several are.
-        ConfigurationError: no port is named, or path and USB device are.
-    """
+    """Return the present path or URL: a USB device may have another path than the last time."""
     if not options.serial_number and not options.vid_pid:
         if not channel:
             raise ConfigurationError("which serial port? serial:/dev/ttyUSB0, or serial:?serial_number=...")
@@ -76,15 +69,7 @@ def find_port(channel: str, options: SerialOptions) -> str:
 
 
 def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
-    """Open a port exclusively.
-
-    Args:
-        baudrate: bits per second.
-
-    Raises:
-        BusNotAvailable: missing, not permitted, taken, or no serial port.
-        ConfigurationError: pyserial knows no such URL, or the port has no such setting.
-    """
+    """Open a port exclusively; ``baudrate``: bits per second."""
     is_url = "://" in path
     if is_url and not options.hang_up:
         raise ConfigurationError(f"{path}: hang_up=no is for ports of this machine: it is the machine that hangs up")

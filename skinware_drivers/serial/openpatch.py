@@ -81,11 +81,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._log: dict[str, tuple[int, int]] = {}  # matter -> (when it was logged, how often it occurred since)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the patch for its description.
-
-        Raises:
-            BusError: it does not answer, its description is impossible, or it must not be asked.
-        """
         if link.listen_only:
             raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
         greeting = await self._greet(link)
@@ -99,7 +94,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                 raise BadDescription(f"the patch was asked for item {number} and sent another")
             items.append(answer[2:])
         found = read_description(items, greeting.crc)
-        log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
+        link.log.info("%s, firmware %s", found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
         self.period_s = (self._wanted_us or found.period_us) / 1e6
@@ -142,8 +137,11 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                         self._take_greeting(link, Greeting.read(message.payload))
                     elif message.identifier == REPORT:
                         self._take_report(link, Report.read(message.payload))
-                    else:
-                        self._take_note(link, message.payload)
+                    elif message.payload:
+                        text = message.payload[1:].decode("utf-8", "backslashreplace")
+                        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+                        matter = f"note {text}" if len(self._log) < _MOST_MATTERS else "note"
+                        self._say(link, _SEVERITIES[min(message.payload[0], 2)], matter, f"says: {text}")
                 except BadDescription as error:
                     self._say(link, logging.WARNING, "announcement", str(error))
 
@@ -184,13 +182,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
             self._say(link, logging.WARNING, "dropped", f"dropped {dropped} samples: its line is too slow for its rate")
         if bad > 0:
             self._say(link, logging.WARNING, "damaged", f"received {bad} damaged frames: look at cable and baud rate")
-
-    def _take_note(self, link: Link, payload: bytes) -> None:
-        if payload:
-            text = payload[1:].decode("utf-8", "backslashreplace")
-            text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-            matter = f"note {text}" if len(self._log) < _MOST_MATTERS else "note"
-            self._say(link, _SEVERITIES[min(payload[0], 2)], matter, f"says: {text}")
 
     def _changed(self, link: Link) -> None:
         self._say(link, logging.WARNING, "changed", "has changed: reading its description again")
@@ -270,13 +261,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def _ask(
         self, link: Link, request: int, arguments: bytes = b"", *, timeout_s: float = _TIMEOUT_S, tries: int = _TRIES
     ) -> bytes:
-        """Send a request, again if necessary (every request can be repeated), and return the answer.
-
-        Raises:
-            HandshakeTimeout: no answer.
-            Refused: the patch refuses.
-            BusSendError: the line takes no bytes.
-        """
+        """Send a request, again if necessary (every request can be repeated), and return the answer."""
         self._number = self._number % 255 + 1
         number = bytes((self._number,))
         answer = Match(_REPLY + request, prefix=number)

@@ -67,11 +67,6 @@ class Greeting:
 
     @classmethod
     def read(cls, data: bytes) -> Greeting:
-        """Read a greeting from the wire.
-
-        Raises:
-            BadDescription: another major version, or no greeting.
-        """
         if data[:1] != bytes((MAJOR,)):
             speaks = f"version {data[0]}.{data[1]}" if len(data) > 1 else "no version"
             raise BadDescription(f"the patch speaks {speaks} of the protocol, this driver version {MAJOR}: update it")
@@ -101,11 +96,6 @@ class Report:
 
     @classmethod
     def read(cls, data: bytes) -> Report:
-        """Read a report from the wire.
-
-        Raises:
-            BadDescription: too short.
-        """
         uptime_ms, sent, dropped, bad = _Reader(data, "report").take("<IIII")
         return cls(uptime_ms / 1000, sent, dropped, bad)
 
@@ -175,11 +165,6 @@ class Description:
 
 
 def read_description(items: Sequence[bytes], crc: int) -> Description:
-    """Read the items of a description.
-
-    Raises:
-        BadDescription: they do not fit their checksum, or are impossible.
-    """
     if zlib.crc32(b"".join(items)) != crc:
         raise BadDescription("the description changed while it was being read")
     found: Description | None = None

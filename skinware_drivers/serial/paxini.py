@@ -34,7 +34,7 @@ from skinware_drivers.serial import (
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES, PaxiniBoard
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES
 
 _HEADERS = 48
 """At least the bytes around the taxels in any body."""
@@ -53,12 +53,6 @@ _VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEA
 
 
 class PaxiniOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     board: Annotated[
         Literal["auto", "converter", "high_speed"], Meta(description="the kind of board; auto: listen and ask")
     ] = "auto"
@@ -93,26 +87,20 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         self._converter = ConverterBoard(
             options.sensors,
             options.points,
-            self._is_away,
+            lambda: self._line is not None and self._line.fileno() < 0,
             period_s=options.period_ms / 1e3,
-            use=self.change_framing,
             report=self.tell,
         )
         self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, report=self.tell)
-        self._board: PaxiniBoard | None = None
+        self._board: ConverterBoard | HighSpeedBoard | None = None
         self._is_asking = False
 
     @property
     def polls(self) -> Sequence[Poll]:
         """Questions to a converter board; a high-speed board sends by itself."""
-        return () if self._board is None else self._board.polls
+        return self._board.polls if isinstance(self._board, ConverterBoard) else ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
         if link.listen_only:
             raise BusError("Paxini's boards report their modules only on request: listening is not enough")
         self._board, self._is_asking = None, True  # no other question meanwhile
@@ -137,10 +125,11 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         return f"Paxini high-speed board {await _ask_high_speed(link)}"
 
     async def start(self, link: Link) -> None:
-        await self._described.start(link)
+        if isinstance(self._described, HighSpeedBoard):  # a converter board only answers
+            await self._described.start(link)
 
     async def stop(self, link: Link) -> None:
-        if self._board is not None:
+        if isinstance(self._board, HighSpeedBoard):
             await self._board.stop(link)
 
     async def probe(self, link: Link, patch: Patch) -> bool:
@@ -169,15 +158,12 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         await self._described.tare(link, patches)
 
     @property
-    def _described(self) -> PaxiniBoard:
+    def _described(self) -> ConverterBoard | HighSpeedBoard:
         if self._board is None:
             raise BusError("the board was not found yet")
         return self._board
 
-    def _is_away(self) -> bool:
-        return self._line is not None and self._line.fileno() < 0
-
-    async def _find(self, link: Link) -> PaxiniBoard:
+    async def _find(self, link: Link) -> ConverterBoard | HighSpeedBoard:
         """Return the board of the options, or the one that streams or answers."""
         if self.options.board == "converter":
             return self._converter

@@ -14,10 +14,9 @@ the status of writes counts.
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers import Byte, Frame, Identifier, Layout, Link, Match, Notice, Patch, Poll
@@ -28,13 +27,10 @@ from skinware_drivers.serial.paxini_modules import (
     POINTS_OF_PART,
     SATURATED,
     TAXEL,
-    PaxiniBoard,
     model_of,
     module,
     values,
 )
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 SENSORS: Sequence[int] = range(9)
 """Ids that sensors can have."""
@@ -72,11 +68,7 @@ def _identifier(sensor: int, function: int, address: int) -> int:
 
 
 async def ask_version(link: Link, sensor: int, *, tries: int = 1) -> str:
-    """Ask a sensor for its version: ``PAXINI PXSR-STDDP03F-v1.0.5``.
-
-    Raises:
-        HandshakeTimeout: no such sensor.
-    """
+    """Ask a sensor for its version: ``PAXINI PXSR-STDDP03F-v1.0.5``."""
     question = read(sensor, _VERSION, VERSION_BYTES)
     match = answer(sensor, _READ, _VERSION)
     return version_in((await link.request(sensor, question, match, timeout_s=_TIMEOUT_S, tries=tries)).payload)
@@ -104,14 +96,15 @@ class ReplyHead(NamedTuple):
         return f"sensor {sensor} answers with function {self.function:#04x}, status {self.status}, at {self.address}"
 
 
-class ConverterBoard(PaxiniBoard):
+class ConverterBoard:
     """The sensors on one line. A sensor that fell silent is asked for its version before it is asked for data again.
 
     Args:
         sensors: ids of the sensors that must answer; none: all that answer.
         points: taxels of each; 0: by their part codes.
         is_away: returns whether the line is closed.
-        how: see :class:`PaxiniBoard`; ``period_s`` is the time between two questions to the same sensor.
+        period_s: time between two questions to the same sensor.
+        report: called with the notices of patches.
     """
 
     framing = Packet(
@@ -123,8 +116,20 @@ class ConverterBoard(PaxiniBoard):
         header=5,
     )
 
-    def __init__(self, sensors: Sequence[int], points: int, is_away: Callable[[], bool], **how: Any) -> None:
-        super().__init__(**how)
+    layout: Layout  # once it was described
+    geometry = None
+
+    def __init__(
+        self,
+        sensors: Sequence[int],
+        points: int,
+        is_away: Callable[[], bool],
+        *,
+        period_s: float,
+        report: Callable[[Patch, Notice], None],
+    ) -> None:
+        self.period_s = period_s
+        self.report = report
         self._wanted, self._points = sensors, points
         self._is_away = is_away
         self._versions: dict[int, str] = {}
@@ -143,7 +148,6 @@ class ConverterBoard(PaxiniBoard):
         ]
 
     async def is_there(self, link: Link) -> bool:
-        """Return whether a sensor answers."""
         for sensor in self._wanted or SENSORS:
             try:
                 await ask_version(link, sensor)
@@ -153,11 +157,7 @@ class ConverterBoard(PaxiniBoard):
         return False
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask for the sensors; each is a patch.
-
-        Raises:
-            BusError: no sensor answers, one of the options does not, or one is of an unknown model.
-        """
+        """Ask for the sensors; each is a patch."""
         found: dict[int, str] = {}
         for sensor in self._wanted or SENSORS:
             try:
@@ -167,15 +167,31 @@ class ConverterBoard(PaxiniBoard):
                     raise
         if not found:
             raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
-        points = {sensor: self._points_of(sensor, version) for sensor, version in found.items()}
+        points = {}
         for sensor, version in found.items():
-            log.info("%s: sensor %d is %s, %s", link.bus_name, sensor, model_of(points[sensor]), version)
+            by_code = (count for code, count in POINTS_OF_PART.items() if code in version)
+            points[sensor] = self._points or next(by_code, 0)
+            if not points[sensor]:
+                raise BusError(
+                    f"sensor {sensor} says that it is {version!r}: not a part code whose number of taxels is known; say"
+                    " it with the option points"
+                )
+        for sensor, version in found.items():
+            link.log.info("sensor %d is %s, %s", sensor, model_of(points[sensor]), version)
         self._versions, self._silent = found, set()
         return self.know(points)
 
     def know(self, points: Mapping[int, int]) -> Sequence[Patch]:
-        """Return the patches of sensors with these ids and numbers of taxels."""
-        self.layout = Layout([_frame(sensor, count) for sensor, count in points.items()])
+        expected = answer(0, _READ, _DATA).prefix  # the same of all sensors
+        data = [Byte(1 + at, byte) for at, byte in enumerate(expected[1:])]
+        taxels_at = _BODY_HEADER + _BEFORE_TAXELS
+        frames = []
+        for sensor, count in points.items():
+            when: list[Condition] = [Identifier(sensor), *data]
+            where = values(count, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
+            length = [taxels_at + TAXEL * count]
+            frames.append(Frame(f"sensor {sensor}", when, length, where, patch=sensor, flags=SATURATED))
+        self.layout = Layout(frames)
         sizes = {sensor: _BEFORE_TAXELS + TAXEL * count for sensor, count in points.items()}
         self._polls = {sensor: self._poll(sensor, _DATA, size) for sensor, size in sizes.items()}
         self._patches = {
@@ -197,17 +213,21 @@ class ConverterBoard(PaxiniBoard):
                 reply = await heard.get()
                 sensor = reply.identifier & _SENSOR_MASK
                 if reply.payload[1] != _ERROR:
-                    self._heard_who(link, sensor, version_in(reply.payload))
+                    version, patch = version_in(reply.payload), self._patches.get(sensor)
+                    if patch is None or sensor not in self._silent:
+                        continue
+                    if version == self._versions[sensor]:
+                        self._silent.discard(sensor)
+                    else:
+                        link.log.warning("sensor %d is another one now: %s", sensor, version)
+                        del self._patches[sensor]  # logged once
+                        self.report(patch, Notice.CHANGED)
                 elif (text := ReplyHead.of(reply.payload).in_words(sensor)) != error:
                     error = text
-                    log.warning("%s: %s", link.bus_name, text)
+                    link.log.warning("%s", text)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
-        """Make sensors take the present forces as zero, one after the other.
-
-        Raises:
-            BusError: one refuses, or does not answer.
-        """
+        """Make sensors take the present forces as zero, one after the other."""
         for patch in patches:
             sensor = patch.key
             done_or_refused = Match(_identifier(sensor, _WRITE, _ZERO), IDENTIFIER.mask & ~_ERROR_MASK)
@@ -216,34 +236,5 @@ class ConverterBoard(PaxiniBoard):
             if (head.function, head.address, head.status) != (_WRITE, _ZERO, 0):
                 raise Refused(head.in_words(sensor), head.status)
 
-    def _heard_who(self, link: Link, sensor: int, version: str) -> None:
-        patch = self._patches.get(sensor)
-        if patch is None or sensor not in self._silent:
-            return
-        if version == self._versions[sensor]:
-            self._silent.discard(sensor)
-        else:
-            log.warning("%s: sensor %d is another one now: %s", link.bus_name, sensor, version)
-            del self._patches[sensor]  # logged once
-            self.report(patch, Notice.CHANGED)
-
-    def _points_of(self, sensor: int, version: str) -> int:
-        known = (points for code, points in POINTS_OF_PART.items() if code in version)
-        points = self._points or next(known, 0)
-        if not points:
-            raise BusError(
-                f"sensor {sensor} says that it is {version!r}: not a part code whose number of taxels is known; say it"
-                " with the option points"
-            )
-        return points
-
     def _poll(self, sensor: int, address: int, size: int) -> Poll:
         return Poll(sensor, read(sensor, address, size), self.period_s, answer(sensor, _READ, address))
-
-
-def _frame(sensor: int, points: int) -> Frame:
-    expected = answer(sensor, _READ, _DATA).prefix
-    when: list[Condition] = [Identifier(sensor), *(Byte(1 + at, byte) for at, byte in enumerate(expected[1:]))]
-    taxels_at = _BODY_HEADER + _BEFORE_TAXELS
-    where = values(points, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
-    return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor, flags=SATURATED)

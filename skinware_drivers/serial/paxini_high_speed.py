@@ -19,13 +19,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
-from typing import Any
 
 from skinware.errors import BusError, HandshakeTimeout
+from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers import Flag, Frame, Identifier, Layout, Link, Match, Notice, Patch
@@ -37,14 +36,11 @@ from skinware_drivers.serial.paxini_modules import (
     MOST_POINTS,
     SATURATED,
     TAXEL,
-    PaxiniBoard,
     Slot,
     module,
     nominal_places,
     values,
 )
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 VERSION_BYTES = 15
 STRANGE = 0x57
@@ -105,13 +101,23 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 """All streamed frames are strange as long as the slots are unknown."""
 
 
-class HighSpeedBoard(PaxiniBoard):
-    """One board: a patch with a module for each connected slot."""
+class HighSpeedBoard:
+    """One board: a patch with a module for each connected slot.
 
-    def __init__(self, hand: Hand, **how: Any) -> None:
-        super().__init__(1 / _USUAL_HZ, **how)
+    Args:
+        hand: with its modules.
+        use: called with a framing for the line; bytes that are no whole frame yet are dropped.
+        report: called with the notices of patches.
+    """
+
+    layout: Layout  # once it was described
+    geometry: Geometry | None = None
+    period_s = 1 / _USUAL_HZ
+
+    def __init__(self, hand: Hand, *, use: Callable[[Framing], None], report: Callable[[Patch, Notice], None]) -> None:
+        self.use, self.report = use, report
         self._hand = hand
-        self.framing = UNKNOWN_SLOTS
+        self.framing: Framing = UNKNOWN_SLOTS
         self._slots: list[Slot] = []
         self._patch: Patch | None = None
         self._streams = False
@@ -123,11 +129,7 @@ class HighSpeedBoard(PaxiniBoard):
         return any(heard.identifier == STRANGE for heard in await link.listen(duration_s))
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, no module is connected to it, or its answer is impossible.
-        """
+        """Ask the board for its modules; it may still be sending for an earlier program."""
         self.framing = UNKNOWN_SLOTS
         self.use(self.framing)
         await self.stop(link)
@@ -136,16 +138,21 @@ class HighSpeedBoard(PaxiniBoard):
         slots = await self._ask_slots(link)
         if not slots:
             raise BusError(f"the board {version} says that no module is connected to it")
-        log.info("%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in slots))
+        link.log.info("board %s with %s", version, ", ".join(f"{s.name} ({s.points})" for s in slots))
         patches = self.know(slots)
         self.use(self.framing)
         return patches
 
     def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
-        """Return the patch of a board with these slots."""
         self._slots = list(slots)
         self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
-        self.layout = Layout([_frame(slot) for slot in slots])
+        has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
+        taxels_at, frames = _LENGTH_AND_ERROR + _RESULTANT, []
+        for slot in slots:
+            where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
+            when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
+            frames.append(Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED]))
+        self.layout = Layout(frames)
         modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in slots]
         self._patch = Patch("hand", modules)
         return [self._patch]
@@ -154,13 +161,13 @@ class HighSpeedBoard(PaxiniBoard):
         """Switch the stream on; not every version of the board acknowledges it."""
         self._streams = True
         if not await self._switch(link, on=True):
-            log.debug("%s: the board does not acknowledge that it streams", link.bus_name)
+            link.log.debug("the board does not acknowledge that it streams")
 
     async def stop(self, link: Link) -> None:
         """Switch the stream off, and wait for the acknowledgement."""
         self._streams = False
         if not await self._switch(link, on=False):
-            log.debug("%s: the board does not acknowledge that it is silent", link.bus_name)
+            link.log.debug("the board does not acknowledge that it is silent")
 
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Return whether a board with the same modules answers: then it was reset, and no longer sends."""
@@ -178,16 +185,12 @@ class HighSpeedBoard(PaxiniBoard):
                 times_ns = [*times_ns, reply.time_ns][-_STRANGE_IN_A_ROW:] if self._streams else []
                 enough = len(times_ns) == _STRANGE_IN_A_ROW and times_ns[-1] - times_ns[0] < _WITHIN_NS
                 if enough and self._patch is not None:
-                    log.warning("%s: the board streams other modules than before; asking which", link.bus_name)
+                    link.log.warning("the board streams other modules than before; asking which")
                     times_ns, self._streams = [], False
                     self.report(self._patch, Notice.CHANGED)
 
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
-        """Calibrate the board, which does not send meanwhile.
-
-        Raises:
-            BusError: it refuses, or does not answer within 10 s.
-        """
+        """Calibrate the board, which does not send meanwhile."""
         await self.stop(link)
         try:
             status = await self._exchange(
@@ -260,20 +263,8 @@ class HighSpeedBoard(PaxiniBoard):
         return None
 
 
-def _frame(slot: Slot) -> Frame:
-    taxels_at = _LENGTH_AND_ERROR + _RESULTANT
-    where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
-    has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
-    when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
-    return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED])
-
-
 def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | None:
-    """Return the data of the reply to such a request; None if the frame is no such reply.
-
-    Raises:
-        Refused: the reply is an error.
-    """
+    """Return the data of the reply to such a request; None if the frame is no such reply."""
     if frame.identifier != _REPLY:
         return None
     said, at, size = struct.unpack_from("<BHH", frame.payload)

@@ -1,20 +1,18 @@
-"""The modules of Paxini's PX-6AX GEN3, and the base class of its boards."""
+"""The modules of Paxini's PX-6AX GEN3."""
 
 from __future__ import annotations
 
 import math
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from skinware.geometry import Geometry
 from skinware.nominal_hand import FINGERS
 from skinware.sensor_types import FORCE_X, FORCE_Y, FORCE_Z, SensorType
 from skinware.status import Status
-from skinware_drivers import Layout, Link, Module, Notice, Patch, Poll, Sentinel, Values, taxels
+from skinware_drivers import Module, Sentinel, Values, taxels
 from skinware_drivers.hand import PITCH_M, Grid, Hand
-from skinware_drivers.serial.framing import Framing
 
 TAXEL = 3
 """Bytes of a taxel."""
@@ -78,7 +76,6 @@ _FROM_THE_END = ("nail", "tip", "middle", "near")
 
 
 def model_of(points: int) -> str:
-    """Return the name of the model with this number of taxels; for an unknown model, the number."""
     return _MODELS.get(points, f"{points} taxels")
 
 
@@ -179,55 +176,3 @@ def _block(points: int) -> Grid:
     length, width = map(int, digits.groups()) if digits else (1, 1)
     columns = max(1, round(math.sqrt(points * width / length)))
     return Grid(-(-points // columns), columns, min(width, _WIDEST_MM) / columns / 1e3 if digits else PITCH_M)
-
-
-class PaxiniBoard(ABC):
-    """One board on a line; the methods are those of a driver, see :class:`skinware_drivers.adapter.Adapter`.
-
-    Attributes:
-        framing: of its frames, as far as it is known.
-        layout: of its frames, once it was described.
-        geometry: nominal places of its modules; None: unknown.
-
-    Args:
-        use: called with a framing for the line; bytes that are no whole frame yet are dropped.
-        report: called with the notices of patches.
-    """
-
-    framing: Framing
-    layout: Layout
-    geometry: Geometry | None = None
-
-    def __init__(
-        self, period_s: float, use: Callable[[Framing], None], report: Callable[[Patch, Notice], None]
-    ) -> None:
-        self.period_s = period_s
-        self.use = use
-        self.report = report
-
-    @property
-    def polls(self) -> Sequence[Poll]:
-        """Questions to the board; none if it sends by itself."""
-        return ()
-
-    @abstractmethod
-    async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the board for its modules."""
-
-    async def start(self, link: Link) -> None:  # noqa: B027  (a board that only answers has nothing to do)
-        """Start the stream, if the board has one."""
-
-    async def stop(self, link: Link) -> None:  # noqa: B027
-        """Stop the stream."""
-
-    @abstractmethod
-    async def probe(self, link: Link, patch: Patch) -> bool:
-        """Return whether a silent patch answers and is the same."""
-
-    @abstractmethod
-    async def attend(self, link: Link) -> None:
-        """Follow frames that are no data."""
-
-    @abstractmethod
-    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
-        """Take the present forces as zero."""

@@ -40,19 +40,11 @@ class Port(ABC):
 
     @abstractmethod
     def read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes; none if none have come.
-
-        Raises:
-            BusNotAvailable: the port is gone.
-        """
+        """Return up to ``size`` bytes; none if none have come."""
 
     @abstractmethod
     def write(self, data: bytes) -> int:
-        """Write the bytes that can be written now; return their number.
-
-        Raises:
-            OSError: the port is gone.
-        """
+        """Write the bytes that can be written now; return their number."""
 
     @abstractmethod
     def close(self) -> None:
@@ -88,11 +80,7 @@ class DescriptorPort(Port):
         return self._fd
 
     def read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes; none if none have come.
-
-        Raises:
-            BusNotAvailable: unplugged, or the other end has closed.
-        """
+        """Return up to ``size`` bytes; none if none have come."""
         try:
             data = os.read(self._fd, size)
         except BlockingIOError:
@@ -143,11 +131,6 @@ class ThreadedPort(Port):
         return self._event
 
     def read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes that the thread has read.
-
-        Raises:
-            BusNotAvailable: the thread has failed.
-        """
         with self._changed:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._event)
@@ -231,9 +214,6 @@ class PtyPort(Port):
 
     Args:
         link: a symbolic link to the port; replaced if it is one.
-
-    Raises:
-        BusNotAvailable: no pseudo terminal, or the link cannot be made.
     """
 
     def __init__(self, link: str = "") -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,10 +12,7 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.serial.framing import Framed, Framer, Framing, fill_rows
-
-Splitting = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-"""(identifier, body) of a frame -> (identifier, body) of each frame that it becomes."""
+from skinware_drivers.serial.framing import Framed, Framer, Framing, Splitting, fill_rows
 
 
 class Part(NamedTuple):
@@ -34,7 +31,7 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Split(Framing):
-    """Frames of another framing, each split into several, which have the time and the end of the whole.
+    """Frames of another framing that is not split, each split into several with the time and the end of the whole.
 
     Attributes:
         whole: how frames lie in the stream, and how commands are sent.
@@ -49,14 +46,11 @@ class Split(Framing):
         object.__setattr__(self, "maximum_body", self.whole.maximum_body)
 
     def framer(self) -> Framer:
-        return _Splitter(self.whole.framer(), self.splitting)
+        framer = self.whole.framer()
+        framer.splitting = self.splitting
+        return framer
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a command, as a whole frame.
-
-        Raises:
-            ValueError: there is no such frame.
-        """
         return self.whole.encode(identifier, payload)
 
 
@@ -72,40 +66,6 @@ def by_length(known: Mapping[tuple[int, int], Sequence[Part]]) -> Splitting:
     return split
 
 
-class _Splitter(Framer):
-    def __init__(self, whole: Framer, splitting: Splitting) -> None:
-        super().__init__()
-        self._whole, self._splitting = whole, splitting
-
-    @property
-    def position(self) -> int:
-        return self._whole.position
-
-    @property
-    def pending(self) -> int:
-        return self._whole.pending
-
-    @property
-    def is_lost(self) -> bool:
-        return self._whole.is_lost
-
-    def asked(self) -> None:
-        self._whole.asked()
-
-    def feed(self, chunk: bytes) -> list[Framed]:
-        """Find whole frames, and split them; the counters count whole frames."""
-        self._whole.counters = self.counters
-        split = self._splitting
-        return [
-            Framed(identifier, body, frame.end)
-            for frame in self._whole.feed(chunk)
-            for identifier, body in split(frame.identifier, frame.body)
-        ]
-
-    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        raise NotImplementedError  # the framer of the whole frames finds
-
-
 CHUNK = 1 << 16
 """Bytes of a chunk, at most."""
 
@@ -115,10 +75,12 @@ class Stream(ABC):
 
     Attributes:
         counters: of the bus; they go on from one stream to the next.
+        is_lost: no more frames can be found, so that the bus must be opened again.
     """
 
     def __init__(self, counters: BusCounters) -> None:
         self.counters = counters
+        self.is_lost = False
 
     @property
     @abstractmethod
@@ -129,11 +91,6 @@ class Stream(ABC):
     @abstractmethod
     def pending(self) -> int:
         """Bytes that may still become part of a frame."""
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether no more frames can be found, so that the bus must be opened again."""
-        return False
 
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
         """Note that the host sends a question."""
@@ -165,19 +122,15 @@ class PythonStream(Stream):
 
     @property
     def is_behind(self) -> bool:
-        """Whether frames did not fit into the batch."""
         return bool(self._backlog)
 
     @property
     def pending(self) -> int:
         return self._framer.pending
 
-    @property
-    def is_lost(self) -> bool:
-        return self._framer.is_lost
-
     def asked(self) -> None:
         self._framer.asked()
+        self.is_lost = self._framer.is_lost
 
     def add(self, chunk: bytes, time_ns: int) -> None:
         framer, counters = self._framer, self.counters.framing
@@ -191,7 +144,11 @@ class PythonStream(Stream):
         fitting = [frame for frame in framed if len(frame.body) <= self._payload_size]
         self.counters.refused += len(framed) - len(fitting)
         if fitting:
-            self._backlog.append((fitting, self._times(fitting, known, time_ns)))
+            time_of = np.full(len(fitting), time_ns)
+            if fitting[0].end <= known:  # frames were held back behind a false beginning
+                ends, times = zip(*self._reads, strict=True)
+                time_of = np.array(times)[np.searchsorted(ends, [frame.end for frame in fitting])]
+            self._backlog.append((fitting, time_of))
         # keep the times of the bytes that are still held back
         undecided = framer.position - framer.pending
         if not framer.pending:
@@ -219,11 +176,3 @@ class PythonStream(Stream):
     def take_damaged(self) -> bytes:
         damaged, self._damaged = self._damaged, b""
         return damaged
-
-    def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
-        """Return (n,) int64 ns: when the last byte of each frame was read."""
-        if framed[0].end > known:
-            return np.full(len(framed), time_ns)
-        ends, times = zip(*self._reads, strict=True)  # frames were held back behind a false beginning
-        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
-        return found

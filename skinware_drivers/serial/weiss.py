@@ -18,12 +18,7 @@ _AROUND = 8
 
 
 def weiss_packet(most_payload: int, **more: Any) -> Packet:
-    """Return the framing of a device.
-
-    Args:
-        most_payload: bytes of the longest payload.
-        more: further arguments of :class:`Packet`.
-    """
+    """Return the framing of a device whose longest payload has so many bytes; ``more``: as of :class:`Packet`."""
     return Packet(
         sync=(0xAA, 0xAA, 0xAA),
         length=Length(Field(4, 2), more=_AROUND),
@@ -72,12 +67,7 @@ class WeissAdapter(SerialAdapter[OptionsT]):
     async def _ask(
         cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int | None = None
     ) -> bytes:
-        """Send a command and return the answer behind its status.
-
-        Raises:
-            Refused: the status is not 0.
-            BusError: no answer, or too short.
-        """
+        """Send a command and return the answer behind its status."""
         reply = await link.request(
             command, arguments, Match(command), timeout_s=cls.timeout_s, tries=cls.tries if tries is None else tries
         )

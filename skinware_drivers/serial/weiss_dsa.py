@@ -15,7 +15,6 @@ Not known: two programs disagree on where run-length coded data begin, so the dr
 
 from __future__ import annotations
 
-import logging
 import math
 import struct
 from collections.abc import Iterable, Sequence
@@ -37,8 +36,6 @@ from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _DATA, _CONTROLLER, _SENSOR, _ACQUIRE, _MATRIX = 0x00, 0x01, 0x02, 0x03, 0x0B
 _ON, _RLE = 0x80, 0x01
 _PART, _TORN = 0x100, 0x200  # identifiers of the frame of a matrix, plus its number, and of data that fit none
@@ -51,12 +48,6 @@ _WHOLE = weiss_packet(_HEADER + 2 * _MOST_CELLS, covers=(3, -2), bare_when_empty
 
 
 class WeissDsaOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     rle_offset: Annotated[
         Literal[5, 11] | None,
         Meta(description="request run-length coded data, which begin at this byte of the payload: not certain"),
@@ -100,17 +91,13 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         self._cells: tuple[_Matrix, ...] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the controller for its matrices; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the controller for its matrices; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a DSA controller reports its matrices only on request: listening is not enough")
         self.change_framing(_WHOLE)
         await self.stop(link)
         matrices = await self._ask_cells(link)
-        log.info("%s: matrices of %s cells", link.bus_name, ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
+        link.log.info("matrices of %s cells", ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
         time, frames, modules, places = DeviceTime(0, "<u4", 1e-3), [], [], []
         for number, matrix in enumerate(matrices):
             name, first = f"finger {number // 2 + 1} {_PARTS[number % 2]}", number << 12
@@ -144,7 +131,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         try:
             await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
         except Refused as error:
-            log.debug("%s: %s", link.bus_name, error)
+            link.log.debug("%s", error)
 
     @operation(looks=True)
     async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002

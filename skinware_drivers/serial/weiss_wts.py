@@ -12,7 +12,6 @@ device only, are not requested.
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Sequence
 from typing import Annotated
@@ -28,8 +27,6 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Answers, Refused
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
 _HEADER = 5
 _MOST_CELLS = 1024
@@ -44,12 +41,6 @@ _REASONS = {
 
 
 class WeissWtsOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     period_ms: Annotated[int, Meta(ge=1, le=0xFFFF, description="time between two frames, ms")] = 10
     tare_payload: Annotated[str, Meta(description="payload of the command tare, in hexadecimal")] = ""
 
@@ -69,11 +60,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
     dtype = np.uint16
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the sensor for its matrix; it may still be sending for an earlier program.
-
-        Raises:
-            BusError: it does not answer, its answer is impossible, or it must not be asked.
-        """
+        """Ask the sensor for its matrix; it may still be sending for an earlier program."""
         if link.listen_only:
             raise BusError("a sensor reports its number of cells only on request: listening is not enough")
         await self.stop(link)
@@ -82,7 +69,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         count = columns * rows
         if not 1 <= count <= _MOST_CELLS or not full_scale:
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
-        log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
+        link.log.info("%d x %d cells of %g x %g mm", columns, rows, width / 100, height / 100)
         self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
         cells, time = Values(_HEADER, "<u2", count), DeviceTime(0, "<u4", 1e-3)
         plain = Frame("frame", [Identifier(_DATA), Byte(4, 0, _RLE)], [cells.end], cells, time=time)
@@ -102,7 +89,7 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         try:
             await self._ask(link, _STOP)
         except Refused as error:
-            log.debug("%s: %s", link.bus_name, error)
+            link.log.debug("%s", error)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002

@@ -10,7 +10,6 @@ length u16 LE of the whole frame, body, CRC-16/CCITT-FALSE u16 LE over everythin
 
 from __future__ import annotations
 
-import logging
 import math
 import struct
 from collections.abc import Sequence
@@ -27,8 +26,6 @@ from skinware_drivers.fields import DeviceTime, Identifier, Sentinel, SequenceNu
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _INFO, _HAND, _DIAGNOSTICS, _STREAM, _GET, _SET = 0x0101, 0x0103, 0x0301, 0x0401, 0x0501, 0x0502
 _RATE, _U16 = 2, 0  # key and type of the configuration value
 _DATA, _ANSWER = 0x55, 0x57
@@ -43,12 +40,6 @@ _ANSWERS = Answers(
 
 
 class WujiGloveOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
-
     rate_hz: Annotated[int, Meta(ge=0, le=1000, description="frames per second; 0: leave the board's own")] = 0
 
 
@@ -97,7 +88,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         if not link.listen_only:
             info, hand = await self._ask(link, _INFO, size=32), await self._ask(link, _HAND, size=1)
             serial_number = info[:24].rstrip(b"\0 ").decode("ascii", "backslashreplace")
-            log.info("%s: glove board %s, firmware %s", link.bus_name, serial_number, info[28:32].hex("."))
+            link.log.info("glove board %s, firmware %s", serial_number, info[28:32].hex("."))
             name = {0: "left glove", 1: "right glove"}.get(hand[0], name)
             if not self._wanted_hz:
                 self.period_s = 1 / await self._get_rate(link)

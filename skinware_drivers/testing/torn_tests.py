@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.decoder import Updates
-from skinware_drivers.decoding.device_numbers import read_numbers
+from skinware_drivers.decoding.decoder import Updates, read_numbers
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch

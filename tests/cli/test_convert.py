@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.cli.convert import _FORMATS, _LEARNING_FORMATS, _WIRE_FORMATS
+from skinware.cli.convert import _FORMATS, _LEARNING_FORMATS, _NAMES, _WIRE_FORMATS
 from skinware.cli.convert import command as convert
 from skinware.conversion import FORMATS, WIRE_FORMATS
 from skinware.conversion.learning import LEARNING_FORMATS
@@ -176,6 +176,12 @@ def test_a_learning_set_for_people_and_programs(file: Path, capsys: pytest.Captu
     info = json.loads(Path("set/meta/info.json").read_text())
     assert info["features"]["observation.tactile.torso.pressure"]["shape"] == [10, 40]
     assert info["features"]["action"] == {"dtype": "float32", "shape": [1], "names": ["knee"]}
+
+
+def test_all_options_of_learning_sets_are_known_as_such() -> None:
+    others = ["names", "format_name", "map_file", "guess", "output", "types", "patches", "in_regions", "region_files"]
+    names = {each.name for each in convert.params} - {*others, "file", "start_s", "end_s", "as_json", "version"}
+    assert names == set(_NAMES)
 
 
 def test_it_offers_what_there_is() -> None:

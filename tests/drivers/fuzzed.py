@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5Options, AllegroV5UdpDriver
@@ -14,7 +14,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.serial.paxini import PaxiniDriver, PaxiniOptions
 from skinware_drivers.serial.paxini_converter import ConverterBoard
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
-from skinware_drivers.serial.paxini_modules import PaxiniBoard, Slot
+from skinware_drivers.serial.paxini_modules import Slot
 from skinware_drivers.virtual.bus import VirtualCanBus
 
 
@@ -28,13 +28,12 @@ def allegro(model: str, **options: object) -> AllegroV5Driver:
 def paxini(board: Literal["converter", "high_speed"], points: Mapping[int, int]) -> PaxiniDriver:
     """A board of Paxini's with sensors of these ids, or modules in these slots, of so many taxels."""
     adapter = PaxiniDriver(PaxiniOptions(board=board))
-    how: dict[str, Any] = {"use": adapter.change_framing, "report": adapter.tell}
-    known: PaxiniBoard
+    known: ConverterBoard | HighSpeedBoard
     if board == "converter":
-        known = ConverterBoard((), 0, lambda: False, period_s=0.01, **how)
+        known = ConverterBoard((), 0, lambda: False, period_s=0.01, report=adapter.tell)
         adapter.patches = known.know(points)
     else:
-        known = HighSpeedBoard(Hand(), **how)
+        known = HighSpeedBoard(Hand(), use=adapter.change_framing, report=adapter.tell)
         adapter.patches = known.know([Slot(*each) for each in points.items()])
     adapter.layout, adapter.period_s = known.layout, known.period_s
     return adapter

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.icub.body import read_positions
 from skinware_drivers.icub.importer import import_files
-from skinware_drivers.icub.positions import read_positions
 from skinware_drivers.icub.xml_tree import Notes
 from tests.icub.conftest import DEFAULTS, WRAPPER, board_sets, configuration, device, triangle_sets
 from tests.icub.test_parts import ETHERNET, OLD

@@ -6,7 +6,7 @@ import numpy as np
 
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.guests import Guests
+from skinware_drivers.modbus.gateway import Guests
 from skinware_drivers.modbus.master import Master, Timing
 from skinware_drivers.modbus.registers import Registers, Row, Wanted
 from skinware_drivers.modbus.wire import Message

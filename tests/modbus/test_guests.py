@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.guests import Guest, Guests
+from skinware_drivers.modbus.gateway import Guest, Guests
 from skinware_drivers.modbus.wire import Message
 from tests.modbus.conversation import MS, ONE, TWO, UNITS, Conversation, address_of, reply_of
 

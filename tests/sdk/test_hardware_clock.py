@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinware_drivers.can.stamps import BLOCK_NS, LEAST_BLOCKS, LONGEST_DELAY_NS, HardwareClock
+from skinware_drivers.can.receiving import BLOCK_NS, LEAST_BLOCKS, LONGEST_DELAY_NS, HardwareClock
 
 Stamps = npt.NDArray[np.int64]
 START_NS = 5_000_000_000_000

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.decoding.device_numbers import read_numbers
+from skinware_drivers.decoding.decoder import read_numbers
 from skinware_drivers.fields import Identifier, SequenceNumber
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
 

@@ -17,7 +17,7 @@ import pytest
 from skinware import BusReason
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can import recvmmsg, socketcan
+from skinware_drivers.can import receiving, socketcan
 from skinware_drivers.can.controller import CONTROLLER_STATES, Controller
 from skinware_drivers.can.socketcan import SocketCanBus
 from tests.sdk.cable import SO_RCVBUFFORCE, Cable, ChoosySocket, drain
@@ -260,7 +260,7 @@ def test_an_interface_that_fails_says_how(
 ) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(receiving, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     with pytest.raises(BusNotAvailable, match=words) as caught:
         bus.receive(FrameBatch(10), 0)
     assert caught.value.is_down is is_down
@@ -270,7 +270,7 @@ def test_an_interface_that_fails_says_how(
 def test_nothing_to_receive_is_no_failure(cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(receiving, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     assert bus.receive(FrameBatch(10), 0) == 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can import recvmmsg, socketcan
+from skinware_drivers.can import receiving, socketcan
 from skinware_drivers.can.socketcan import SocketCanBus
 from tests.sdk.cable import Cable, drain, pass_ms
 
@@ -88,7 +88,7 @@ def test_what_another_bus_left_in_a_row_is_no_stamp_of_a_frame_that_has_none(
     bus.adopt(cable.end)
     cable.end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, 0)
     batch = FrameBatch(10)
-    recvmmsg.rows_of(batch).control[:] = 1  # a second of 1970
+    receiving.rows_of(batch).control[:] = 1  # a second of 1970
     cable.put(0x123)
     before_ns = time.monotonic_ns()
     drain(bus, batch)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinware_drivers.can import stamps
-from skinware_drivers.can.stamps import Stamper
+from skinware_drivers.can import receiving
+from skinware_drivers.can.receiving import Stamper
 
 SECOND = 10**9
 WALL_NS = 1_700_000_000 * SECOND
@@ -24,7 +24,7 @@ class Clocks:
         self.monotonic_ns = 1000 * SECOND
         self.offset_ns = WALL_NS
         self.pauses: list[int] = []
-        monkeypatch.setattr(stamps, "now_ns", lambda: self.monotonic_ns)
+        monkeypatch.setattr(receiving, "now_ns", lambda: self.monotonic_ns)
         monkeypatch.setattr(time, "time_ns", self._read_wall)
 
     def _read_wall(self) -> int:
@@ -59,7 +59,7 @@ def test_no_step_moves_a_stamp_out_of_its_poll(steps: list[tuple[int, int]]) -> 
             assert (np.diff(np.append(last_ns, read)) >= 0).all()
             last_ns = read[-1]
             assert last_ns <= clocks.monotonic_ns
-            if abs(step_ns) > window_ns + stamps._SLEW_NS or step_ns == 0:
+            if abs(step_ns) > window_ns + receiving._SLEW_NS or step_ns == 0:
                 assert read.tolist() == [before_ns + pause_ns // 3, before_ns + pause_ns // 2]
 
 

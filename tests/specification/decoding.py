@@ -16,8 +16,7 @@ from skinware.samples import Unused
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
-from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates
-from skinware_drivers.decoding.device_numbers import read_numbers
+from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates, read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Byte, SequenceNumber

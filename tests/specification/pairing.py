@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.decoding.compiled import NEVER_NS, CompiledCycle, Punctuality
-from skinware_drivers.decoding.device_numbers import read_numbers
+from skinware_drivers.decoding.decoder import read_numbers
 
 Indices = npt.NDArray[np.int64]
 Places = npt.NDArray[np.uint8]

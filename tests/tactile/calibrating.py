@@ -14,7 +14,7 @@ from skinware.tactile.calibration.placing import Presses
 from skinware.tactile.calibration.shapes import Shape, shapes_of
 from skinware.tactile.calibration.topology import StrokeSums, Topology, shortest_m
 from skinware.tactile.testing import Response, Surface, World
-from skinware_drivers.icub.positions import read_positions
+from skinware_drivers.icub.body import read_positions
 from skinware_drivers.icub.xml_tree import Notes
 from tests.tactile.skins import placed
 

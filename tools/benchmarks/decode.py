@@ -32,7 +32,7 @@ from can.interfaces.socketcan import SocketcanBus
 
 from skinware import DriverReader, DriverWriter, Namespace
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can.recvmmsg import rows_of
+from skinware_drivers.can.receiving import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus

@@ -1,18 +1,24 @@
-"""Date CAN frames on CLOCK_MONOTONIC, by the kernel's stamps or the controller's clock (decision 7)."""
+"""Receive all datagrams that have arrived with one system call (``recvmmsg``), and date them on CLOCK_MONOTONIC.
+
+The time is that of the kernel's stamps or of the controller's clock (decision 7).
+"""
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import socket
 import struct
 import time
 from collections import deque
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import FrameBatch
 
 Stamps = npt.NDArray[np.int64]
 
@@ -61,18 +67,14 @@ class HardwareClock:
         steps, arrived = np.diff(hardware[known]), np.diff(software[known])
         cuts = np.flatnonzero((steps < 0) | (np.abs(arrived - steps) > LONGEST_DELAY_NS)) + 1
         for rows in np.split(known, cuts):
-            stamps[rows] = self._convert_part(hardware[rows], software[rows])
-        return stamps
-
-    def _convert_part(self, hardware: Stamps, software: Stamps) -> Stamps:
-        difference = software - hardware
-        if (self._points or self._lowest is not None) and not self._goes_on(hardware, difference):
-            self._forget()
-        self._learn(hardware, difference)
-        self._last_ns = int(hardware[-1])
-        stamps: Stamps = hardware + self._line(hardware)
-        np.maximum(stamps, software - LONGEST_DELAY_NS, out=stamps)
-        np.minimum(stamps, software, out=stamps)  # a frame is on the wire before the kernel has it
+            part = hardware[rows]
+            difference = software[rows] - part
+            if (self._points or self._lowest is not None) and not self._goes_on(part, difference):
+                self._forget()
+            self._learn(part, difference)
+            self._last_ns = int(part[-1])
+            # a frame is on the wire before the kernel has it
+            stamps[rows] = np.clip(part + self._line(part), software[rows] - LONGEST_DELAY_NS, software[rows])
         return stamps
 
     def _goes_on(self, hardware: Stamps, difference: Stamps) -> bool:
@@ -102,19 +104,15 @@ class HardwareClock:
         if int(hardware[-1]) - self._block_began_ns >= BLOCK_NS:
             self._points.append(self._lowest)
             self._lowest = None
-            self._fit()
-
-    def _fit(self) -> None:
-        """Fit the line to the lower edge: the median of all slopes between points, as low as the lowest point."""
-        at = np.array([point[0] for point in self._points], np.int64)
-        offset = np.array([point[1] for point in self._points], np.int64)
-        x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
-        first, second = np.triu_indices(len(x), 1)
-        apart = x[second] > x[first]
-        if np.count_nonzero(apart) >= LEAST_BLOCKS * (LEAST_BLOCKS - 1) // 2:
-            slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
-            self._drift = min(max(float(np.median(slopes)), -LARGEST_DRIFT), LARGEST_DRIFT)
-        self._edge = int(at[-1]), int(offset[-1] + np.floor((y - x * self._drift).min()))
+            # fit the line to the lower edge: the median of all slopes between points, as low as the lowest point
+            at, offset = np.array(self._points, np.int64).T
+            x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
+            first, second = np.triu_indices(len(x), 1)
+            apart = x[second] > x[first]
+            if np.count_nonzero(apart) >= LEAST_BLOCKS * (LEAST_BLOCKS - 1) // 2:
+                slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
+                self._drift = min(max(float(np.median(slopes)), -LARGEST_DRIFT), LARGEST_DRIFT)
+            self._edge = int(at[-1]), int(offset[-1] + np.floor((y - x * self._drift).min()))
 
 
 Stamping = Literal["auto", "hardware", "software"]
@@ -151,27 +149,19 @@ class Stamper:
     of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
     it there. Hardware stamps are on the controller's clock, see :class:`HardwareClock`.
 
-    Args:
+    Attributes:
         hardware: read the controller's stamps, too.
+        offset_ns: CLOCK_MONOTONIC - CLOCK_REALTIME, ns.
+        last_poll_ns: CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, hardware: bool = False) -> None:
         self.hardware = hardware
         self._clock = HardwareClock()
-        self._last_poll_ns = now_ns()
-        self._offset_ns = _offset_now_ns()[0]
-
-    @property
-    def state(self) -> tuple[int, int]:
-        """CLOCK_MONOTONIC - CLOCK_REALTIME, ns, and the time of the last poll, CLOCK_MONOTONIC ns."""
-        return self._offset_ns, self._last_poll_ns
-
-    @state.setter
-    def state(self, state: tuple[int, int]) -> None:
-        self._offset_ns, self._last_poll_ns = state
+        self.last_poll_ns = now_ns()
+        self.offset_ns = _offset_now_ns()[0]
 
     def switch_on(self, sock: socket.socket) -> None:
-        """Make the kernel stamp the frames that a socket receives."""
         if self.hardware:
             flags = _RX_HARDWARE | _RAW_HARDWARE | _RX_SOFTWARE | _SOFTWARE
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
@@ -185,19 +175,19 @@ class Stamper:
         Args:
             control: (n, 8) int64, their ancillary data, in order of arrival.
         """
-        before_ns = self._offset_ns
-        self._offset_ns, poll_ns = _offset_now_ns()
+        before_ns = self.offset_ns
+        self.offset_ns, poll_ns = _offset_now_ns()
         software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]
-        stamps: Stamps = software + self._offset_ns
-        is_step = abs(self._offset_ns - before_ns) > _SLEW_NS
+        stamps: Stamps = software + self.offset_ns
+        is_step = abs(self.offset_ns - before_ns) > _SLEW_NS
         if is_step:
             other = software + before_ns
-            is_other = (other >= self._last_poll_ns) & (other <= poll_ns)
-            is_other &= (stamps < self._last_poll_ns) | (stamps > poll_ns)
+            is_other = (other >= self.last_poll_ns) & (other <= poll_ns)
+            is_other &= (stamps < self.last_poll_ns) | (stamps > poll_ns)
             stamps[is_other] = other[is_other]
         if self.hardware:
             stamps[software == 0] = poll_ns
-        np.maximum(stamps, self._last_poll_ns, out=stamps)
+        np.maximum(stamps, self.last_poll_ns, out=stamps)
         np.minimum(stamps, poll_ns, out=stamps)
         if is_step:
             np.maximum.accumulate(stamps, out=stamps)
@@ -205,7 +195,7 @@ class Stamper:
             # the kernel begins to stamp in the background: earlier frames have the time at which they were read
             stamps = np.minimum.accumulate(stamps[::-1])[::-1]
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
-        self._last_poll_ns = min(int(stamps[-1]), poll_ns)
+        self.last_poll_ns = min(int(stamps[-1]), poll_ns)
         if self.hardware:
             return self._clock.convert(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
         return stamps
@@ -222,3 +212,90 @@ def _offset_now_ns() -> tuple[int, int]:
         if best_ns < 2000:
             break
     return offset_ns, poll_ns
+
+
+CONTROL_WORDS = 8
+"""8-byte words of ancillary data kept for each datagram: a header (2 words), then one ``timespec`` or three."""
+_MMSGHDR = np.dtype(
+    [
+        ("name", np.uint64),
+        ("name_length", np.uint64),
+        ("iov", np.uint64),
+        ("iov_count", np.uint64),
+        ("control", np.uint64),
+        ("control_length", np.uint64),
+        ("flags", np.uint64),
+        ("length", np.uint64),
+    ]
+)
+"""``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
+_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
+
+_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
+_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
+_recvmmsg.restype = ctypes.c_int
+_CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
+"""``struct can_frame`` and ``struct canfd_frame``; the kernel always hands out the whole of the latter."""
+
+
+class Rows:
+    """The arguments of ``recvmmsg`` for the rows of one batch; see ``rows_of``.
+
+    The end of a CAN FD frame that is longer than a row goes into a scratch buffer.
+
+    Attributes:
+        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row. Where the kernel writes none, an earlier
+            frame's data remains (see ``forget``).
+        headers_address: address of the ``mmsghdr`` of the first row.
+    """
+
+    def __init__(self, batch: FrameBatch) -> None:
+        capacity, rows = batch.capacity, np.arange(batch.capacity)
+        self.control: npt.NDArray[np.int64] = np.zeros((capacity, CONTROL_WORDS), np.int64)
+        row_bytes = batch.wire.strides[0]
+        beyond = _FD_FRAME_BYTES - row_bytes if row_bytes > _CLASSIC_ROW_BYTES else 0
+        self._beyond = np.zeros(_FD_FRAME_BYTES, np.uint8)
+        self._iov = np.zeros((capacity, 2), _IOVEC)
+        self._iov["base"][:, 0] = batch.wire.ctypes.data + row_bytes * rows
+        self._iov["length"][:, 0] = row_bytes
+        self._iov["base"][:, 1] = self._beyond.ctypes.data
+        self._iov["length"][:, 1] = max(0, beyond)
+        self._headers = np.zeros(capacity, _MMSGHDR)
+        self._headers["iov"] = self._iov.ctypes.data + self._iov.strides[0] * rows
+        self._headers["iov_count"] = 2 if beyond > 0 else 1
+        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
+        self._control_length = self._headers["control_length"]
+        self._flags, self._length = self._headers["flags"], self._headers["length"]
+        self.headers_address: int = self._headers.ctypes.data
+
+    def receive(self, fd: int, free: slice) -> int:
+        """Fill free rows of the batch; return how many were filled, -1 on an error (errno)."""
+        self._control_length[free] = 8 * CONTROL_WORDS  # the kernel wrote what it used
+        address = self.headers_address + _MMSGHDR.itemsize * free.start
+        count: int = _recvmmsg(fd, address, free.stop - free.start, socket.MSG_DONTWAIT, None)
+        return count
+
+    def forget(self, rows: slice) -> None:
+        """Clear ancillary data before frames are received that may have none of their own."""
+        self.control[rows] = 0
+
+    def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
+        """Return (n,) bool: the datagrams that were longer than their row: FD frames, though the layout has none."""
+        found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
+        return found
+
+    def are_fd(self, rows: slice) -> npt.NDArray[np.bool_]:
+        """Return (n,) bool: the CAN FD frames, whatever their flags say; valid right after receiving only."""
+        found: npt.NDArray[np.bool_] = (self._length[rows] & np.uint64(0xFFFF_FFFF)) == _FD_FRAME_BYTES
+        return found | self.cut(rows)
+
+
+_rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()
+
+
+def rows_of(batch: FrameBatch) -> Rows:
+    """Return the arguments for a batch, made once: all buses that fill the batch share them."""
+    rows = _rows.get(batch)
+    if rows is None:
+        rows = _rows[batch] = Rows(batch)
+    return rows

@@ -238,10 +238,10 @@ def finger(
         shapes = _shapes(structure, type_name, layout, _places(structure, type_name, layout))
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
-        _write(file, gathering, found.placement, frame or service, pitch_m)
+        _write(file, gathering, found, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
     words = f"; the tip is at {', '.join(f'{_MM * number:.1f}' for number in tip)} mm"
-    _report_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+    _report_placed(how.as_json, file, found, {"tip_m": tip}, words)
 
 
 @command.command(

@@ -153,11 +153,7 @@ class TopicBus(ServerBus):
         topics: to read; :class:`DdsAdapter` sets them.
     """
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self.topics: Sequence[DdsTopic] = ()
+    topics: Sequence[DdsTopic] = ()
 
     def heard(self) -> list[HeardTopic]:
         """Return the topics that are published there, as far as that is known."""

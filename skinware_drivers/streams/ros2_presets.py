@@ -18,6 +18,7 @@ from skinware_drivers.streams.cdr import Message
 from skinware_drivers.streams.ros2_parts import (
     Making,
     Part,
+    Places,
     Rule,
     by_rules,
     check_count,
@@ -122,20 +123,10 @@ def _cloud(message: Message, topic: str) -> Sequence[Part]:
         else None
         for names in (_AXES, _NORMAL)
     )
-    return [
-        Part(
-            topic,
-            "points",
-            f"{height}x{width}" if height > 1 else "points",
-            tuple(sensor_type(name, "counts") for name in shown),
-            tuple(points + columns[name][0] for name in shown),
-            tuple(columns[name][1] for name in shown),
-            None,
-            position,
-            normal,
-            frame_of(message, topic),
-        )
-    ]
+    kind = f"{height}x{width}" if height > 1 else "points"
+    shown_columns = [(name, points + columns[name][0], columns[name][1]) for name in shown]
+    part = _part(topic, "points", kind, shown_columns)
+    return [replace(part, position_m=position, normal=normal, frame=frame_of(message, topic))]
 
 
 def _image(message: Message, topic: str) -> Sequence[Part]:
@@ -153,16 +144,8 @@ def _image(message: Message, topic: str) -> Sequence[Part]:
     check_count(height * width * channels)
     at = data.start + np.add.outer(np.arange(height) * step, np.arange(width) * channels * size).reshape(-1)
     names = ["pressure"] if channels == 1 else [f"channel_{number}" for number in range(channels)]
-    return [
-        Part(
-            topic,
-            "image",
-            f"{height}x{width}",
-            tuple(sensor_type(name, "counts") for name in names),
-            tuple(at + number * size for number in range(channels)),
-            (dtype,) * channels,
-        )
-    ]
+    columns = [(name, at + number * size, dtype) for number, name in enumerate(names)]
+    return [_part(topic, "image", f"{height}x{width}", columns)]
 
 
 def _array(message: Message, topic: str) -> Sequence[Part]:
@@ -177,16 +160,14 @@ def _array(message: Message, topic: str) -> Sequence[Part]:
     if not len(places):
         return ()
     names = ["pressure"] if axes == 1 else _FORCE
-    return [
-        Part(
-            topic,
-            "array",
-            f"{shape[0]}x{shape[1]}" if shape else "taxels",
-            tuple(sensor_type(name, "counts") for name in names),
-            tuple(places[axis::axes] for axis in range(axes)),
-            (data.dtype,) * axes,
-        )
-    ]
+    columns = [(name, places[axis::axes], data.dtype) for axis, name in enumerate(names)]
+    return [_part(topic, "array", f"{shape[0]}x{shape[1]}" if shape else "taxels", columns)]
+
+
+def _part(topic: str, name: str, kind: str, columns: Sequence[tuple[str, Places, str]]) -> Part:
+    """Return a part of columns: quantity, places and dtype of each."""
+    names, places, dtypes = zip(*columns, strict=True)
+    return Part(topic, name, kind, tuple(sensor_type(each, "counts") for each in names), places, dtypes)
 
 
 def _xela(message: Message, topic: str) -> Sequence[Part]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -173,11 +173,15 @@ class BridgeReader(ServiceReader[BridgeSample]):
         return (texts(attached.static_columns().get("robot", np.zeros(0, "S1"))) or [""])[0]
 
 
-class BridgeStateWriter(ServiceWriter):
-    """Publish the state of a bridge."""
+class BridgeStateWriter:
+    """Publish the state of a bridge.
+
+    Args:
+        namespace: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+    """
 
     def __init__(self, robot: str, namespace: Namespace) -> None:
-        super().__init__(
+        self._service = ServiceWriter(
             service_name(robot),
             _COLUMNS,
             {"robot": np.array([robot.encode()], "S48")},
@@ -193,7 +197,7 @@ class BridgeStateWriter(ServiceWriter):
         Raises:
             Closed, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
         """
-        columns = self.begin()
+        columns = self._service.begin()
         columns["is_up"][...], columns["since_ns"][...] = state.is_up, state.since_ns
         columns["clock_offset_ns"][...] = state.clock_offset_ns or 0
         columns["clock_error_ns"][...] = -1 if state.clock_error_ns is None else state.clock_error_ns
@@ -210,7 +214,16 @@ class BridgeStateWriter(ServiceWriter):
             enums = STATES.index(service.state), MODES.index(service.mode), 0
             rates = service.rate_hz, service.gap_hz, service.bytes_per_s
             columns["services"][row] = (name.encode(), *enums, service.gap, *rates, *ages)
-        self.commit(at_ns)
+        self._service.commit(at_ns)
+
+    def close(self) -> None:
+        self._service.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def _state_of(row: npt.NDArray[Any]) -> ServiceState:

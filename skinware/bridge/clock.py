@@ -37,11 +37,7 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Exchange:
-    """Bounds of our clock minus the other one, from a question and its answer.
-
-    Attributes:
-        round_trip_ns: without the time that the other end took.
-    """
+    """Bounds of our clock minus the other one, from a question and its answer; the other end's time is left out."""
 
     at_ns: int
     low_ns: int
@@ -50,10 +46,7 @@ class Exchange:
 
     @staticmethod
     def of(asked_ns: int, heard_ns: int, answered_ns: int, returned_ns: int) -> Exchange:
-        """Return the bounds; we asked at ``asked_ns`` and got the answer at ``returned_ns``.
-
-        The other two are times of the other clock.
-        """
+        """Return the bounds; we asked and got the answer at the outer times, the inner ones are of the other clock."""
         low_ns, high_ns = asked_ns - heard_ns, returned_ns - answered_ns
         return Exchange((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
 
@@ -67,11 +60,7 @@ class Exchange:
 
 
 class PeerClock:
-    """Estimates the difference between our clock and that of another machine.
-
-    Attributes:
-        error_ns: the largest error of ``offset_ns`` until the next questions are answered.
-    """
+    """The difference of our clock and another; ``error_ns``: its largest error until the next answers come."""
 
     def __init__(self) -> None:
         self._samples: deque[Exchange] = deque()
@@ -90,7 +79,6 @@ class PeerClock:
         return min((sample.round_trip_ns for sample in self._samples), default=0)
 
     def pause_ns(self) -> int:
-        """Return how long to wait before the next questions."""
         return _FAST_NS if self._rounds < _FAST_ROUNDS else _SLOW_NS
 
     def offset_ns(self, at_ns: int) -> int:
@@ -202,11 +190,7 @@ class Pinger:
 
 
 def answer_pings(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Callable[[], None]:
-    """Answer questions for the time of a clock.
-
-    Returns:
-        A function that ends it.
-    """
+    """Answer questions for the time of a clock; return a function that ends it."""
 
     def asked(_key: str, message: bytes) -> None:
         heard_ns = clock()

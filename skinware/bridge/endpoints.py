@@ -11,7 +11,6 @@ import ssl
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from skinware.errors import ConfigurationError
 
@@ -24,16 +23,6 @@ _QUESTIONS = tuple(f"skinware/*/*/*/{key}" for key in ("services", "*/generation
 _SUBSCRIBE = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
 _PUBLISH = ("put", "declare_subscriber", "delete", "reply", "declare_queryable", "liveliness_token")
 _ASK = ("query",)
-
-
-class _Permission(NamedTuple):
-    """Messages of zenoh that may pass under some keys, for the named certificates or, if there are none, for all."""
-
-    name: str
-    messages: Sequence[str]
-    keys: Sequence[str]
-    certificates: Sequence[str] = ()
-    flow: str = "ingress"
 
 
 @dataclass(frozen=True)
@@ -54,47 +43,38 @@ class Rules:
 
     def access_control(self) -> str:
         """Return zenoh's setting of that name, JSON; it denies all that no rule permits."""
-        permissions = [
-            _Permission("see", _SUBSCRIBE, _ALL),
-            _Permission("ask", _ASK, _QUESTIONS),
-            _Permission("ping", ("put",), ("skinware/*/*/*/ping",)),
-            _Permission("call", _ASK, ("skinware/*/*/*/*/call/**",), self.callers),
-        ]
+        rules: list[dict[str, object]] = []
+        subjects: list[dict[str, object]] = []
+
+        def permit(
+            name: str,
+            messages: Sequence[str],
+            keys: Sequence[str],
+            certificates: Sequence[str] = (),
+            flow: str = "ingress",
+        ) -> None:
+            """Let messages pass under some keys, for the named certificates or, if there are none, for all."""
+            what = {"messages": list(messages), "key_exprs": list(keys)}
+            rules.append({"id": name, "permission": "allow", "flows": [flow], **what})
+            subjects.append({"id": name} | ({"cert_common_names": list(certificates)} if certificates else {}))
+
+        permit("see", _SUBSCRIBE, _ALL)
+        permit("ask", _ASK, _QUESTIONS)
+        permit("ping", ("put",), ("skinware/*/*/*/ping",))
+        permit("call", _ASK, ("skinware/*/*/*/*/call/**",), self.callers)
         if self.routes:
-            permissions.append(_Permission("pass on", (*_SUBSCRIBE, *_PUBLISH, *_ASK), _ALL, flow="egress"))
+            permit("pass on", (*_SUBSCRIBE, *_PUBLISH, *_ASK), _ALL, flow="egress")
             for robot in self.robots:
-                keys = (f"skinware/*/{robot}/**", f"skinware/live/{robot}/**")
-                permissions.append(_Permission(f"serve {robot}", _PUBLISH, keys, [robot]))
+                permit(f"serve {robot}", _PUBLISH, (f"skinware/*/{robot}/**", f"skinware/live/{robot}/**"), [robot])
             if not self.robots:
-                permissions.append(_Permission("serve", _PUBLISH, _ALL))
+                permit("serve", _PUBLISH, _ALL)
             if self.routers:
-                permissions.append(_Permission("route", (*_PUBLISH, *_ASK), _ALL, self.routers))
+                permit("route", (*_PUBLISH, *_ASK), _ALL, self.routers)
         else:
-            permissions.append(_Permission("publish", _PUBLISH, _ALL, flow="egress"))
-        rules = [
-            {
-                "id": each.name,
-                "permission": "allow",
-                "flows": [each.flow],
-                "messages": list(each.messages),
-                "key_exprs": list(each.keys),
-            }
-            for each in permissions
-        ]
-        subjects = [
-            {"id": each.name} | ({"cert_common_names": list(each.certificates)} if each.certificates else {})
-            for each in permissions
-        ]
-        policies = [{"rules": [each.name], "subjects": [each.name]} for each in permissions]
-        return json.dumps(
-            {
-                "enabled": True,
-                "default_permission": "deny",
-                "rules": rules,
-                "subjects": subjects,
-                "policies": policies,
-            }
-        )
+            permit("publish", _PUBLISH, _ALL, flow="egress")
+        policies = [{"rules": [rule["id"]], "subjects": [rule["id"]]} for rule in rules]
+        known = {"rules": rules, "subjects": subjects, "policies": policies}
+        return json.dumps({"enabled": True, "default_permission": "deny", **known})
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.bridge.link import Priority
-from skinware.bridge.messages import MOST_FRAMES, RAW, FrameMessage, Service, split_frame, split_generation
+from skinware.bridge.messages import MOST_FRAMES, RAW, Service, split_frame, split_generation
 from skinware.bridge.mirror import Mirror
-from skinware.bridge.pacing import LinkTraffic, Pacing, Pulls
+from skinware.bridge.pacing import Pacing, Pulls
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge_state import ServiceState
 from skinware.errors import BadRecording, BridgeError, SkinwareError
@@ -30,29 +29,39 @@ _LATEST_NS = 1 << 61
 
 
 class FrameOutput:
-    """Publishes the frames of a service in order.
+    """Publishes the frames of a service in order, and counts what came.
 
     Attributes:
         count: the robot's number of the newest frame, over generations; None: none so far.
         is_dead: nothing was published since the robot was lost.
+        frames, bytes, ages_ns: since the last report; ages from the publication there to the one here.
+        gap: frames of the robot that were not published here, since the first one.
     """
 
     def __init__(self, name: str, peer: Peer, mirror: Mirror) -> None:
         self._name, self._peer, self._mirror = name, peer, mirror
-        self.traffic = LinkTraffic()
         self.count: int | None = None
         self.newest = (0, 0)
         self.is_dead = False
+        self.frames = self.bytes = self.gap = self._gap_before = 0
+        self.ages_ns: list[int] = []
         self._again_ns = 0
 
+    def report(self, state: str, mode: str) -> ServiceState:
+        """Return the state of the service, with the rates since the last report."""
+        ages_ns = sorted(self.ages_ns)
+        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
+        new = self.gap - self._gap_before
+        report = ServiceState(state, mode, self.frames, self.gap, self.bytes, median, oldest, new)
+        self.frames, self.bytes, self._gap_before = 0, 0, self.gap
+        self.ages_ns.clear()
+        return report
+
     def publish(self, frame: RecordedSample, generation: Generation) -> int | None:
-        """Publish a frame, unless it is not newer.
+        """Publish a frame, unless it is not newer; raise BadRecording if its times are impossible.
 
         Returns:
             The time since its publication on the robot, ns; None: it was not published.
-
-        Raises:
-            BadRecording: its times are impossible.
         """
         if frame.position <= self.newest or now_ns() < self._again_ns:
             return None
@@ -68,10 +77,10 @@ class FrameOutput:
             return None
         count = generation.published_before + frame.sequence
         if self.count is not None:
-            self.traffic.gap += max(0, count - self.count - 1)
+            self.gap += max(0, count - self.count - 1)
         self.count, self.newest, self.is_dead = count, frame.position, False
-        self.traffic.frames += 1
-        self.traffic.ages_ns.append(age_ns)
+        self.frames += 1
+        self.ages_ns.append(age_ns)
         return age_ns
 
 
@@ -105,7 +114,7 @@ class ServiceFollower:
     def report(self) -> ServiceState:
         """Return how the service comes, since the last call."""
         state = self.service.state if self._peer.is_connected else "unheard"
-        return self.output.traffic.report(state, self._pacing.mode)
+        return self.output.report(state, self._pacing.mode)
 
     def take(self, service: Service) -> None:
         before, self.service = self.service, service
@@ -119,7 +128,6 @@ class ServiceFollower:
             self._mirror.budget.release(self._name)
 
     def look(self, time_ns: int) -> None:
-        """Ask for what is due."""
         clock = self._peer.clock
         if not self._peer.is_connected or self._generation is None or not clock.is_known:
             return
@@ -131,7 +139,15 @@ class ServiceFollower:
             self._pull()
         may_probe = time_ns > pulls.probe_until_ns and self.output.count is not None
         if may_probe and self._pacing.wants_probe(time_ns, clock.round_trip_ns):
-            self._probe()
+            asked_ns = now_ns()
+            pulls.probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
+            self._ask(
+                "newest",
+                lambda payload, returned_ns: self._probed(returned_ns - asked_ns, payload),
+                {"form": RAW},
+                timeout_s=2 * ANSWER_S,
+                priority=Priority.PULLED,
+            )
 
     def start_over(self) -> None:
         """Forget the generation: the robot begins new ones."""
@@ -147,7 +163,6 @@ class ServiceFollower:
         self._pulls.probe_until_ns = 0
 
     def take_held(self) -> None:
-        """Publish the frame that waited for its generation or the robot's clock."""
         if self._held and self._generation is not None:
             held, self._held = self._held, b""
             self._take_frame(held)
@@ -155,7 +170,6 @@ class ServiceFollower:
     def _ask(
         self, what: str, answered: Callable[[bytes | None, int], None], parameters: dict[str, object], **how: Any
     ) -> None:
-        """Ask for something of the service, or of the part of it that is wanted."""
         if self._part:
             parameters["part"] = self._part
         self._peer.ask(self._peer.keys.of(self._name, what), answered, parameters=parameters, **how)
@@ -251,17 +265,6 @@ class ServiceFollower:
         if frame is not None:
             self._publish(frame)
 
-    def _probe(self) -> None:
-        asked_ns = now_ns()
-        self._pulls.probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
-        self._ask(
-            "newest",
-            lambda payload, returned_ns: self._probed(returned_ns - asked_ns, payload),
-            {"form": RAW},
-            timeout_s=2 * ANSWER_S,
-            priority=Priority.PULLED,
-        )
-
     def _probed(self, took_ns: int, message: bytes | None) -> None:
         if self.is_over:
             return
@@ -290,7 +293,7 @@ class ServiceFollower:
         if self.is_over:
             return None
         self._peer.heard()
-        self.output.traffic.bytes += len(message)
+        self.output.bytes += len(message)
         try:
             parts = split_frame(message)
             generation = self._generation
@@ -302,7 +305,14 @@ class ServiceFollower:
             if not self._peer.clock.is_known:
                 self._held = message
                 return None
-            frame = frame_of(generation, self._slot(parts, generation))
+            if parts.form == RAW:
+                if len(parts.content) != generation.slot_stride:
+                    raise BadRecording(f"a frame of {len(parts.content)} bytes, not {generation.slot_stride}")
+                slot = np.frombuffer(parts.content, np.uint8)
+            else:
+                self._decoder = self._decoder or FrameDecoder(generation.coded, generation.slot_stride)
+                slot = self._decoder.decode(parts.content, keeps=parts.keeps)
+            frame = frame_of(generation, slot)
             count = generation.published_before + frame.sequence
             if not (0 < frame.sequence <= count <= MOST_FRAMES):
                 raise BadRecording(f"it has number {count}")
@@ -312,15 +322,6 @@ class ServiceFollower:
             self._refuse_frame(error)
             return None
         return frame
-
-    def _slot(self, parts: FrameMessage, generation: Generation) -> npt.NDArray[np.uint8]:
-        if parts.form == RAW:
-            if len(parts.content) != generation.slot_stride:
-                raise BadRecording(f"a frame of {len(parts.content)} bytes, not {generation.slot_stride}")
-            return np.frombuffer(parts.content, np.uint8)
-        if self._decoder is None:
-            self._decoder = FrameDecoder(generation.coded, generation.slot_stride)
-        return self._decoder.decode(parts.content, keeps=parts.keeps)
 
     def _publish(self, frame: RecordedSample) -> None:
         if self._generation is None:
@@ -340,7 +341,6 @@ class ServiceFollower:
 
 
 def _check_generation(generation: Generation) -> None:
-    """Raise BadRecording if there can be no such generation, or if it is too large."""
     if generation.published_before > MOST_FRAMES or generation.period_ns < 0:
         raise BadRecording(
             f"a generation after {generation.published_before} frames with a period of {generation.period_ns} ns"

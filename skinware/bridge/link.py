@@ -30,11 +30,7 @@ _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
 @dataclass(frozen=True)
 class Question:
-    """A question of a peer. Exactly one of ``reply`` and ``fail`` is called, in any thread.
-
-    Attributes:
-        fail: sends the reason why there is no answer.
-    """
+    """A question of a peer. One of ``reply`` and ``fail``, which takes the reason, is called once, in any thread."""
 
     key: str
     parameters: Mapping[str, str]
@@ -53,11 +49,7 @@ class Priority:
 
 
 def open_session(endpoints: Endpoints) -> zenoh.Session:
-    """Open a session that shares only what it declares, and that always connects again.
-
-    Raises:
-        BridgeError: it cannot be opened; the message says why.
-    """
+    """Open a session that shares only what it declares, and that always connects again."""
     settings: dict[str, object] = {
         "mode": json.dumps(endpoints.mode),
         "connect/endpoints": json.dumps(endpoints.connect),
@@ -112,11 +104,7 @@ class Sender:
 
 
 class Link:
-    """A session of zenoh.
-
-    Raises:
-        BridgeError: it cannot be opened; the message says what to do.
-    """
+    """A session of zenoh; BridgeError says why it cannot be opened."""
 
     def __init__(self, endpoints: Endpoints) -> None:
         self._session = open_session(endpoints)
@@ -138,20 +126,12 @@ class Link:
             self._session.put(key, payload, priority=priority, express=True)
 
     def listen(self, key: str, heard: Callable[[str, bytes], object]) -> Callable[[], None]:
-        """Call ``heard(key, bytes)`` with messages under keys, in the receiving thread.
-
-        Returns:
-            A function that ends it.
-        """
+        """Call ``heard(key, bytes)`` with messages in the receiving thread; return a function that ends it."""
         hear = directly(lambda sample: heard(str(sample.key_expr), sample.payload.to_bytes()))
         return self._end_of(self._session.declare_subscriber(key, hear))
 
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
-        """Call ``asked`` with questions under keys, in the receiving thread.
-
-        Returns:
-            A function that ends it.
-        """
+        """Call ``asked`` with questions under keys, in the receiving thread; return a function that ends it."""
 
         def ask(query: zenoh.Query) -> None:
             def reply(payload: bytes) -> None:
@@ -267,11 +247,7 @@ class Guard:
             self._report(kind, why)
 
     def run(self, kind: str, work: Callable[..., object], *arguments: object) -> bool:
-        """Do what a message asks for, and count the message if that fails.
-
-        Returns:
-            Whether it was done.
-        """
+        """Do what a message asks for, and count it if that fails; return whether it was done."""
         try:
             work(*arguments)
         except SkinwareError as error:

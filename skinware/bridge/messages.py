@@ -112,15 +112,10 @@ class Wish(msgspec.Struct, frozen=True):
 
     @property
     def number(self) -> str:
-        """Equal for equal wishes."""
         return hashlib.blake2b(msgspec.json.encode(self), digest_size=8).hexdigest()
 
     def choice(self) -> SensorChoice:
-        """Return the wish in the form that the rest of Skinware uses.
-
-        Raises:
-            ConfigurationError: the regions contradict each other.
-        """
+        """Return the wish in the form that the rest of Skinware uses."""
         return SensorChoice((), self.patches, Regions(self.regions), self.in_regions)
 
 
@@ -166,11 +161,7 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 class About(msgspec.Struct, frozen=True):
-    """Facts about a generation that its file does not have.
-
-    Attributes:
-        operations: of the service: descriptions by name.
-    """
+    """Facts about a generation that its file does not have: the operations of the service, descriptions by name."""
 
     operations: Annotated[dict[_Word, _Line], msgspec.Meta(max_length=256)] = {}
 
@@ -192,11 +183,7 @@ class CallResult(msgspec.Struct, frozen=True):
 
 
 def read_text(message: bytes, kind: type[_Kind]) -> _Kind:
-    """Return the content of a JSON message of a peer.
-
-    Raises:
-        BridgeError: it is longer or deeper than allowed, or no such message; the error says which.
-    """
+    """Return the content of a JSON message of a peer, or raise BridgeError."""
     try:
         return read_json(message, kind)
     except ValueError as error:
@@ -208,11 +195,7 @@ ALL_SUMMARIES = f"skinware/{VERSION}/*/*/summary"
 
 
 class Keys:
-    """The keys of a robot; ``instance``: number of the bridge that serves it, or ``*`` for any.
-
-    Raises:
-        ConfigurationError: the robot's name is wrong.
-    """
+    """The keys of a robot; ``instance``: number of the bridge that serves it, or ``*`` for any."""
 
     def __init__(self, robot: str, instance: str = "*") -> None:
         if not is_name(robot):
@@ -236,11 +219,7 @@ class Keys:
 
 
 def token_parts(key: str) -> tuple[str, int, str]:
-    """Return (robot, version, instance) of a token; version 0: not known here.
-
-    Raises:
-        BridgeError: it is no token.
-    """
+    """Return (robot, version, instance) of a token, or raise BridgeError; version 0: not known here."""
     parts = key.split("/")
     if len(parts) != 5 or not is_name(parts[2]) or len(key) > 256:
         raise BridgeError("a token of no bridge")
@@ -264,17 +243,11 @@ def raw_message(frame: Sample) -> bytes:
 
 
 def coded_message(coded: bytes, keeps: bool) -> bytes:
-    """Return the message of a coded frame; ``keeps``: the receiver is to keep the frame."""
     return _CODED_HEAD.pack(CODED, keeps) + coded
 
 
 class FrameMessage(NamedTuple):
-    """The parts of a frame's message.
-
-    Attributes:
-        form: ``RAW`` or ``CODED``.
-        content: the slot, or the coded frame.
-    """
+    """The parts of a frame's message; ``content``: the slot (``RAW``), or the coded frame (``CODED``)."""
 
     form: int
     generation: int
@@ -283,11 +256,7 @@ class FrameMessage(NamedTuple):
 
 
 def split_frame(message: bytes) -> FrameMessage:
-    """Return the parts of a frame's message.
-
-    Raises:
-        BridgeError: its form is not known.
-    """
+    """Return the parts of a frame's message, or raise BridgeError."""
     if len(message) < _RAW_HEAD.size or message[0] not in (RAW, CODED):
         raise BridgeError("a frame of no known form")
     form, generation = _RAW_HEAD.unpack_from(message)  # the generation has the same place in both forms
@@ -302,11 +271,7 @@ def generation_message(about: About, packed: bytes) -> bytes:
 
 
 def split_generation(message: bytes) -> tuple[About, bytes]:
-    """Return the parts of a generation's message; the second is the service's file up to its slots.
-
-    Raises:
-        BridgeError: it is no such message.
-    """
+    """Return the parts of a generation's message; the second is the service's file up to its slots."""
     try:
         (size,) = _SIZE.unpack_from(message)
         begin = _SIZE.size + size

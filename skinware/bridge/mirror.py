@@ -29,11 +29,7 @@ class MemoryBudget:
         self._taken: dict[str, int] = {}
 
     def reserve(self, name: str, size: int) -> None:
-        """Reserve ``size`` bytes for a service in place of its former ones.
-
-        Raises:
-            BridgeError: the robot would have too much; nothing has changed.
-        """
+        """Reserve bytes for a service in place of its former ones, or raise BridgeError."""
         others = sum(taken for one, taken in self._taken.items() if one != name)
         if others + size > self._most:
             raise BridgeError(
@@ -98,7 +94,6 @@ class Mirror(Republisher):
             self._give(name, frame.position)
 
     def answered(self, name: str, request: Request, answer: CallResult, result: Any) -> None:
-        """Answer a request that was passed on, together with the frame that goes with the answer."""
         if request.cancelled or name not in self._services:
             return
         if answer.error is not None:

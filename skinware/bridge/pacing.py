@@ -15,7 +15,6 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from skinware.bridge_state import ServiceState
 from skinware.realtime import NS_PER_S, now_ns
 
 _LOOK_NS = 2 * NS_PER_S
@@ -45,46 +44,14 @@ _FIRST_RETRY_NS, _LAST_RETRY_NS = 10 * NS_PER_S, 320 * NS_PER_S
 
 
 @dataclass
-class LinkTraffic:
-    """The frames of a service that came.
-
-    Attributes:
-        gap: frames of the robot that were not published here, since the first one; all others: since the last report.
-        ages_ns: from the publication there to the one here.
-    """
-
-    frames: int = 0
-    gap: int = 0
-    gap_before: int = 0
-    bytes: int = 0
-    ages_ns: list[int] = field(default_factory=list)
-
-    def report(self, state: str, mode: str) -> ServiceState:
-        """Return the state of the service, with the rates since the last report."""
-        ages_ns = sorted(self.ages_ns)
-        median, oldest = (ages_ns[int(share * len(ages_ns))] if ages_ns else None for share in (0.5, 0.99))
-        new = self.gap - self.gap_before
-        report = ServiceState(state, mode, self.frames, self.gap, self.bytes, median, oldest, new)
-        self.frames, self.bytes, self.gap_before = 0, 0, self.gap
-        self.ages_ns.clear()
-        return report
-
-
-@dataclass
 class Pulls:
-    """Questions for frames that wait for an answer.
-
-    Attributes:
-        open: by number, the time until which an answer may come.
-        probe_until_ns: the same for a probe of the link.
-    """
+    """Questions for frames that wait for an answer: by number, and for a probe, the time until which it may come."""
 
     count: int = 0
     open: dict[int, int] = field(default_factory=dict)
     probe_until_ns: int = 0
 
     def begin(self, timeout_s: float) -> int:
-        """Return the number of a new question."""
         self.count += 1
         self.open[self.count] = now_ns() + round(timeout_s * NS_PER_S)
         return self.count
@@ -104,16 +71,15 @@ class _QueueTimes:
     """Estimates from ages how long frames wait in queues."""
 
     def __init__(self) -> None:
-        self._ages: deque[tuple[int, int]] = deque()  # (when, age), since the last look
+        self.ages: deque[tuple[int, int]] = deque()  # (when, age)
         self._least: deque[tuple[int, int]] = deque()  # (when, least age), at looks
         self.since_ns: int = 0
 
     def add(self, at_ns: int, age_ns: int, kept_ns: int) -> None:
-        """Add the age of a frame; forget those older than ``kept_ns``."""
         self.since_ns = self.since_ns or at_ns
-        self._ages.append((at_ns, age_ns))
-        while at_ns - self._ages[0][0] > kept_ns:
-            self._ages.popleft()
+        self.ages.append((at_ns, age_ns))
+        while at_ns - self.ages[0][0] > kept_ns:
+            self.ages.popleft()
 
     def look(self, at_ns: int) -> int:
         """Return the time that all but a few of the frames waited.
@@ -121,14 +87,11 @@ class _QueueTimes:
         In a queue that does not drain, all frames wait. Behind a packet that TCP sends again only some do, and fewer
         questions would not help them.
         """
-        ages = sorted(age for _, age in self._ages)
+        ages = sorted(age for _, age in self.ages)
         self._least.append((at_ns, ages[0]))
         while at_ns - self._least[0][0] > _KEPT_NS:
             self._least.popleft()
         return ages[len(ages) // _FEW] - min(age for _, age in self._least)
-
-    def forget_ages(self) -> None:
-        self._ages.clear()
 
 
 class Pacing:
@@ -219,7 +182,7 @@ class Pacing:
         self._looked_ns = at_ns
         most_ns = max(_OLD_PERIODS * period_ns / 2, _LEAST_OLD_NS / 2, _SHARE_OF_ROUND_TRIP * round_trip_ns)
         is_late = self._queue.look(at_ns) > most_ns
-        self._queue.forget_ages()
+        self._queue.ages.clear()
         self._late = self._late + 1 if is_late else 0
         self._rest -= 1
         if self._late >= _LATE_LOOKS and self.open > 1:

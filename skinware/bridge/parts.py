@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import Index, as_index, texts
-from skinware.bridge.messages import Wish
+from skinware.bridge.messages import Service, Wish
 from skinware.bridge.streaming import FrameStream
 from skinware.errors import BadRecording, BridgeError, StructureError
 from skinware.memory.file_layout import SLOT
@@ -53,15 +53,15 @@ class ServiceFile:
         return generation if generation.is_driver else None
 
 
+@dataclass
+class ServedService:
+    stream: FrameStream
+    file: ServiceFile
+    service: Service
+
+
 class Cut:
-    """Some sensors of a generation of a driver, with their modules, patches and buses.
-
-    Args:
-        positions: (n,) of the sensors that stay, in a frame, ascending.
-
-    Raises:
-        StructureError: it is not a driver, or no sensor stays.
-    """
+    """Some sensors of a driver, by (n,) ascending positions in a frame, with their modules, patches and buses."""
 
     def __init__(self, whole: Generation, positions: npt.NDArray[np.int64]) -> None:
         structure = whole.structure
@@ -171,7 +171,6 @@ class RobotPart:
         return None if cut is None else (cut.file, self._streams[name])
 
     def expire(self) -> None:
-        """Answer questions that waited too long."""
         for stream in list(self._streams.values()):
             stream.expire()
 
@@ -192,12 +191,7 @@ class Parts:
         self._asked_ns: dict[str, int] = {}
 
     def wanted(self, wish: Wish) -> RobotPart:
-        """Return the part of a wish that came now.
-
-        Raises:
-            BridgeError: there are too many other parts.
-            ConfigurationError: the wish contradicts itself.
-        """
+        """Return the part of a wish that came now; BridgeError if there are too many."""
         number = wish.number
         with self._lock:
             part = self._parts.get(number)
@@ -214,7 +208,6 @@ class Parts:
         return None if part is None else part.find(name)
 
     def take(self, name: str, frame: Sample) -> None:
-        """Send the sensors of each part of a driver's frame."""
         for part in list(self._parts.values()):
             part.take(name, frame)
 

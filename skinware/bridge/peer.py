@@ -23,7 +23,7 @@ before; it is not heard any more; its clock was measured again."""
 
 ANSWER_S = 1.0
 _MOST_JOBS, _MOST_BYTES = 4096, 1 << 27
-_PATIENCE_NS = 3 * NS_PER_S
+_PATIENCE_NS, _NEVER_NS = 3 * NS_PER_S, 1 << 62
 """How long a robot is not reached before the reason is looked for, and before it is looked for again."""
 _PING_NS = 150_000_000
 _SILENCE_NS = 400_000_000
@@ -79,32 +79,6 @@ class Jobs:
             os.close(fd)
 
 
-class Diagnosis:
-    """Looks, in a thread of its own, for the reason why a robot is not reached.
-
-    ``why_not`` may wait; a job calls ``report`` with its result, one line, or an empty text if there is a connection.
-    """
-
-    def __init__(self, why_not: Callable[[], str], report: Callable[[str], None], jobs: Jobs) -> None:
-        self._why_not, self._report, self._jobs = why_not, report, jobs
-        self._is_running = False
-        self.next_ns: int = now_ns() + _PATIENCE_NS
-
-    def look(self, time_ns: int) -> None:
-        if time_ns >= self.next_ns and not self._is_running:
-            self._is_running, self.next_ns = True, time_ns + _PATIENCE_NS
-            threading.Thread(target=self._run, name="skinware bridge diagnosis", daemon=True).start()
-
-    def _run(self) -> None:
-        why = self._why_not()
-
-        def done() -> None:
-            self._is_running = False
-            self._report(why)
-
-        self._jobs.add(done)
-
-
 @dataclass
 class Bridges:
     """The bridges of a robot that are there, and the one that is followed.
@@ -124,12 +98,14 @@ class Bridges:
 
     @property
     def namesakes(self) -> int:
-        """Number of other bridges that serve a robot of this name."""
         return len(self.there - {self.instance}) if self.instance else 0
 
 
 class Peer:
     """A robot to which a link may lead. Messages that come in zenoh's threads are handled as ``jobs``.
+
+    Args:
+        why_not: returns the reason why the robot is not reached, in one line, or an empty text; it may wait.
 
     Attributes:
         keys: of the bridge that is followed; before one is, of any.
@@ -155,14 +131,14 @@ class Peer:
         self._link, self._jobs, self._changed = link, jobs, changed
         self._heard_ns = 0
         self._troubles: set[str] = set()
-        self._diagnosis = Diagnosis(why_not, self._unreached, jobs)
+        self._why_not = why_not
+        self._diagnose_ns = self.since_ns + _PATIENCE_NS
         self.guard = Guard(self._refused)
         self._pinger = Pinger(link, os.urandom(8).hex(), self._clock_answered, self.guard)
         link.watch_tokens(ALL_TOKENS, lambda key, there: self.soon("a token", partial(self._token, key, there)))
 
     @property
     def who(self) -> str:
-        """This end, in questions."""
         return self._pinger.who
 
     def ask(
@@ -223,12 +199,15 @@ class Peer:
         return True
 
     def look(self, time_ns: int) -> None:
-        """Ping, and find out whether the robot is still heard."""
         if time_ns >= self._pinger.asked_ns + self.clock.pause_ns():
             self._pinger.ask()
         silent_ns = time_ns - self._heard_ns
         if not self.is_connected:
-            self._diagnosis.look(time_ns)
+            if time_ns >= self._diagnose_ns:
+                self._diagnose_ns = _NEVER_NS
+                threading.Thread(
+                    target=self._diagnose, args=(time_ns,), name="skinware bridge diagnosis", daemon=True
+                ).start()
         elif silent_ns > _SILENCE_NS - _PING_NS:
             round_trip_ns = self.clock.round_trip_ns if self.clock.is_known else _LONGEST_ROUND_TRIP_NS
             if silent_ns > _SILENCE_NS + _ROUND_TRIPS * round_trip_ns:
@@ -274,11 +253,16 @@ class Peer:
     def _lose(self, why: str) -> None:
         if self.is_connected:
             self.is_connected, self.since_ns = False, now_ns()
-            self._diagnosis.next_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve the robot
+            if self._diagnose_ns != _NEVER_NS:
+                self._diagnose_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve the robot
             self._changed("lost")
             self.on_event({"event": "disconnected", "robot": self.keys.robot, "why": why})
 
-    def _unreached(self, why: str) -> None:
+    def _diagnose(self, begun_ns: int) -> None:
+        self._jobs.add(partial(self._diagnosed, self._why_not(), begun_ns + _PATIENCE_NS))
+
+    def _diagnosed(self, why: str, again_ns: int) -> None:
+        self._diagnose_ns = again_ns
         if not self.is_connected:
             robots = ", ".join(sorted(self.bridges.other_robots))
             hint = f"robots there: {robots}" if robots else "does it want --tls?"

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -28,7 +28,7 @@ from skinware.bridge.messages import (
     host_name,
     read_text,
 )
-from skinware.bridge.parts import Parts, ServiceFile
+from skinware.bridge.parts import Parts, ServedService, ServiceFile
 from skinware.bridge.streaming import FrameStream
 from skinware.bridge.watching import Summaries
 from skinware.errors import (
@@ -46,11 +46,8 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, boot, now_ns
 from skinware.service import ServiceReader
-from skinware.service.messages import Answer
-from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
-from skinware.transfer.generation import Generation
 
 _LONGEST_LINE = 4096
 _MOST_FRAMES = 1024
@@ -90,13 +87,6 @@ class _Workers:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
 
-@dataclass
-class _ServedService:
-    stream: FrameStream
-    file: ServiceFile
-    service: Service
-
-
 class Server:
     """Serves the services of a namespace as those of a robot.
 
@@ -123,7 +113,7 @@ class Server:
         instance = os.urandom(8).hex()
         self._identity = Services(instance, f"{boot()}/{namespace.name}", tuple(callers), host=host_name())
         self._keys, self._link, self._namespace = Keys(robot, instance), link, namespace
-        self._services: dict[str, _ServedService] = {}
+        self._services: dict[str, ServedService] = {}
         self._states: dict[str, State] = {}
         self._lock = threading.Lock()
         self._is_ending = False
@@ -137,8 +127,8 @@ class Server:
         self._ends = [answer_pings(link, self._keys)]
         for key, asked in (
             (self._keys.services, self._services_asked),
-            (self._keys.of("*", "generation"), self._generation_asked),
-            (self._keys.of("*", "newest"), self._newest_asked),
+            (self._keys.of("*", "generation"), self._of_service_asked),
+            (self._keys.of("*", "newest"), self._of_service_asked),
             (self._keys.of("*", "call/*"), partial(self._call_soon, self._call)),
         ):
             self._ends.append(link.answer(key, partial(self._asked, asked)))
@@ -156,7 +146,7 @@ class Server:
             for served in self._services.values():
                 served.stream.expire()
             self._parts.expire()
-            self._code_soon(self._summarise)
+            self._code_soon(lambda: self._summaries.send(self._there(), self.missed))
             each_second()
 
         self._collector.run(second)
@@ -191,7 +181,7 @@ class Server:
         with self._lock:
             served = self._services.get(service)
             if served is None:
-                served = self._services[service] = _ServedService(self._stream(service), file, state)
+                served = self._services[service] = ServedService(self._stream(service), file, state)
             else:
                 served.file, served.service = file, state
             served.stream.begin(segment.generation, [CodedColumn.of(column) for column in segment.layout.slot])
@@ -223,22 +213,9 @@ class Server:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
-    def _there(self) -> dict[str, _ServedService]:
-        """Return copies of all services that are not closed."""
+    def _there(self) -> dict[str, ServedService]:
         with self._lock:
             return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
-
-    def _summarise(self) -> None:
-        there = self._there()
-        self._summaries.count({name: served.stream.frames for name, served in there.items()})
-        if not self._summaries.is_wanted:
-            return
-        drivers: dict[str, tuple[State, Structure, Generation, Sample | None]] = {}
-        for name, served in there.items():
-            driver = served.file.driver
-            if driver is not None and driver.structure is not None:
-                drivers[name] = served.service.state, driver.structure, driver, served.stream.newest
-        self._summaries.send(drivers, len(there) - len(drivers), self.missed)
 
     def _answer_wish(self, question: Question) -> None:
         services: dict[str, Service] = {}
@@ -286,25 +263,18 @@ class Server:
         else:
             question.reply(self._list_of_services())
 
-    def _find(self, question: Question) -> tuple[ServiceFile, FrameStream] | None:
-        """Return the file and stream of a service that a question is for; answer the question if there is none."""
-        name, part = question.key.split("/")[4], question.parameters.get("part")
-        served = self._services.get(name)
+    def _of_service_asked(self, question: Question) -> None:
+        """Answer a question for the generation or the newest frame of a service, or of a part of it."""
+        name, what = question.key.split("/")[4:]
+        part, served = question.parameters.get("part"), self._services.get(name)
         found = None if served is None else (served.file, served.stream)
         if part:
             found = self._parts.find(part, name)
         if found is None:
             question.fail(b"no such service")
-        return found
-
-    def _newest_asked(self, question: Question) -> None:
-        found = self._find(question)
-        if found is not None:
+        elif what == "newest":
             found[1].asked(question)
-
-    def _generation_asked(self, question: Question) -> None:
-        found = self._find(question)
-        if found is not None:
+        else:
             self._call_soon(self._answer_generation, question, found[0])
 
     # -- calls, in threads of their own ---------------------------------------------------------------------------
@@ -321,25 +291,22 @@ class Server:
         question.reply(generation_message(About(operations), file.packed))
 
     def _call(self, question: Question) -> None:
+        """Call an operation and wait for its answer, but not beyond the end of this bridge."""
         *_, name, _, operation = question.key.split("/")
         try:
             arguments = read_text(question.payload, dict[str, Any]) if question.payload else {}
-            answer = self._result(name, operation, arguments)
+            with ServiceReader[Sample](name, namespace=self._namespace, announce=False) as reader:
+                pending = reader.ask(operation, **arguments)
+                until_ns, pause_s = now_ns() + round(_CALL_S * NS_PER_S), _SHORTEST_PAUSE_S
+                while not pending.done() and now_ns() < until_ns:
+                    if self._is_ending:
+                        pending.cancel()
+                    time.sleep(pause_s)
+                    pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+                answer = pending.result(0.0)
         except Exception as error:  # noqa: BLE001, the caller gets it
             other: _ErrorKind = "failed" if isinstance(error, RequestError) else "refused"
             result = CallResult(error=str(error)[:_LONGEST_LINE], why=_ERRORS.get(type(error), other))
         else:
             result = CallResult(answer.generation, answer.sequence, msgspec.Raw(msgspec.json.encode(answer.result)))
         question.reply(msgspec.json.encode(result))
-
-    def _result(self, name: str, operation: str, arguments: Mapping[str, Any]) -> Answer:
-        """Call an operation and wait for its answer, but not beyond the end of this bridge."""
-        with ServiceReader[Sample](name, namespace=self._namespace, announce=False) as reader:
-            pending = reader.ask(operation, **arguments)
-            until_ns, pause_s = now_ns() + round(_CALL_S * NS_PER_S), _SHORTEST_PAUSE_S
-            while not pending.done() and now_ns() < until_ns:
-                if self._is_ending:
-                    pending.cancel()
-                time.sleep(pause_s)
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-            return pending.result(0.0)

@@ -29,11 +29,7 @@ _LONGEST_NAME = 64
 
 
 class _FrameForm(NamedTuple):
-    """Form in which the frames of a generation are sent.
-
-    Attributes:
-        cut: makes the frame that is sent of the frame that was taken; None: they are the same.
-    """
+    """Form in which frames of a generation are sent; ``cut`` makes them of those that are taken, None: the same."""
 
     generation: int
     columns: Sequence[CodedColumn]
@@ -134,7 +130,6 @@ class FrameStream:
             question.fail(b"too many questions at once")
 
     def expire(self) -> None:
-        """Answer questions that waited too long, and forget pullers that ask no more."""
         time_ns = now_ns()
         late: list[Question] = []
         with self._lock:

@@ -20,16 +20,15 @@ from skinware.bridge.messages import (
     VERSION,
     DriverSummary,
     Keys,
-    State,
     Summary,
     host_name,
     read_text,
     token_parts,
 )
+from skinware.bridge.parts import ServedService
 from skinware.driver_service import counters_of
 from skinware.errors import BridgeError
 from skinware.limits import LIMITS
-from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, is_fresh
 from skinware.structure import Structure
@@ -45,38 +44,32 @@ class Summaries:
 
     def __init__(self, namespace: str, send: Sender) -> None:
         self._namespace, self._host, self._send = namespace, host_name(), send
-        self._frames: Mapping[str, int] = {}
+        self._frames: dict[str, int] = {}
         self._counted_ns = now_ns()
-        self._rates_hz: dict[str, float] = {}
 
-    @property
-    def is_wanted(self) -> bool:
-        return self._send.is_heard
-
-    def count(self, frames: Mapping[str, int]) -> None:
-        """Take the number of frames of each service so far, about once a second."""
-        time_ns = now_ns()
-        seconds = (time_ns - self._counted_ns) / NS_PER_S
-        new = {name: count - self._frames.get(name, 0) for name, count in frames.items()}
-        self._rates_hz = {name: round(count / seconds, 1) for name, count in new.items()}
-        self._frames, self._counted_ns = frames, time_ns
-
-    def send(
-        self, drivers: Mapping[str, tuple[State, Structure, Generation, Sample | None]], services: int, missed: int
-    ) -> None:
-        """Send it.
+    def send(self, services: Mapping[str, ServedService], missed: int) -> None:
+        """Count the frames of the services, about once a second, and send the summary.
 
         Args:
-            drivers: by name: state, present generation with its structure, and newest frame.
             missed: frames that the bridge missed in their rings.
         """
-        summaries = {name: _summary(self._rates_hz.get(name, 0.0), *driver) for name, driver in drivers.items()}
-        self._send(msgspec.json.encode(Summary(self._namespace, summaries, services, missed, self._host)))
+        before, time_ns = self._frames, now_ns()
+        seconds = (time_ns - self._counted_ns) / NS_PER_S
+        self._frames, self._counted_ns = {name: served.stream.frames for name, served in services.items()}, time_ns
+        if not self._send.is_heard:
+            return
+        drivers: dict[str, DriverSummary] = {}
+        for name, served in services.items():
+            driver = served.file.driver
+            if driver is not None and driver.structure is not None:
+                rate_hz = round((self._frames[name] - before.get(name, 0)) / seconds, 1)
+                drivers[name] = _summary(rate_hz, served, driver, driver.structure)
+        n_others = len(services) - len(drivers)
+        self._send(msgspec.json.encode(Summary(self._namespace, drivers, n_others, missed, self._host)))
 
 
-def _summary(
-    rate_hz: float, state: State, structure: Structure, generation: Generation, newest: Sample | None
-) -> DriverSummary:
+def _summary(rate_hz: float, served: ServedService, generation: Generation, structure: Structure) -> DriverSummary:
+    state, newest = served.service.state, served.stream.newest
     is_live = state == "live"
     age_ms, dropped, fresh, problems = None, 0, 0, int(not is_live)
     silent: list[str] = []

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.cli import _command as cli
-from skinware.cli._heat_map import BACKGROUND, arrange
-from skinware.cli._terminal import are_terminals, echo, print_json, terminal_width
+from skinware.cli._heat_map import arrange
+from skinware.cli._terminal import echo, print_json, terminal_width
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
@@ -30,7 +30,11 @@ _HEIGHT = 40
 
 
 def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]) -> Iterator[str]:
-    """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted."""
+    """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
+
+    Args:
+        coverage: (n,) 0 to 1 for each sensor.
+    """
     patch = structure.patch_of(type_name)
     width = max(map(len, structure.patch_names))
     for number, name in enumerate(structure.patch_names):
@@ -41,16 +45,20 @@ def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]
 
 
 def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64], width: int) -> Iterator[str]:
-    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage, 0 to 1."""
+    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage.
+
+    Args:
+        coverage: (n,) 0 to 1 for each sensor.
+    """
     drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
     of_sensor = np.zeros(structure.n_sensors)
     of_sensor[structure.index(type_name)] = coverage
     level = np.where(of_sensor >= 1, len(SIGNS) - 1, np.ceil(of_sensor * (len(SIGNS) - 2)))
-    pixels = drawn.draw(level.astype(np.uint8)[drawn.sensors])
+    codes = level.astype(np.uint8)[drawn.sensors]
+    pixels = np.append(codes, np.uint8(len(SIGNS)))[drawn.pixels]
     for number in range(drawn.lines):
         upper, lower = pixels[2 * number : 2 * number + 2]
-        codes = np.where(upper == BACKGROUND, lower, upper).tolist()
-        signs = [" " if code == BACKGROUND else SIGNS[code] for code in codes]
+        signs = [(SIGNS + " ")[code] for code in np.where(upper == len(SIGNS), lower, upper).tolist()]
         for label in drawn.labels.get(number, ()):
             signs[label.column : label.column + len(label.text)] = label.text
         yield "".join(signs).rstrip()
@@ -96,7 +104,14 @@ _WIDTH = 100
 
 
 class Gathering:
-    """Take the snapshots of a driver into a session, and report the progress."""
+    """Take the snapshots of a driver into a session, and report the progress.
+
+    Args:
+        fresh: begin with nothing, and ignore that file.
+
+    Raises:
+        ConfigurationError: the data of the state file do not fit.
+    """
 
     def __init__(
         self,
@@ -118,48 +133,59 @@ class Gathering:
         self._reported = -1.0
 
     def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
-        """Gather until a share of the sensors has all that is wanted, for a time, or until Enter."""
-        gathers = duration_s is None or duration_s > 0
+        """Gather until enough sensors have all that is wanted, for a time, or until Enter.
+
+        Gathered data are in the state file afterwards, also after Ctrl-C.
+
+        Args:
+            share: part of the sensors that is enough, 0 to 1.
+            duration_s: longest time after the baselines are known; None: no limit.
+
+        Raises:
+            ServiceTimeout: the driver is silent.
+            KeyboardInterrupt: Ctrl-C.
+        """
         with self._kept():
-            if gathers:
-                self._wait_for_rest()
-            if self._as_json:
-                what = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
-                print_json({"event": "ready", **what, **self._figures()})
-            else:
-                echo(f"continuing with the data in {self._state_path}\n" * self.restored + what_to_do)
-            if gathers:
-                self._gather(share, duration_s)
-        if not self._as_json:
-            self._show_coverage()
+            self._run(what_to_do, share, duration_s)
+            self._report_coverage()
 
     def weigh(self, weight_n: float, duration_s: float, source: ForceSource) -> None:
-        """Ask for a known weight, and gather while it rests. Baselines are followed until Enter."""
+        """Ask for a known weight, and gather while it rests. Baselines are measured before, and followed until Enter.
+
+        Args:
+            weight_n: the weight, N.
+            duration_s: how long it rests.
+            source: pairs it with the temperature.
+
+        Raises:
+            ServiceTimeout: the driver is silent.
+            KeyboardInterrupt: Ctrl-C.
+        """
         with self._kept():
             self._wait_for_rest()
             echo(f"lay {weight_n:g} N on the skin, and press Enter", err=True)
-            if are_terminals(sys.stdin):
+            if sys.stdin is not None and sys.stdin.isatty():
                 for frame in frames_until(self._reader, enter_pressed):
                     self.source.loads(frame)
             source.weight_n, time_is_over = weight_n, after(duration_s)
             felt = np.zeros(len(self._uid), bool)
-            for frame in frames_until(self._reader, time_is_over):
-                loads = self.source.loads(frame)
-                self._session.take(frame.acquired_ns, loads, source.newest())
-                felt |= loads > 0
-        if not felt.any():
-            cli.warn(f"no sensor felt {weight_n:g} N: it does not count")
-        elif not self._as_json:
-            echo(f"{weight_n:g} N: {plural(int(felt.sum()), 'sensor')} felt it")
+            try:
+                for frame in frames_until(self._reader, time_is_over):
+                    loads = self.source.loads(frame)
+                    self._session.take(frame.acquired_ns, loads, source.newest())
+                    felt |= loads > 0
+            finally:
+                self._save()
+            if not felt.any():
+                cli.warn(f"no sensor felt {weight_n:g} N: it does not count")
+            elif not self._as_json:
+                echo(f"{weight_n:g} N: {plural(int(felt.sum()), 'sensor')} felt it")
 
     @contextmanager
     def _kept(self) -> Iterator[None]:
-        """Save the gathered data at the end of the block, and say on Ctrl-C where they are."""
+        """Say on Ctrl-C where the gathered data are."""
         try:
-            try:
-                yield
-            finally:
-                self._save()
+            yield
         except KeyboardInterrupt:
             if self._as_json:
                 print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})
@@ -167,8 +193,10 @@ class Gathering:
                 echo(f"\nthe gathered data are in {self._state_path}; the same command continues with them")
             raise
 
-    def _show_coverage(self) -> None:
-        """Show the coverage of each patch, and a picture of the skin."""
+    def _report_coverage(self) -> None:
+        """Show the coverage of each patch to people, and a picture of the skin."""
+        if self._as_json:
+            return
         structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
         for line in bars(structure, type_name, coverage):
             echo(line)
@@ -176,6 +204,17 @@ class Gathering:
         for line in picture(structure, type_name, coverage, min(terminal_width() or _WIDTH, _WIDTH)):
             echo(line)
         echo(f"\n{SIGNS[0]} nothing   {SIGNS[1]} to {SIGNS[-2]} some   {SIGNS[-1]} all that is wanted")
+
+    def _run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
+        gathers = duration_s is None or duration_s > 0
+        try:
+            if gathers:
+                self._wait_for_rest()
+            self._report_ready(what_to_do)
+            if gathers:
+                self._gather(share, duration_s)
+        finally:
+            self._save()
 
     def _gather(self, share: float, duration_s: float | None) -> None:
         time_is_over = after(math.inf if duration_s is None else duration_s)
@@ -208,6 +247,15 @@ class Gathering:
     def _figures(self) -> dict[str, Any]:
         coverage = self._session.coverage
         return {**self._session.figures, "sensors": len(coverage), "covered": int((coverage >= 1).sum())}
+
+    def _report_ready(self, what_to_do: str) -> None:
+        if self._as_json:
+            what = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
+            print_json({"event": "ready", **what, **self._figures()})
+            return
+        if self.restored:
+            echo(f"continuing with the data in {self._state_path}")
+        echo(what_to_do)
 
     def _report_progress(self) -> None:
         structure, coverage = self.structure, self._session.coverage

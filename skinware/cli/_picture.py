@@ -109,14 +109,14 @@ class Picture:
         self._levels = None
 
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
-        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts; ``life`` says whether news comes."""
+        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts.
+
+        Args:
+            life: what the driver is doing; nothing is fresh where no news comes.
+        """
         structure = frame.structure
         sensor_type, physical = self.type_in(structure), physical_values(frame)
-        memory = self._memories.get(key.driver)
-        if memory is None or memory.structure is not structure:
-            memory = self._memories[key.driver] = Memory(structure)
-            self._layouts[key.driver] = SkinLayout((key.driver,), (structure,))
-        memory.rest.follow(physical, frame.status == 0, frame.published_ns)
+        memory = self._follow(key.driver, frame, physical)
         made_for = (key, structure, sensor_type, self._region, width, height)
         if self.arrangement is None or made_for != self._made_for:
             self.arrangement = self._arrange(key, structure, sensor_type.name, width, height)
@@ -159,6 +159,14 @@ class Picture:
         if self._wanted not in (None, type_name):
             self.title += f" (there are no {self._wanted} sensors)"
         return arrangement
+
+    def _follow(self, driver: str, frame: DriverSnapshot, physical: npt.NDArray[np.float32]) -> Memory:
+        memory = self._memories.get(driver)
+        if memory is None or memory.structure is not frame.structure:
+            memory = self._memories[driver] = Memory(frame.structure)
+            self._layouts[driver] = SkinLayout((driver,), (frame.structure,))
+        memory.rest.follow(physical, frame.status == 0, frame.published_ns)
+        return memory
 
     def _scaled(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +10,14 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._middlewares import ros2, yarp
-from skinware.cli._robots import connect_option, list_robots, route
+from skinware.cli._robots import list_robots, route
 from skinware.cli._terminal import echo, print_json, say
 from skinware.cli._viewers import foxglove, rerun
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skinware.bridge import Server
     from skinware.bridge_state import BridgeState
 
 _PORT = 7448
@@ -25,7 +27,8 @@ _MODES = {
 }
 
 
-@cli.group("skin-bridge")
+@click.group("skin-bridge", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Publish the drivers and services of one machine on another, in a ROS 2 graph, or as ports of YARP.
 
@@ -47,7 +50,7 @@ for _each in (route, list_robots, ros2, yarp, rerun, foxglove):
         "skin-bridge serve --robot icub --listen tls/0.0.0.0:7448 --tls certs  for all with a certificate",
     ),
 )
-@cli.names_argument
+@click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--robot", required=True, metavar="R", help="Name of this robot.")
 @click.option(
     "--listen",
@@ -56,7 +59,7 @@ for _each in (route, list_robots, ros2, yarp, rerun, foxglove):
     help=f"Where peers connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Connect to a router instead.")
-@cli.tls_option()
+@cli.tls_option
 @cli.caller_option
 @cli.insecure_option
 @cli.namespace_option
@@ -99,23 +102,29 @@ def serve(
             ready = {"event": "ready", "robot": robot, "namespace": place.name}
             where = {"listen": list(places.listen), "connect": list(places.connect)}
             say(as_json, ready | where, f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
-            before: dict[str, int] = {}
-            shown: dict[str, str] = {}
+            server.run(_serving_status(server, as_json))
 
-            def report() -> None:
-                frames = server.frames()
-                if not as_json:
-                    cli.echo_changes(shown, {name: state for name, (state, _, _) in frames.items()})
-                    return
-                services = {}
-                for name, (state, count, pullers) in frames.items():
-                    services[name] = {"state": state, "rate_hz": count - before.get(name, 0), "pulled_by": pullers}
-                    before[name] = count
-                guard = server.guard
-                counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
-                print_json({"event": "status", **counts, "services": services})
 
-            server.run(report)
+def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
+    before: dict[str, int] = {}
+    shown: dict[str, str] = {}
+
+    def report() -> None:
+        frames = server.frames()
+        if as_json:
+            services = {
+                name: {"state": state, "rate_hz": count - before.get(name, 0), "pulled_by": pullers}
+                for name, (state, count, pullers) in frames.items()
+            }
+            guard = server.guard
+            counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
+            print_json({"event": "status", **counts, "services": services})
+        else:
+            cli.echo_changes(shown, {name: state for name, (state, _, _) in frames.items()})
+        for name, (_, count, _) in frames.items():
+            before[name] = count
+
+    return report
 
 
 @command.command(
@@ -127,9 +136,15 @@ def serve(
     ),
 )
 @click.argument("robot", metavar="R")
-@connect_option
+@click.option(
+    "--connect",
+    multiple=True,
+    required=True,
+    metavar="ENDPOINT",
+    help="Robot or router: tcp/HOST:PORT.",
+)
 @click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
-@cli.tls_option()
+@cli.tls_option
 @click.option(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),
@@ -137,7 +152,9 @@ def serve(
     show_default=True,
     help="Get every frame (push), or only the newest, as fast as the link takes them (pull).",
 )
-@cli.parts_options
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; repeatable.")
+@click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; repeatable.")
+@cli.regions_option
 @cli.json_option
 def join(
     robot: str,
@@ -160,7 +177,6 @@ def join(
     from skinware.bridge import Joiner, Link, Wish, endpoints
     from skinware.bridge.endpoints import why_unreachable
     from skinware.bridge.messages import Keys
-    from skinware.bridge_state import as_data
     from skinware.memory.namespace import Namespace
 
     regions = tuple(cli.regions_asked_for(in_regions, region_files))
@@ -181,15 +197,7 @@ def join(
         with contextlib.closing(joiner), cli.signals_end(joiner.stop):
             ready = {"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)}
             say(as_json, ready, f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
-            shown: dict[str, str] = {}
-
-            def report(bridge: BridgeState) -> None:
-                if as_json:
-                    print_json({"event": "status"} | as_data(bridge))
-                else:
-                    cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
-
-            joiner.run(report)
+            joiner.run(_joined_status(as_json))
 
 
 def _show_event(event: dict[str, Any]) -> None:
@@ -201,4 +209,19 @@ def _show_event(event: dict[str, Any]) -> None:
         echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
 
-main = partial(cli.run, command, goes_on=True)
+def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
+    from skinware.bridge_state import as_data
+
+    shown: dict[str, str] = {}
+
+    def report(bridge: BridgeState) -> None:
+        if as_json:
+            print_json({"event": "status"} | as_data(bridge))
+            return
+        cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
+
+    return report
+
+
+def main() -> None:
+    cli.run(command, goes_on=True)

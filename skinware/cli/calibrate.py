@@ -81,7 +81,8 @@ class _How:
     as_json: bool
 
 
-@cli.group("skin-calibrate")
+@click.group("skin-calibrate", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Find the places of sensors by touching the skin; check a geometry.
 
@@ -178,7 +179,8 @@ def touch(
     with _opened(file, session_of, how, where) as (gathering, session):
         structure, type_name, shapes, layout_m, is_here = gathering.structure, gathering.type_name, None, None, False
         if layout is not None:
-            places, shapes = _layout(structure, type_name, layout)
+            places = _places(structure, type_name, layout)
+            shapes = _shapes(structure, type_name, layout, places)
             layout_m, is_here = _layout_m(places, frame or service)
         gathering.run(_PRESS, how.share, how.duration_s)
         placement = place(session.presses, shapes, offset_m=offset_m, layout_m=layout_m, is_here=is_here)
@@ -233,13 +235,13 @@ def finger(
     where = (service, poses_namespace, column, (4, 4))
     with _opened(file, session_of, how, where) as (gathering, session):
         structure, type_name = gathering.structure, gathering.type_name
-        _, shapes = _layout(structure, type_name, layout)
+        shapes = _shapes(structure, type_name, layout, _places(structure, type_name, layout))
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
-        _write(file, gathering, found.placement, frame or service, pitch_m)
+        _write(file, gathering, found, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
     words = f"; the tip is at {', '.join(f'{_MM * number:.1f}' for number in tip)} mm"
-    _report_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+    _report_placed(how.as_json, file, found, {"tip_m": tip}, words)
 
 
 @command.command(
@@ -375,6 +377,12 @@ def _opened(
         yield gathering, session
 
 
+def _places(structure: Structure, type_name: str, layout: Path) -> Geometry:
+    from skinware.geometry import read_geometry
+
+    return read_geometry(layout).of(structure, type_name)
+
+
 def _layout_m(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
     """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
     from collections import Counter
@@ -386,17 +394,14 @@ def _layout_m(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bo
     return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
 
 
-def _layout(structure: Structure, type_name: str, layout: Path) -> tuple[Geometry, Mapping[int, Shape]]:
-    """Return the places of sensors in a file, and the shapes of the modules that have places there."""
-    from skinware.geometry import read_geometry
+def _shapes(structure: Structure, type_name: str, layout: Path, places: Geometry) -> Mapping[int, Shape]:
     from skinware.tactile.calibration.shapes import shapes_of
 
-    places = read_geometry(layout).of(structure, type_name)
     kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
     shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
     if not shapes:
         raise ConfigurationError(f"{layout}: no whole module of this driver has places in it")
-    return places, shapes
+    return shapes
 
 
 def _write(file: Path, gathering: Gathering, placement: Placement, frame: str, pitch_m: float) -> None:
@@ -421,4 +426,5 @@ def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mappin
     click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)
 
 
-main = partial(cli.run, command)
+def main() -> None:
+    cli.run(command)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import click
@@ -39,4 +38,5 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
     echo(f"{target}: written; {what}")
 
 
-main = partial(cli.run, command)
+def main() -> None:
+    cli.run(command)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,8 @@ if TYPE_CHECKING:
 _REPORT_EVERY_S = 1.0
 
 
-@cli.group("skin-regions")
+@click.group("skin-regions", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Name parts of a skin: regions, which programs and skin-top use by name."""
 
@@ -157,4 +157,5 @@ class _Painter:
         say(self._as_json, {"event": event, **what, "touched": int(stroked.sum())}, text)
 
 
-main = partial(cli.run, command)
+def main() -> None:
+    cli.run(command)

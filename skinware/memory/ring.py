@@ -30,17 +30,21 @@ _HEADER_WORDS = file_layout.SLOT.itemsize // 8
 
 
 class FrameSource(Protocol):
-    """The generation of a sample: one that is read live, or one that was recorded.
-
-    Attributes:
-        columns: (shape, dtype, offset in the slot) of every column, by name.
-        period_ns: the writer's nominal period, 0 if it has none.
-    """
+    """The generation of a sample: one that is read live, or one that was recorded."""
 
     context: object
-    columns: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]
-    generation: int
-    period_ns: int
+
+    @property
+    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
+        """(shape, dtype, offset in the slot) of every column, by name."""
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+
+    @property
+    def period_ns(self) -> int:
+        """The writer's nominal period, 0 if it has none."""
 
 
 class Sample:

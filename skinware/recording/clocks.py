@@ -44,11 +44,7 @@ def read_clocks() -> Clocks:
 
 
 class TimeAxis:
-    """The times of a recording's messages.
-
-    Attributes:
-        clocks: the last reading.
-    """
+    """The times of a recording's messages; ``clocks``: the last reading."""
 
     def __init__(self, read: Callable[[], Clocks] = read_clocks) -> None:
         self._read = read

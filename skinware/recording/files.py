@@ -9,7 +9,6 @@ from collections import Counter, deque
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from mcap.records import Channel, Schema
 
@@ -41,66 +40,8 @@ class Head:
     data: bytes
 
 
-class Target(Protocol):
-    """A destination of a recording."""
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files that exist now."""
-
-    @property
-    def size(self) -> int:
-        """Bytes in these files; bytes in memory before there is a file."""
-
-    @property
-    def counts(self) -> Counter[int]:
-        """Messages of each channel in them."""
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the recording has reached its greatest size."""
-
-    def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
-        """Add a chunk.
-
-        Args:
-            heads: descriptions of the generations of its samples.
-
-        Raises:
-            OSError: it cannot be written; the chunks before it are safe.
-        """
-
-    def check(self) -> None:
-        """Make sure that the open file still exists, unchanged by others.
-
-        Raises:
-            OSError: it does not.
-        """
-
-    def save(self) -> None:
-        """Write the chunks that are only in memory.
-
-        Raises:
-            OSError: they cannot be written.
-        """
-
-    def finish(self) -> None:
-        """Complete the files. Idempotent.
-
-        Raises:
-            OSError: the disk has no room for a summary; the file stays without one.
-        """
-
-
 class RecordingFile:
-    """A file that explains itself: it has the heads of generations before their samples, now and then, and at the end.
-
-    Args:
-        path: of the file, which must not exist.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """A file that explains itself: heads of generations stand before their samples, now and then, and at the end."""
 
     def __init__(self, path: Path) -> None:
         self.file = McapFile(path)
@@ -109,7 +50,6 @@ class RecordingFile:
         self._last_ns = 0
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
-        """Append a chunk, after the heads of its generations."""
         self._last_ns = chunk.end_ns
         size = max(self._written.values(), default=0)
         if chunk.start_ns - self._written_ns > _REPEATED_AFTER_NS or self.file.size - size > _REPEATED_AFTER_BYTES:
@@ -136,15 +76,11 @@ class RecordingFile:
 
 
 class PendingChunk:
-    """A chunk that is being filled, with the heads of its generations.
-
-    Attributes:
-        chunk: takes messages; another one after each :meth:`move_to`.
-        heads: of the generations of its samples.
-    """
+    """A chunk that is being filled, with the heads of the generations of its samples."""
 
     def __init__(self) -> None:
-        self.chunk, self.heads = OpenChunk(), set[Head]()
+        self.chunk = OpenChunk()
+        self.heads: set[Head] = set()
         self._decoded_size = 0
 
     @property
@@ -177,7 +113,49 @@ class PendingChunk:
         target.add(chunk, heads)
 
 
-class Files:
+class Target:
+    """A destination of a recording; ``path``: of its first file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._files: deque[McapFile] = deque()
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that exist now."""
+        return [file.path for file in self._files if file.is_there]
+
+    @property
+    def size(self) -> int:
+        """Bytes in these files; bytes in memory before there is a file."""
+        return sum(file.size for file in self._files)
+
+    @property
+    def counts(self) -> Counter[int]:
+        """Messages of each channel in them."""
+        return sum((file.counts for file in self._files), Counter())
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the recording has reached its greatest size."""
+        return False
+
+    def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
+        """Add a chunk, with the heads of its generations; OSError if that fails: the chunks before it are safe."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Make sure that the open file, if there is one, still exists, unchanged by others; raise OSError if not."""
+
+    def save(self) -> None:
+        """Write the chunks that are only in memory; raise OSError if that fails."""
+
+    def finish(self) -> None:
+        """Complete the files. Idempotent. OSError: the disk has no room for a summary; the file stays without one."""
+        raise NotImplementedError
+
+
+class Files(Target):
     """One file, or several one after the other.
 
     Args:
@@ -191,25 +169,10 @@ class Files:
     """
 
     def __init__(self, path: Path, *, split_size: int | None = None, max_size: int | None = None) -> None:
-        self._path, self._split_size, self._max_size = path, split_size, max_size
+        super().__init__(path)
+        self._split_size, self._max_size = split_size, max_size
         self._number = 0
-        self._ended: deque[McapFile] = deque()
         self._file = self._next_file()
-
-    @property
-    def paths(self) -> list[Path]:
-        return [file.path for file in self._all if file.is_there]
-
-    @property
-    def size(self) -> int:
-        return sum(file.size for file in self._all)
-
-    @property
-    def counts(self) -> Counter[int]:
-        counts: Counter[int] = Counter()
-        for file in self._all:
-            counts += file.counts
-        return counts
 
     @property
     def is_full(self) -> bool:
@@ -218,34 +181,27 @@ class Files:
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
         if self._split_size is not None and self._file.file.size >= self._split_size:
             self._file.finish()
-            self._ended.append(self._file.file)
             self._file = self._next_file()
         self._file.add(chunk, heads)
-        while self._split_size is not None and self._max_size is not None and self.size > self._max_size:
-            if not self._ended:
-                break
-            self._ended.popleft().path.unlink(missing_ok=True)
+        if self._split_size is not None and self._max_size is not None:
+            while len(self._files) > 1 and self.size > self._max_size:
+                self._files.popleft().path.unlink(missing_ok=True)
 
     def check(self) -> None:
         self._file.file.check()
 
-    def save(self) -> None:
-        """Do nothing: every chunk is written at once."""
-
     def finish(self) -> None:
         self._file.finish()
-
-    @property
-    def _all(self) -> list[McapFile]:
-        return [*self._ended, self._file.file]
 
     def _next_file(self) -> RecordingFile:
         self._number += 1
         split = self._split_size is not None
-        return RecordingFile(_numbered(self._path, self._number, 3) if split else self._path)
+        file = RecordingFile(_numbered(self._path, self._number, 3) if split else self._path)
+        self._files.append(file.file)
+        return file
 
 
-class Past:
+class Past(Target):
     """The last seconds, kept in memory, and written on request and at the end.
 
     Args:
@@ -254,14 +210,10 @@ class Past:
     """
 
     def __init__(self, path: Path, duration_s: float) -> None:
-        self._path, self._duration_ns = path, round(duration_s * NS_PER_S)
+        super().__init__(path)
+        self._duration_ns = round(duration_s * NS_PER_S)
         self._chunks: deque[tuple[ClosedChunk, Collection[Head]]] = deque()
-        self._saved: list[McapFile] = []
         self._finished = False
-
-    @property
-    def paths(self) -> list[Path]:
-        return [file.path for file in self._saved if file.is_there]
 
     @property
     def size(self) -> int:
@@ -269,31 +221,20 @@ class Past:
 
     @property
     def counts(self) -> Counter[int]:
-        """Messages of each channel in the last file, or in memory before there is one."""
-        if self._saved:
-            return self._saved[-1].counts
-        counts: Counter[int] = Counter()
-        for chunk, _ in self._chunks:
-            counts += chunk.counts
-        return counts
-
-    @property
-    def is_full(self) -> bool:
-        return False
+        if self._files:
+            return self._files[-1].counts
+        return sum((chunk.counts for chunk, _ in self._chunks), Counter())
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
         self._chunks.append((chunk, tuple(heads)))
         while self._chunks[0][0].end_ns < chunk.end_ns - self._duration_ns:
             self._chunks.popleft()
 
-    def check(self) -> None:
-        """Do nothing: no file is open."""
-
     def save(self) -> None:
         """Write the chunks that are kept; they also stay in memory."""
-        number = len(self._saved) + 1
+        number = len(self._files) + 1
         file = RecordingFile(self._path if number == 1 else _numbered(self._path, number, 1))
-        self._saved.append(file.file)
+        self._files.append(file.file)
         try:
             for chunk, heads in self._chunks:
                 file.add(chunk, heads)
@@ -312,11 +253,7 @@ def _numbered(path: Path, number: int, digits: int) -> Path:
 
 @dataclass(frozen=True)
 class Recovered:
-    """The result of a recovery.
-
-    Attributes:
-        was_whole: the file had its summary, and no chunk was damaged.
-    """
+    """The result of a recovery; ``was_whole``: the file had its summary, and no chunk was damaged."""
 
     messages: dict[str, int]
     damaged: int
@@ -328,10 +265,6 @@ def recover(source: Path, target: Path) -> Recovered:
 
     Args:
         target: the new file; it may replace the old one, but no other.
-
-    Raises:
-        BadRecording: the source is not a recording, or no chunk is undamaged.
-        OSError: the source cannot be read, or the target cannot be written.
     """
     if target.exists() and not target.samefile(source):
         raise FileExistsError(errno.EEXIST, "exists already: give another name", str(target))

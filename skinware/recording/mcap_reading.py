@@ -42,11 +42,7 @@ class Damaged(Exception):
 
 
 class McapMessage(NamedTuple):
-    """One message.
-
-    Attributes:
-        time_ns: time of publication, on the axis that orders the file (``log_time``).
-    """
+    """One message; ``time_ns``: of publication, on the axis that orders the file (``log_time``)."""
 
     channel_id: int
     sequence: int
@@ -82,8 +78,6 @@ class ChunkPlace:
 
 @dataclass
 class ChunkContents:
-    """The contents of a chunk."""
-
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     messages: list[McapMessage] = field(default_factory=list)
@@ -144,11 +138,7 @@ class McapSource:
             return ""
 
     def contents(self, place: ChunkPlace) -> ChunkContents:
-        """Return the contents of a chunk.
-
-        Raises:
-            Damaged: it is not as it was written.
-        """
+        """Return the contents of a chunk, or raise Damaged."""
         try:
             compressed = self._data[place.compressed_at : place.end]
             if zstandard.frame_content_size(compressed) not in (-1, place.size):
@@ -158,7 +148,22 @@ class McapSource:
             raise Damaged(f"its contents cannot be decompressed ({error})") from None
         if len(data) != place.size or zlib.crc32(data) != place.crc:  # 0, MCAP's "none", too: ours have a CRC
             raise Damaged("its contents do not fit their checksum")
-        return _parsed(data, self._limits)
+        contents = ChunkContents()
+        for opcode, record in _records(memoryview(data)):
+            if opcode == Opcode.MESSAGE:
+                if len(record) < _MESSAGE.size:
+                    raise Damaged("a message is shorter than its header")
+                channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
+                if time_ns > self._limits.time_ns:
+                    raise Damaged("a message has a time that no clock has")
+                contents.messages.append(McapMessage(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
+            elif opcode == Opcode.CHANNEL:
+                channel = _read(Channel, record)
+                contents.channels[channel.id] = channel
+            elif opcode == Opcode.SCHEMA:
+                schema = _read(Schema, record)
+                contents.schemas[schema.id] = schema
+        return contents
 
     def close(self) -> None:
         """Close the file; contents that were read stay valid. Idempotent."""
@@ -166,11 +171,7 @@ class McapSource:
         self._map.close()
 
     def _chunks_in_summary(self) -> list[ChunkPlace]:
-        """Return the places that the summary lists.
-
-        Raises:
-            Damaged: there is no summary, or it does not fit the file.
-        """
+        """Return the places that the summary lists; Damaged: there is none, or it does not fit the file."""
         end = len(self._data) - len(MAGIC)
         footer_at = end - _FOOTER.size
         if footer_at < len(MAGIC) or self._data[end:] != MAGIC or self._data[: len(MAGIC)] != MAGIC:
@@ -259,31 +260,8 @@ class McapSource:
         self.close()
 
 
-def _parsed(data: bytes, limits: Limits) -> ChunkContents:
-    contents = ChunkContents()
-    for opcode, record in _records(memoryview(data)):
-        if opcode == Opcode.MESSAGE:
-            if len(record) < _MESSAGE.size:
-                raise Damaged("a message is shorter than its header")
-            channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
-            if time_ns > limits.time_ns:
-                raise Damaged("a message has a time that no clock has")
-            contents.messages.append(McapMessage(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
-        elif opcode == Opcode.CHANNEL:
-            channel = _read(Channel, record)
-            contents.channels[channel.id] = channel
-        elif opcode == Opcode.SCHEMA:
-            schema = _read(Schema, record)
-            contents.schemas[schema.id] = schema
-    return contents
-
-
 def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Yield (opcode, contents) of each record in a part of a file.
-
-    Raises:
-        Damaged: the records do not fill it.
-    """
+    """Yield (opcode, contents) of each record in a part of a file; Damaged: they do not fill it."""
     at = 0
     while at < len(data):
         if at + _RECORD.size > len(data):
@@ -297,11 +275,7 @@ def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
-    """Return (first time, last time, offset, channels) of a chunk index. An hour has some 14,000 of these records.
-
-    Raises:
-        Damaged: it is not a chunk index.
-    """
+    """Return (first time, last time, offset, channels) of a chunk index. An hour has some 14,000 of these records."""
     try:
         start_ns, end_ns, offset, _, size = _CHUNK_INDEX.unpack_from(record)
         channels = _MESSAGE_INDEX.iter_unpack(record[_CHUNK_INDEX.size : _CHUNK_INDEX.size + size])
@@ -311,11 +285,7 @@ def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
 
 
 def _read(kind: Any, record: memoryview) -> Any:
-    """Return a record as an object of the package mcap.
-
-    Raises:
-        Damaged: it is not a record of this kind.
-    """
+    """Return a record as an object of the package mcap, or raise Damaged."""
     try:
         return kind.read(ReadDataStream(BytesIO(record)))
     except (McapError, struct.error, UnicodeDecodeError) as error:

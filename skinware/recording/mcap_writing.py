@@ -45,11 +45,7 @@ _SPOOL_BYTES = 64 << 10  # records of the summary in memory: those of 500 chunks
 
 @dataclass(frozen=True)
 class ClosedChunk:
-    """A finished chunk, ready for any file.
-
-    Attributes:
-        index: its entry in the summary, for a chunk at offset 0.
-    """
+    """A finished chunk, ready for any file; ``index``: its entry in the summary, for a chunk at offset 0."""
 
     record: bytes
     index: ChunkIndex
@@ -69,11 +65,7 @@ class ClosedChunk:
 
 @dataclass
 class OpenChunk:
-    """A chunk that is being filled.
-
-    Attributes:
-        size: bytes in it so far.
-    """
+    """A chunk that is being filled; ``size``: bytes in it so far."""
 
     size: int = 0
     _parts: list[bytes | memoryview] = field(default_factory=list)
@@ -157,15 +149,7 @@ class OpenChunk:
 
 
 class McapFile:
-    """A file that grows by whole chunks, and always consists of the chunks that were added.
-
-    Args:
-        path: of the file, which must not exist.
-        profile: MCAP's name for the kind of its channels.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """A file that grows by whole chunks, and always consists of the chunks that were added."""
 
     def __init__(self, path: Path, profile: str = PROFILE) -> None:
         from importlib.metadata import version
@@ -198,11 +182,7 @@ class McapFile:
         return (info.st_dev, info.st_ino) == self._inode
 
     def check(self) -> None:
-        """Make sure that the file is unchanged, and where it was made.
-
-        Raises:
-            OSError: it is not; the message says what happened to it.
-        """
+        """Make sure that the file is unchanged, and where it was made, or raise OSError."""
         if self._fd < 0:
             return
         info = os.fstat(self._fd)
@@ -217,12 +197,7 @@ class McapFile:
             raise OSError(errno.ENOENT, f"moved while it was recorded; all until then is in {where}", str(self.path))
 
     def add(self, chunk: ClosedChunk) -> None:
-        """Append a chunk.
-
-        Raises:
-            OSError: it cannot be written, for instance because the disk is full: the file stays without it; or
-                :meth:`check` fails.
-        """
+        """Append a chunk, or raise OSError: the file stays without it."""
         self.check()
         free = os.fstatvfs(self._fd)
         summary_size = 2048 + self._index.size
@@ -244,11 +219,7 @@ class McapFile:
         self.counts += chunk.counts
 
     def finish(self) -> None:
-        """Write the summary, which makes reading fast, and close the file. Idempotent.
-
-        Raises:
-            OSError: the disk has no room for it. The file then ends with its last chunk, and is closed.
-        """
+        """Write the summary, which makes reading fast, and close the file. Idempotent. It may lack room: OSError."""
         if self._fd < 0:
             return
         try:
@@ -326,11 +297,6 @@ class _Spool:
         self._waiting += record
 
     def save(self) -> None:
-        """Write the records in memory to the file, if they are many.
-
-        Raises:
-            OSError: they cannot be written, and stay in memory.
-        """
         if len(self._waiting) < _SPOOL_BYTES:
             return
         if self._file is None:

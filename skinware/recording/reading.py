@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Collection, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -189,9 +190,12 @@ class Recording:
             if not isinstance(frame, RecordedDriverSnapshot):
                 continue
             newest[driver] = frame
-            layout = _layout(newest, layout)
+            names = tuple(sorted(newest))
+            frames = tuple(newest[name] for name in names)
+            structures = tuple(each.structure for each in frames)
+            if names != layout.drivers or any(map(operator.is_not, structures, layout.structures)):
+                layout = SkinLayout(names, structures)
             if time_s >= start_s:
-                frames = tuple(newest[name] for name in layout.drivers)
                 yield RecordedSnapshot(layout, frames, frame.published_ns, time_s)
 
     def moments(
@@ -378,11 +382,3 @@ class Recording:
 
     def __repr__(self) -> str:
         return f"<Recording {self.path}: {', '.join(self.services) or 'nothing'}, {self.duration_s:.1f} s>"
-
-
-def _layout(newest: dict[str, RecordedDriverSnapshot], before: SkinLayout) -> SkinLayout:
-    """Return the layout of some samples; the one before if nothing changed."""
-    drivers = tuple(sorted(newest))
-    structures = tuple(newest[name].structure for name in drivers)
-    same = drivers == before.drivers and all(a is b for a, b in zip(structures, before.structures, strict=True))
-    return before if same else SkinLayout(drivers, structures)

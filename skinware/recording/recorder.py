@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from mcap.records import Channel, Schema
 
@@ -44,17 +44,11 @@ _LONGEST_REST_NS = 10_000_000
 _MOST_NEWS = 100
 
 
-class Renderer(Protocol):
-    """Makes messages for viewers from samples."""
+Renderer = Callable[[str, Generation, Sample, int], Iterable[tuple[str, str, Schema, bytes]]]
+"""Makes messages for viewers of a service's sample: (topic, encoding, schema, data) of each.
 
-    def messages(
-        self, service: str, generation: Generation, frame: Sample, time_ns: int
-    ) -> Iterable[tuple[str, str, Schema, bytes]]:
-        """Return (topic, encoding, schema, data) of each message.
-
-        Args:
-            time_ns: time of publication, ns since 1970, on the axis of the recording.
-        """
+It gets the service, the generation, the sample, and its time of publication, ns since 1970 on the recording's axis.
+"""
 
 
 class Recorder:
@@ -156,7 +150,6 @@ class Recorder:
     # -- the collector's listener ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.transfer.collecting.FrameListener`."""
         self._coder.jobs.put(partial(self._coder.begin, service, head))
 
     def took(self, service: str, frame: Sample) -> None:
@@ -184,11 +177,7 @@ class _WireStream:
 
 
 class _Coder(threading.Thread):
-    """Codes samples, fills chunks, and hands them to the target when they are due.
-
-    Attributes:
-        jobs: to be done in this thread; None: the last one was before it.
-    """
+    """Codes samples, fills chunks, and hands them to the target when they are due, by ``jobs``; None: the end."""
 
     def __init__(
         self,
@@ -212,10 +201,21 @@ class _Coder(threading.Thread):
         self.news: deque[dict[str, Any]] = deque(maxlen=_MOST_NEWS)
 
     def run(self) -> None:
-        """Do jobs until the end, or until one fails."""
         try:
-            while self._work():
-                pass
+            while True:
+                if now_ns() >= self._next_clock_ns:
+                    self._look_around()
+                if now_ns() >= self._due_ns or self._pending.is_large:
+                    self._pending.move_to(self._target)
+                is_empty = self._pending.chunk.is_empty
+                until_ns = self._next_clock_ns if is_empty else min(self._due_ns, self._next_clock_ns)
+                try:
+                    job = self.jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
+                except queue.Empty:
+                    continue
+                if job is None:
+                    break
+                job()
             self._pending.move_to(self._target)
         except Exception as error:  # noqa: BLE001, Recorder.run raises it
             self.failure = error
@@ -224,27 +224,21 @@ class _Coder(threading.Thread):
         except OSError as error:
             self.failure = self.failure or error
 
-    def _work(self) -> bool:
-        """Do one job; return False after the last."""
-        if now_ns() >= self._next_clock_ns:
-            self._look_around()
-        if now_ns() >= self._due_ns or self._pending.is_large:
-            self._pending.move_to(self._target)
-        until_ns = self._next_clock_ns if self._pending.chunk.is_empty else min(self._due_ns, self._next_clock_ns)
-        try:
-            job = self.jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
-        except queue.Empty:
-            return True
-        if job is not None:
-            job()
-        return job is not None
-
     def take(self, service: str, frame: Sample) -> None:
-        match self._streams[service]:
-            case _WireStream() as stream:
-                self._add_wire(stream, frame)
-            case _Stream() as stream:
-                self._add_frame(stream, service, frame)
+        stream = self._streams[service]
+        if isinstance(stream, _WireStream):
+            bus = int(frame.column("bus")[()])
+            if bus < len(stream.buses):
+                channel, schema = self.channels.of_wire(stream.driver, stream.buses[bus])
+                self._add(channel, schema, frame.sequence, frame.published_ns, message_of(frame))
+        elif stream is not None:
+            channel, schema = self.channels.of_service(service, FRAME)
+            self._begin_chunk()
+            time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
+            self._pending.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
+            if self._renderer is not None and stream.generation is not None:
+                for topic, encoding, known, data in self._renderer(service, stream.generation, frame, time_ns):
+                    self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
         self.bytes_done += len(frame.slot)
 
     def save(self) -> None:
@@ -290,22 +284,6 @@ class _Coder(threading.Thread):
             self._abouts += 1
             channel, schema = self.channels.of_about(wires.driver)
             self._pending.heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
-
-    def _add_frame(self, stream: _Stream, service: str, frame: Sample) -> None:
-        channel, schema = self.channels.of_service(service, FRAME)
-        self._begin_chunk()
-        time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
-        self._pending.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
-        if self._renderer is not None and stream.generation is not None:
-            for topic, encoding, known, data in self._renderer.messages(service, stream.generation, frame, time_ns):
-                self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
-
-    def _add_wire(self, stream: _WireStream, frame: Sample) -> None:
-        bus = int(frame.column("bus")[()])
-        if bus >= len(stream.buses):
-            return
-        channel, schema = self.channels.of_wire(stream.driver, stream.buses[bus])
-        self._add(channel, schema, frame.sequence, frame.published_ns, message_of(frame))
 
     def add_json(self, topic: str, data: dict[str, Any], monotonic_ns: int | None = None) -> None:
         channel, schema = self.channels.of_all(topic)

@@ -68,7 +68,6 @@ class _Tape:
         return self.next
 
     def publish_next(self) -> Moment | None:
-        """Publish the moment that is due next, and return it; None at the end."""
         moment, self.next = self.take_next(), None
         if moment is not None:
             self._apply(moment)
@@ -79,10 +78,6 @@ class _Tape:
         self._timeline.seek(time_s)
         self.reached_s = time_s
         self._show(self._timeline.services)
-
-    def step_on(self, samples: int) -> None:
-        while samples and (moment := self.publish_next()) is not None:
-            samples -= moment.frame is not None
 
     def step_back(self, samples: int) -> None:
         self._put_back()
@@ -208,31 +203,32 @@ class Replayer:
             NameInUse: a running driver or service has one of the names.
             NamespaceError: the namespace cannot be used, or shared memory is full.
         """
-        if self._tape.start_s > self._recording.duration_s:
+        tape = self._tape
+        if tape.start_s > self._recording.duration_s:
             return
         with short_turns():
-            self._run(report, every_s)
-
-    def _run(self, report: Callable[[], object], every_s: float) -> None:
-        self._go_to(self._tape.start_s)
-        if self._paused and not self.frames:  # programs that are to resume it must find its services
-            self.step()
-        while not self._stopping:
-            if not self._paused:
-                self._tape.take_next()
-            due_ns = now_ns() + WAIT_SLICE_NS if self._paused else self._due_ns(self._tape.next_s)
-            if not self._wait(due_ns, report, every_s) or self._paused:
-                continue
-            behind_ns = now_ns() - due_ns
-            moment = self._tape.publish_next()
-            if moment is None:
-                if not self._end():
-                    return
-                continue
-            if behind_ns > _MOST_BEHIND_NS:
-                self._from_ns += behind_ns
-            self.late += moment.frame is not None and behind_ns > _LATE_NS
-            self._goes_on = True
+            self._go_to(tape.start_s)
+            if self._paused and not self.frames:  # programs that are to resume it must find its services
+                self.step()
+            while not self._stopping:
+                if self._paused:
+                    self._wait(now_ns() + WAIT_SLICE_NS, report, every_s)
+                    continue
+                tape.take_next()
+                ahead_s = (tape.next_s - self._from_s) / self._republisher.speed
+                due_ns = self._from_ns + round(ahead_s * NS_PER_S)
+                if not self._wait(due_ns, report, every_s) or self._paused:
+                    continue
+                behind_ns = now_ns() - due_ns
+                moment = tape.publish_next()
+                if moment is None:
+                    if not self._end():
+                        return
+                    continue
+                if behind_ns > _MOST_BEHIND_NS:
+                    self._from_ns += behind_ns
+                self.late += moment.frame is not None and behind_ns > _LATE_NS
+                self._goes_on = True
 
     def stop(self) -> None:
         """End the replay; from any thread or signal handler."""
@@ -281,8 +277,8 @@ class Replayer:
         self._set_paused(True, self.time_s)
         if frames < 0:
             self._tape.step_back(-frames)
-        else:
-            self._tape.step_on(frames)
+        while frames > 0 and (moment := self._tape.publish_next()) is not None:
+            frames -= moment.frame is not None
         self._from_now(self._tape.reached_s)
         return self.replay()
 
@@ -320,9 +316,6 @@ class Replayer:
         """Continue from a time in the recording, and end the wait for the next moment."""
         self._from_ns, self._from_s = now_ns(), time_s
         self._turned += 1
-
-    def _due_ns(self, time_s: float) -> int:
-        return self._from_ns + round((time_s - self._from_s) / self._republisher.speed * NS_PER_S)
 
     def _wait(self, due_ns: int, report: Callable[[], object], every_s: float) -> bool:
         """Wait until a time, and answer requests; return False if one of them, or ``stop``, ended the wait."""

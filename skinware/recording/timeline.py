@@ -6,11 +6,13 @@ from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from itertools import accumulate
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
-from skinware.recording.mcap_reading import ChunkPlace
 from skinware.transfer.collecting import CLOSED, DEAD
 from skinware.transfer.generation import RecordedSample
+
+if TYPE_CHECKING:
+    from skinware.recording.reading import Recording
 
 GONE = (CLOSED, DEAD)
 _KEPT_CHUNKS = 3
@@ -30,31 +32,10 @@ class Moment(NamedTuple):
     event: str = ""
 
 
-class MomentSource(Protocol):
-    """A recording that has moments."""
-
-    @property
-    def places(self) -> list[ChunkPlace]:
-        """Places of its chunks, in order."""
-
-    def time_s(self, time_ns: int) -> float:
-        """Return the time of a message, s since the recording began."""
-
-    def may_have(self, place: ChunkPlace, services: Collection[str], *, events: bool = True) -> bool:
-        """Return whether a chunk may have samples of some services, or events."""
-
-    def moments_in(self, place: ChunkPlace, services: Collection[str]) -> list[Moment]:
-        """Return the moments of some services in a chunk, by time; none if it is damaged."""
-
-
 class Timeline:
-    """A position between two moments of some services.
+    """A position between two moments of some services; ``ahead`` decodes the next chunk in the background."""
 
-    Args:
-        ahead: decodes the next chunk in the background; None: each chunk is decoded when it is needed.
-    """
-
-    def __init__(self, recording: MomentSource, services: Iterable[str], ahead: Executor | None = None) -> None:
+    def __init__(self, recording: Recording, services: Iterable[str], ahead: Executor | None = None) -> None:
         self._recording, self.services = recording, tuple(services)
         self._places = [place for place in recording.places if recording.may_have(place, self.services)]
         self._ends_s = list(accumulate((recording.time_s(place.end_ns) for place in self._places), max))
@@ -69,7 +50,6 @@ class Timeline:
         self._at = bisect_left(self._moments(self._chunk), time_s, key=lambda moment: moment.time_s)
 
     def next(self) -> Moment | None:
-        """Pass the next moment and return it; None at the end."""
         while self._chunk < len(self._places):
             moments = self._moments(self._chunk)
             if self._at < len(moments):
@@ -79,7 +59,6 @@ class Timeline:
         return None
 
     def back(self) -> Moment | None:
-        """Pass the moment before and return it; None at the beginning."""
         while not self._at:
             if not self._chunk:
                 return None

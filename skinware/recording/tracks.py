@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +12,14 @@ from skinware._columns import Index, as_index
 from skinware.errors import BadRecording, StructureError
 from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
-from skinware.recording.mcap_reading import ChunkContents
 from skinware.status import is_fresh
 from skinware.structure import Structure
 from skinware.transfer.codec import HEADER, Run, runs
 from skinware.transfer.generation import PER_SENSOR, Generation, RecordedSample, frames_of
+
+if TYPE_CHECKING:
+    from skinware.recording.mcap_reading import ChunkContents
+    from skinware.recording.reading import Recording
 
 
 class Series:
@@ -130,23 +132,6 @@ class Series:
 _FOR_DRIVERS = ("values", "status", "module_time_ns")
 
 
-class ChunkSource(Protocol):
-    path: Path
-    start_ns: int
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file."""
-
-    def chunks(
-        self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
-    ) -> Iterator[ChunkContents]:
-        """Yield the chunks that may have messages of some channels within a time."""
-
-    def note(self, problem: str) -> None:
-        """Note that something is wrong with the file."""
-
-
 class Track:
     """The recorded samples of one service.
 
@@ -163,7 +148,7 @@ class Track:
 
     def __init__(
         self,
-        recording: ChunkSource,
+        recording: Recording,
         name: str,
         channel: int,
         generations: Mapping[int, Generation],

@@ -10,20 +10,17 @@ import heapq
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from typing import BinaryIO
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording.reading import Recording
-from skinware.recording.wire_tracks import WireItem, WireTrack
+from skinware.recording.wire_tracks import WireTrack
 from skinware.text import nearest_name
-from skinware.wire import IS_CUT, IS_FD, candump_line, channel_name
-
-SOCKETCAN, SERIAL = 227, 147
-"""Link types of interfaces in pcapng: LINKTYPE_CAN_SOCKETCAN, and LINKTYPE_USER0 with :data:`SERIAL_HEADER`."""
-SERIAL_HEADER = struct.Struct("<BBH")
-"""In front of the bytes of a packet of a serial line: version (1), 0 received or 1 sent, 0."""
+from skinware.wire import IS_CUT, IS_FD, SERIAL, SERIAL_HEADER, SOCKETCAN, WireItem, candump_line, channel_name
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _NAME, _DESCRIPTION, _RESOLUTION, _FLAGS = 2, 3, 9, 2
@@ -64,15 +61,9 @@ class Exported:
 
 
 def export_candump(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
-    """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
-
-    Raises:
-        BadRecording: no frame of a CAN bus was recorded.
-        ConfigurationError: no wire of a chosen driver was recorded.
-        OSError: the file exists already, or cannot be written.
-    """
-
-    def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
+    """Write the frames of all CAN buses as ``candump -L`` does; each line ends with R (received) or T (sent)."""
+    part = chosen or Chosen()
+    with _exporting(recording, path, part, with_serial=False) as (file, wires, exported):
         for number, item in _in_order(wires, part, exported):
             channel = wires[number][1]
             fd_flags = item.flags if item.flags & IS_FD else None
@@ -80,22 +71,16 @@ def export_candump(recording: Recording, path: Path, chosen: Chosen | None = Non
             line = candump_line(item.epoch_ns // 1000, channel, item.identifier or 0, fd_flags, item.data, direction)
             file.write(line.encode() + b"\n")
             exported.counts[channel] += 1
-
-    return _export(recording, path, chosen or Chosen(), write, with_serial=False)
+    return exported
 
 
 def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
     """Write all wires for Wireshark, with times in ns and directions.
 
     An interface of a CAN bus has the link type :data:`SOCKETCAN`, one of a serial line :data:`SERIAL`.
-
-    Raises:
-        BadRecording: no wire was recorded.
-        ConfigurationError: no wire of a chosen driver was recorded.
-        OSError: the file exists already, or cannot be written.
     """
-
-    def write(file: BinaryIO, wires: _Wires, part: Chosen, exported: Exported) -> None:
+    part = chosen or Chosen()
+    with _exporting(recording, path, part, with_serial=True) as (file, wires, exported):
         file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)))
         for wire, name in wires:
             options = _option(_NAME, name.encode()) + _option(_RESOLUTION, b"\x09")
@@ -105,18 +90,14 @@ def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None
         for number, item in _in_order(wires, part, exported):
             file.write(_packet(number, item))
             exported.counts[wires[number][1]] += 1
+    return exported
 
-    return _export(recording, path, chosen or Chosen(), write, with_serial=True)
 
-
-def _export(
-    recording: Recording,
-    path: Path,
-    chosen: Chosen,
-    write: Callable[[BinaryIO, _Wires, Chosen, Exported], None],
-    *,
-    with_serial: bool,
-) -> Exported:
+@contextmanager
+def _exporting(
+    recording: Recording, path: Path, chosen: Chosen, *, with_serial: bool
+) -> Iterator[tuple[BinaryIO, _Wires, Exported]]:
+    """Yield a new file, the wires to write into it, and the result to fill in; a file that fails is removed."""
     recorded = {wire.driver for wire in recording.wires}
     for driver in chosen.drivers:
         if recorded and driver not in recorded:
@@ -138,11 +119,10 @@ def _export(
         raise BadRecording(f"{recording.path}: {what} was recorded: skin-record --wire records them")
     with path.open("xb") as file:
         try:
-            write(file, wires, chosen, exported)
+            yield file, wires, exported
         except BaseException:
             path.unlink()
             raise
-    return exported
 
 
 def _named(recording: Recording) -> _Wires:
@@ -159,7 +139,10 @@ def _named(recording: Recording) -> _Wires:
 def _in_order(wires: _Wires, chosen: Chosen, exported: Exported) -> Iterator[tuple[int, WireItem]]:
     """Yield (number of its wire, item) of all wires by time; note how many frames were cut."""
     cut = 0
-    streams = [_numbered(number, wire, chosen) for number, (wire, _) in enumerate(wires)]
+    streams = [
+        zip(repeat(number), wire.items(start_s=chosen.start_s, end_s=chosen.end_s))
+        for number, (wire, _) in enumerate(wires)
+    ]
     for count, (number, item) in enumerate(heapq.merge(*streams, key=lambda one: one[1].epoch_ns)):
         if not count % _ASKED_EACH and chosen.is_stopped():
             raise KeyboardInterrupt
@@ -167,11 +150,6 @@ def _in_order(wires: _Wires, chosen: Chosen, exported: Exported) -> Iterator[tup
         yield number, item
     if cut:
         exported.notes.append(f"{cut} CAN FD frames without their end: their driver knows none that are so long")
-
-
-def _numbered(number: int, wire: WireTrack, chosen: Chosen) -> Iterator[tuple[int, WireItem]]:
-    for item in wire.items(start_s=chosen.start_s, end_s=chosen.end_s):
-        yield number, item
 
 
 def _block(kind: int, body: bytes) -> bytes:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,10 @@ import numpy.typing as npt
 from skinware.limits import LIMITS
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
-from skinware.recording.tracks import ChunkSource
-from skinware.wire import read_pieces
+from skinware.wire import WireItem, read_pieces
+
+if TYPE_CHECKING:
+    from skinware.recording.reading import Recording
 
 _HEADER = struct.Struct("<QQqQ")
 """Generation and sequence of the sample, its time of publication, frames or bytes missed on the bus so far."""
@@ -68,26 +70,6 @@ class WirePiece(NamedTuple):
     data: bytes
 
 
-class WireItem(NamedTuple):
-    """A frame of a CAN bus, or bytes of a serial line that were read or written together.
-
-    Attributes:
-        time_ns: CLOCK_MONOTONIC.
-        epoch_ns: the same, ns since 1970.
-        is_sent: the driver sent it; False: it received it.
-        identifier: with the flags of linux/can.h; None for bytes.
-        flags: of ``skinware.wire.ROWS``.
-        data: payload, or bytes.
-    """
-
-    time_ns: int
-    epoch_ns: int
-    is_sent: bool
-    identifier: int | None
-    flags: int
-    data: bytes
-
-
 class WireTrack:
     """The frames or bytes of one bus of a driver, as the driver received and sent them.
 
@@ -101,7 +83,7 @@ class WireTrack:
         driver, bus: as above.
     """
 
-    def __init__(self, recording: ChunkSource, driver: str, bus: str, channel: int) -> None:
+    def __init__(self, recording: Recording, driver: str, bus: str, channel: int) -> None:
         self._recording = recording
         self.driver: str = driver
         self.bus: str = bus

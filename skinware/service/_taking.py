@@ -35,26 +35,15 @@ class Accounts:
         self._record = ReaderRecord(service, os.getpid(), program, "on demand")
         self._namespace, self._announce_it = namespace, announce
         self._announcement: Announcement | None = None
-        self._announced_ns = self._announced_frames = self.due_ns = 0
+        self._announced_ns = self._announced_frames = 0
         self._in_loop = False
         self._turns: list[Turn] = []
         self._cpu_ns = 0
 
     @property
     def record(self) -> ReaderRecord:
-        """The figures so far, all turns added up."""
-        record = self._record
-        turns, self._turns = self._turns, []
-        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
-            age_ns = taken_ns - acquired_ns
-            record.age.add(age_ns)
-            record.age_ms = round(age_ns / 1e6, 3)
-            if cpu_ns:
-                record.wall.add(ended_ns - taken_ns)
-                if 0 < self._cpu_ns <= cpu_ns:
-                    record.cpu.add(cpu_ns - self._cpu_ns)
-                self._cpu_ns = cpu_ns
-        return record
+        self._add_up()
+        return self._record
 
     def begin_loop(self, kind: str) -> None:
         """From now on the reader reads in a loop, whose turns are timed."""
@@ -66,6 +55,10 @@ class Accounts:
         if missed:
             self._record.missed += missed
 
+    @property
+    def due_ns(self) -> int:
+        return self._announced_ns + _ANNOUNCE_EVERY_NS
+
     def settle(self, turns: Turns) -> None:
         self._record.frames += turns.frames
         self._record.missed += turns.missed
@@ -76,9 +69,25 @@ class Accounts:
         time_ns = now_ns()
         if turn is not None:
             self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
-        if time_ns < self.due_ns:
-            return
-        record = self.record
+        if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
+            self._add_up()
+            self._announce(time_ns)
+
+    def _add_up(self) -> None:
+        record = self._record
+        turns, self._turns = self._turns, []
+        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
+            age_ns = taken_ns - acquired_ns
+            record.age.add(age_ns)
+            record.age_ms = round(age_ns / 1e6, 3)
+            if cpu_ns:
+                record.wall.add(ended_ns - taken_ns)
+                if 0 < self._cpu_ns <= cpu_ns:
+                    record.cpu.add(cpu_ns - self._cpu_ns)
+                self._cpu_ns = cpu_ns
+
+    def _announce(self, time_ns: int) -> None:
+        record = self._record
         if self._announced_ns:
             passed_ns = time_ns - self._announced_ns
             record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
@@ -87,7 +96,6 @@ class Accounts:
                 self._announcement = Announcement(self._namespace, record.service)
             self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, record.frames
-        self.due_ns = time_ns + _ANNOUNCE_EVERY_NS
 
     def close(self) -> None:
         self._announce_it = False
@@ -96,7 +104,11 @@ class Accounts:
 
 
 class Taking(Attachment[SampleT]):
-    """Takes the samples of a service: the newest, or one after the other."""
+    """Takes the samples of a service: the newest, or one after the other.
+
+    Args:
+        name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
+    """
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None, announce: bool) -> None:
         super().__init__(name, namespace, timeout_s)
@@ -245,7 +257,14 @@ class Taking(Attachment[SampleT]):
     def _take_turn(
         self, wanted: int, timeout_ns: int, max_age_s: float | None = None, newer_than: Position | None = None
     ) -> SampleT:
-        """Return the sample after ``newer_than`` or the last one taken; C takes it while only samples come."""
+        """Return the next sample after ``newer_than`` (default: the last one taken).
+
+        C takes it, as long as nothing but samples happens since the last one.
+
+        Args:
+            wanted: ``NEWER`` for the newest, or ``NEXT``.
+            max_age_s: as for ``read``.
+        """
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:
             ring = self._ring
@@ -253,7 +272,7 @@ class Taking(Attachment[SampleT]):
                 frames = ring.take.next(wanted, timeout_ns)
                 if frames:
                     return frames[0]
-                begun_ns = ring.take.state_in_c.begun_ns
+                begun_ns = ring.take.begun_ns
         deadline_ns = (begun_ns or now_ns()) + timeout_ns
         if wanted == NEXT:
             frame = self._read_in_order(deadline_ns)

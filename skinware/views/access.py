@@ -20,11 +20,7 @@ _WORD = 4
 
 
 def account_of(peer: tuple[str, int], here: tuple[str, int]) -> int | None:
-    """Return the user id of the other end's owner; None where the kernel does not show it.
-
-    Args:
-        peer: address and port of the other end, on this machine.
-    """
+    """Return the user id of the owner of ``peer``, an end on this machine; None where the kernel does not show it."""
     local, remote = _in_table(peer), _in_table(here)
     try:
         lines = _TABLES[ipaddress.ip_address(peer[0]).version].read_text(encoding="ascii").splitlines()[1:]
@@ -45,11 +41,7 @@ def _in_table(end: tuple[str, int]) -> str:
 
 
 class AccessRefused(Exception):
-    """A request is refused.
-
-    Attributes:
-        status: of the answer.
-    """
+    """A request is refused, with this status of the answer."""
 
     def __init__(self, status: HTTPStatus, why: str) -> None:
         super().__init__(why)
@@ -57,11 +49,7 @@ class AccessRefused(Exception):
 
 
 class Access:
-    """Decide which requests may be answered.
-
-    Args:
-        token: that requests need; None: this account and root may look. Give one where other machines can connect.
-    """
+    """Decide which requests may be answered; without a token, this account and root may look."""
 
     def __init__(self, host: str, token: str | None = None) -> None:
         self.token = token
@@ -70,12 +58,7 @@ class Access:
         self._hosts = None if not is_loopback(host) else {"localhost", "127.0.0.1", "::1", host.lower()}
 
     def check(self, target: str, headers: Mapping[str, str]) -> None:
-        """Check that a request may be answered.
-
-        Raises:
-            Refused: it may not be answered.
-            ValueError: something in it cannot be an address.
-        """
+        """Check that a request may be answered; ValueError: something in it cannot be an address."""
         host = _only(headers, "Host")
         name = urlsplit(f"http://{host}").hostname
         if not host or (self._hosts is not None and name not in self._hosts):
@@ -92,14 +75,7 @@ class Access:
             raise AccessRefused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
 
     def check_account(self, peer: tuple[str, int], here: tuple[str, int]) -> None:
-        """Check that the account at the other end of a connection may look.
-
-        Args:
-            peer: address and port of that end.
-
-        Raises:
-            Refused: it may not look.
-        """
+        """Check that the account at the other end of a connection may look."""
         if self.token is None and account_of(peer, here) not in (os.geteuid(), 0):
             raise AccessRefused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,15 +16,19 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, settling, status_now
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.contacts_service import ContactsSample
-from skinware.tactile.motion_service import MotionSample
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.tactile.motion_service import MotionReader, MotionSample
+from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
-from skinware.views.live import LiveDriver, LiveDrivers, TactileServices
+from skinware.views.live import LiveDriver, LiveDrivers, LiveSources
 from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
+_Made = TypeVar("_Made")
 _JUDGE_EVERY_NS = NS_PER_S // 5
+_CALM_WITHIN_NS = 20_000_000
+"""A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
 """A snapshot may be taken this much earlier than the pace asks for."""
 _UNHEALTHY, _NEVER_SEEN, _ALL_BITS = np.uint8(Status.UNHEALTHY), np.uint8(Status.NEVER_SEEN), np.uint8(0xFF)
@@ -48,33 +52,30 @@ class Newest:
     motion: MotionSample | None
     shared: dict[object, Any] = field(default_factory=dict)
 
-    def once(self, key: object, make: Callable[[], Any]) -> Any:
-        """Return a result that is made once for all viewers."""
+    def once(self, key: object, make: Callable[[], _Made]) -> _Made:
         if key not in self.shared:
             self.shared[key] = make()
-        return self.shared[key]
+        made: _Made = self.shared[key]
+        return made
 
     def physical(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]]:
         """Return (n,) values of a quantity's sensors in its unit."""
-        values: npt.NDArray[np.floating[Any]] = self.once(
-            ("physical", quantity.name), lambda: self.frame.physical(quantity.type.name)
-        )
-        return values
+        return self.once(("physical", quantity.name), lambda: self.frame.physical(quantity.type.name))
 
     def all_physical(self) -> npt.NDArray[np.float32]:
         """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""
-        values: npt.NDArray[np.float32] = self.once("all", lambda: physical_values(self.frame))
-        return values
+        return self.once("all", lambda: physical_values(self.frame))
 
     def above_baseline(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
         """Return (n,) how far values are above their baselines, 0 without touch; None without a calmed driver."""
         calm = self.calm
         if calm is None:
             return None
-        values: npt.NDArray[np.floating[Any]] = self.once(
-            ("calm", quantity.name), lambda: calm.physical(quantity.type.name)
-        )
-        return values
+        return self.once(("calm", quantity.name), lambda: calm.physical(quantity.type.name))
+
+    @property
+    def contacts_position(self) -> tuple[int, int] | None:
+        return None if self.contacts is None else self.contacts.position
 
     @property
     def why(self) -> npt.NDArray[np.uint8]:
@@ -84,16 +85,14 @@ class Newest:
     @property
     def settling(self) -> npt.NDArray[np.bool_]:
         """(n_sensors,) bool: those whose baselines the calmed driver does not know yet."""
-        waiting: npt.NDArray[np.bool_] = self.once("settling", lambda: settling(self.calm or self.frame))
-        return waiting
+        return self.once("settling", lambda: settling(self.calm or self.frame))
 
     @property
     def marked(self) -> npt.NDArray[np.uint8]:
         """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
-        marked: npt.NDArray[np.uint8] = self.once(
+        return self.once(
             "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
         )
-        return marked
 
     def totals(self, quantity: Quantity, rest: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float64] | None:
         """Return (n_pads,) the load on each pad, the sum or the highest of its values, in the quantity's unit.
@@ -121,7 +120,9 @@ class Newest:
 
 
 class Origin:
-    """A namespace whose drivers are followed, with the services about them.
+    """A namespace whose drivers are followed, with the services about them: calmed drivers, contacts and motion.
+
+    Contacts and motion may be in the namespace of calmed drivers, too.
 
     Args:
         names: of the drivers; default: all.
@@ -142,26 +143,58 @@ class Origin:
         self.namespace, self.names, self.calm = namespace, tuple(names), calm
         self.recording, self.is_beside = recording, is_beside
         self.live = LiveDrivers(namespace, names)
-        self.services = TactileServices(self.live, names, calm)
+        self._calm = None if calm is None else LiveDrivers(calm, names)
+        namespaces = [namespace, *([] if calm is None else [calm])]
+        self._contacts = [LiveSources[ContactsSample](each, ContactsReader) for each in namespaces]
+        self._motion = [LiveSources[MotionSample](each, MotionReader) for each in namespaces]
+        self._services: list[LiveSources[Any]] = [*self._contacts, *self._motion]
 
     @property
     def title(self) -> str:
         """The part of its drivers' keys that is the same whenever they are shown."""
         return self.recording or self.namespace.name
 
+    def look(self) -> list[LiveDriver]:
+        """Look for drivers and services that came or went, and return all drivers by name."""
+        drivers = self.live.look()
+        if self._calm is not None:
+            self._calm.look()
+        for services in self._services:
+            services.look()
+        return drivers
+
+    def is_due(self, live: LiveDriver) -> bool:
+        """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
+        frame, calm = live.frame, None if self._calm is None else self._calm.get(live.name)
+        if frame is None or calm is None or self._calm is None:
+            return frame is not None
+        self._calm.poll(calm)
+        is_here = calm.frame is not None and calm.frame.acquired_ns >= frame.acquired_ns
+        return is_here or now_ns() - frame.published_ns > _CALM_WITHIN_NS
+
+    def about(self, driver: str) -> tuple[DriverSnapshot | None, ContactsSample | None, MotionSample | None]:
+        """Return the newest snapshot of a calmed driver, contacts and motion; None where no living service has one."""
+        live = None if self._calm is None else self._calm.get(driver)
+        calm = None if live is None or live.frame is None or live.frame.stale else live.frame
+        contacts = [sample for source in self._contacts if (sample := source.of(driver)) is not None]
+        motion = [found for source in self._motion if (found := source.of(driver)) is not None]
+        return calm, next(iter(contacts), None), next(iter(motion), None)
+
+    def contacts_reader(self, driver: str) -> SourceReader[ContactsSample] | None:
+        found = (reader for source in self._contacts for reader in source.readers.values())
+        return next((reader for reader in found if reader.source.driver == driver), None)
+
     def close(self) -> None:
-        self.services.close()
+        for services in self._services:
+            services.close()
+        if self._calm is not None:
+            self._calm.close()
         self.live.close()
 
 
 @dataclass
 class PlotFunction:
-    """A function of a snapshot whose values are plotted.
-
-    Attributes:
-        driver: name; None: the first.
-        problem: why it failed last; empty: it did not.
-    """
+    """A function of snapshots of a driver (None: the first) that is plotted; ``problem``: why it failed last."""
 
     function: Callable[[DriverSnapshot], float]
     driver: str | None = None
@@ -169,7 +202,6 @@ class PlotFunction:
     problem: str = ""
 
     def __call__(self, frame: DriverSnapshot) -> float:
-        """Return its value; NaN if it fails."""
         try:
             value, self.problem = float(self.function(frame)), ""
         except Exception as error:  # noqa: BLE001 - a user's function may raise anything
@@ -260,19 +292,18 @@ class ShownDriver:
         if (
             self.life != before_life
             or not np.array_equal(self.newest.status, before.status)
-            or _number(self.newest.contacts) != _number(before.contacts)
+            or self.newest.contacts_position != before.contacts_position
         ):
             self.changes += 1
 
     def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8]) -> Newest:
         self._judged_ns = now_ns()
-        services, name = self.origin.services, self.live.name
-        calm = services.calm_of(name)
+        calm, contacts, motion = self.origin.about(self.live.name)
         if calm is not None and not self._fits(calm.structure):
             calm = None
         if calm is not None:
             status = status | (calm.status & _UNHEALTHY)
-        return Newest(frame, status, calm, services.contacts_of(name), services.motion_of(name))
+        return Newest(frame, status, calm, contacts, motion)
 
     def _fits(self, calm: Structure) -> bool:
         """Return whether a calmed driver has the same sensors; the comparison is made once for two structures."""
@@ -283,10 +314,6 @@ class ShownDriver:
             )
             self._calm_pair = calm, self.structure, fits
         return fits
-
-
-def _number(sample: ContactsSample | None) -> tuple[int, int] | None:
-    return None if sample is None else sample.position
 
 
 class Follower:
@@ -317,23 +344,21 @@ class Follower:
     def take(self, period_ns: int) -> list[ShownDriver]:
         """Take newer snapshots without waiting.
 
-        Args:
-            period_ns: shortest time between two snapshots of a driver.
-
         Returns:
             The drivers with a newer snapshot; their ``changes``, and ``edition``, show what else has changed.
         """
         self.problem = None
         try:
-            found = [(live, origin) for origin in self.origins for live in origin.live.look()]
-            for origin in self.origins:
-                origin.services.look()
+            found = [(live, origin) for origin in self.origins for live in origin.look()]
         except NamespaceError as error:
             self.problem = str(error)
             return []
         if [driver.live for driver in self.drivers] != [live for live, _ in found]:
             kept = {id(driver.live): driver for driver in self.drivers}
-            self.drivers = [kept.get(id(live)) or self._begin(live, origin) for live, origin in found]
+            self.drivers = []
+            for live, origin in found:
+                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
+                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
             self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
@@ -354,14 +379,10 @@ class Follower:
             origin.live.poll(live)
         if live.frame is None or live.frame is driver.frame:
             driver.judge()
-        elif origin.services.is_due(live):
+        elif origin.is_due(live):
             driver.take(live.frame)
             return True
         return False
-
-    def _begin(self, live: LiveDriver, origin: Origin) -> ShownDriver:
-        number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
-        return ShownDriver(number, live, origin)
 
     def _arrange(self) -> None:
         self.edition += 1

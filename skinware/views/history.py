@@ -93,20 +93,13 @@ class DriverRest:
 
 
 class RecentValues:
-    """Values of n sensors in the last seconds."""
-
     def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
         self._values: npt.NDArray[Any] = np.zeros((_FRAMES, n), dtype)
         self._time_ns = np.zeros(_FRAMES, np.int64)
         self._count = 0
 
     def add(self, values: npt.NDArray[Any], time_ns: int) -> None:
-        """Keep the values of a snapshot.
-
-        Args:
-            values: (n,) raw.
-            time_ns: when it was published; later than all before.
-        """
+        """Keep the (n,) raw values of a snapshot, published later than all before."""
         row = self._count % _FRAMES
         self._values[row], self._time_ns[row] = values, time_ns
         self._count += 1
@@ -126,7 +119,6 @@ class RecentValues:
         return noise
 
     def _rows(self) -> npt.NDArray[np.int64]:
-        """Return the rows of the last ten seconds, the oldest first."""
         rows = np.arange(max(0, self._count - _FRAMES), self._count) % _FRAMES
         if not len(rows):
             return rows
@@ -147,12 +139,7 @@ class WipeTest:
         self._highest: Floats = np.full(structure.n_sensors, -np.inf, np.float32)
 
     def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_]) -> None:
-        """Take a snapshot into account.
-
-        Args:
-            physical: (n,) physical values.
-            fresh: (n,) bool; other sensors are left out.
-        """
+        """Take (n,) physical values into account where they are fresh."""
         np.fmin(self._lowest, physical, out=self._lowest, where=fresh)
         np.fmax(self._highest, physical, out=self._highest, where=fresh)
 
@@ -174,8 +161,6 @@ def threshold(noise: float) -> float:
 
 
 class Memory:
-    """Everything that a picture of one driver remembers from snapshot to snapshot."""
-
     def __init__(self, structure: Structure, rest: DriverRest | None = None) -> None:
         self.structure = structure
         self.rest = rest or DriverRest(structure)
@@ -199,13 +184,7 @@ class Memory:
         return rounded_up(max(greatest, _LEAST_SPAN * noise))
 
     def limits(self, key: tuple[str, str], values: Floats, known: tuple[float, float]) -> tuple[float, float]:
-        """Return the two limits of values where they are known, otherwise the extremes seen so far.
-
-        Args:
-            key: of the kind of values.
-            values: (k,) of the sensors that count.
-            known: of the sensor type; infinite where they are not known.
-        """
+        """Return the two limits of values where they are known, otherwise the extremes of (k,) values seen so far."""
         if all(map(math.isfinite, known)):
             return known
         counting = values[np.isfinite(values)]

@@ -1,4 +1,4 @@
-"""Follow drivers live, all or one of them, and the services about them: contacts, motion, calmed drivers, bridges."""
+"""Follow drivers live, all or one of them, contacts on them, and bridges."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, Generic, NamedTuple
+from typing import Generic, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,19 +19,16 @@ from skinware.drivers import Drivers
 from skinware.errors import ConfigurationError, NamespaceError, ServiceNotFound, ServiceTimeout, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import NS_PER_S
 from skinware.skin import Skin
 from skinware.state import DriverReport, report_of
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
-from skinware.tactile.motion_service import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
 
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _COUNT_EVERY_NS = NS_PER_S // 10
-_CALM_WITHIN_NS = 20_000_000
-"""A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _WAIT_S = 0.1
 _SILENT_S = 5.0
 
@@ -45,8 +42,6 @@ class _Count(NamedTuple):
 
 
 class LiveDriver:
-    """One driver and its newest snapshot."""
-
     def __init__(self, reader: DriverReader) -> None:
         self.reader = reader
         self.frame: DriverSnapshot | None = None
@@ -116,11 +111,7 @@ class LiveDrivers:
         return self._live.get(name)
 
     def look(self) -> list[LiveDriver]:
-        """Look for drivers that came or went, if that is due, and return all by name.
-
-        Raises:
-            NamespaceError: the namespace cannot be trusted or read.
-        """
+        """Return all drivers by name."""
         self._drivers.look()
         if self._drivers.trouble:
             raise NamespaceError(self._drivers.trouble)
@@ -152,12 +143,11 @@ class LiveBridges(Drivers[BridgeReader]):
         super().__init__(namespace, BridgeReader)
 
     def states(self) -> list[BridgeState]:
-        """Return the state of each bridge whose program lives."""
         samples = [self.newest(name) for name in list(self.readers)]
         return [sample.state for sample in samples if sample is not None and not sample.stale]
 
 
-class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
+class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
     """The services of one kind in a namespace, each of which is about one driver."""
 
     def of(self, driver: str) -> SampleT | None:
@@ -169,69 +159,8 @@ class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
         return None
 
 
-class TactileServices:
-    """Calmed drivers, contacts and motion for the drivers of a namespace, from it and from the namespace of calm.
-
-    Args:
-        calm: namespace of calmed drivers; None: without it.
-    """
-
-    def __init__(self, drivers: LiveDrivers, names: Collection[str] = (), calm: Namespace | None = None) -> None:
-        self._calm = None if calm is None else LiveDrivers(calm, names)
-        namespaces = [drivers.namespace, *([] if calm is None else [calm])]
-        self._contacts = [LiveSources[ContactsSample](namespace, ContactsReader) for namespace in namespaces]
-        self._motion = [LiveSources[MotionSample](namespace, MotionReader) for namespace in namespaces]
-        self._all: list[LiveSources[Any]] = [*self._contacts, *self._motion]
-
-    def look(self) -> None:
-        """Look for services that came or went.
-
-        Raises:
-            NamespaceError: the namespace of calmed drivers cannot be trusted or read.
-        """
-        if self._calm is not None:
-            self._calm.look()
-        for services in self._all:
-            services.look()
-
-    def is_due(self, live: LiveDriver) -> bool:
-        """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
-        frame, calm = live.frame, None if self._calm is None else self._calm.get(live.name)
-        if frame is None or calm is None or self._calm is None:
-            return frame is not None
-        self._calm.poll(calm)
-        is_here = calm.frame is not None and calm.frame.acquired_ns >= frame.acquired_ns
-        return is_here or now_ns() - frame.published_ns > _CALM_WITHIN_NS
-
-    def calm_of(self, driver: str) -> DriverSnapshot | None:
-        """Return the newest snapshot of a calmed driver; None where no living service publishes one."""
-        calm = None if self._calm is None else self._calm.get(driver)
-        return None if calm is None or calm.frame is None or calm.frame.stale else calm.frame
-
-    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
-        found = (reader for source in self._contacts for reader in source.readers.values())
-        return next((reader for reader in found if reader.source.driver == driver), None)
-
-    def contacts_of(self, driver: str) -> ContactsSample | None:
-        return next((sample for source in self._contacts if (sample := source.of(driver)) is not None), None)
-
-    def motion_of(self, driver: str) -> MotionSample | None:
-        return next((sample for source in self._motion if (sample := source.of(driver)) is not None), None)
-
-    def close(self) -> None:
-        for services in self._all:
-            services.close()
-        if self._calm is not None:
-            self._calm.close()
-
-
 class TouchedPlace(NamedTuple):
-    """A contact, and its place on the skin.
-
-    Attributes:
-        sensor: position in a snapshot of the taxel nearest to its centre; of its first taxel where places are not
-            known.
-    """
+    """A contact, and its place: the taxel nearest to its centre, or its first where places are not known."""
 
     contact: Contact
     unit: str
@@ -240,11 +169,7 @@ class TouchedPlace(NamedTuple):
 
 
 def places_of(frame: ContactsSample | None, structure: Structure) -> list[TouchedPlace]:
-    """Return the places of contacts, the oldest first; none if they are of other sensors than those of the driver.
-
-    Args:
-        structure: of their driver now.
-    """
+    """Return the places of contacts, the oldest first; none if they are of other sensors than the structure's."""
     if frame is None:
         return []
     source = frame.source
@@ -276,11 +201,7 @@ class Overview:
         self.bridges = LiveBridges(namespace)
 
     def look(self) -> list[LiveDriver]:
-        """Look for what came or went, take the newest snapshots without waiting, and return all drivers by name.
-
-        Raises:
-            NamespaceError: the namespace cannot be trusted or read.
-        """
+        """Look for what came or went, take the newest snapshots without waiting, and return all drivers by name."""
         for driver in self.drivers.look():
             self.drivers.poll(driver)
         self.contacts.look()
@@ -299,16 +220,7 @@ class Overview:
 
 
 def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReader:
-    """Return a reader of a driver, or of the only one that runs.
-
-    Args:
-        driver: its name; None: the only one.
-        how: the way to choose one, for the message.
-
-    Raises:
-        ServiceNotFound: it does not run, or none does.
-        ConfigurationError: several run.
-    """
+    """Return a reader of a driver, or of the only one that runs; ``how`` to choose one is for the message."""
     if driver is None:
         with Skin(namespace) as skin:
             drivers = skin.refresh().drivers
@@ -325,10 +237,6 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
 
     Args:
         is_over: called before each snapshot, and ten times a second while none arrives; True ends it.
-
-    Raises:
-        ServiceTimeout: no snapshot arrived for 5 s.
-        StructureChanged: the driver has other sensors now.
     """
     newest: DriverSnapshot | None = None
     heard_s = time.monotonic()
@@ -344,7 +252,6 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
 
 
 def after(seconds: float) -> Callable[[], bool]:
-    """Return a function that returns whether this time has passed since now."""
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() >= end_s
 

@@ -18,7 +18,6 @@ Mode = Literal["raw", "change", "peak", "wipe"]
 
 DEFAULT_FPS = 30.0
 
-
 MOST_EXACT = 32
 """Sensors whose exact values are sent, and lines of plots, at most."""
 MOST_MODULES = 4096
@@ -31,8 +30,6 @@ class Next(msgspec.Struct, tag_field="op", tag="next"):
 
 
 class Choose(msgspec.Struct, tag_field="op", tag="look"):
-    """Choose mode, quantity, scale and pace."""
-
     mode: Mode = "raw"
     type: str | None = None
     scale: tuple[float, float] | None = None
@@ -75,8 +72,6 @@ class Plot(msgspec.Struct, tag_field="op", tag="plot"):
 
 
 class Mark(msgspec.Struct, tag_field="op", tag="mark"):
-    """Mark an event, now, also in the recording."""
-
     text: Annotated[str, msgspec.Meta(max_length=200)]
 
 
@@ -107,11 +102,7 @@ _DECODER = msgspec.json.Decoder(Operation)
 
 
 def operation_of(text: str | bytes) -> Operation:
-    """Return an operation from its JSON.
-
-    Raises:
-        ConfigurationError: this is no operation; the message says why.
-    """
+    """Return an operation from its JSON, or raise ConfigurationError."""
     try:
         operation: Operation = _DECODER.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a ValidationError is a DecodeError
@@ -120,8 +111,6 @@ def operation_of(text: str | bytes) -> Operation:
 
 
 class QuantityPicture(NamedTuple):
-    """A quantity of a driver as a viewer sees it."""
-
     quantity: Quantity
     levels: Levels
     """(n,) uint8, see :mod:`skinware.views.quantities`."""
@@ -155,13 +144,13 @@ class Look:
         self._memories: dict[int, Memory] = {}
         self._wiping = False
 
-    def choose(self, mode: Mode, quantity: str | None, scale: tuple[float, float] | None, fps: float) -> None:
-        if mode != self.mode and mode == "peak":
+    def choose(self, choice: Choose) -> None:
+        if choice.mode != self.mode and choice.mode == "peak":
             for memory in self._memories.values():
                 memory.peak = None
-        if mode != self.mode and mode == "wipe":
+        if choice.mode != self.mode and choice.mode == "wipe":
             self.wipe(True)
-        self.mode, self.quantity, self.scale, self.fps = mode, quantity, scale, fps
+        self.mode, self.quantity, self.scale, self.fps = choice.mode, choice.type, choice.scale, choice.fps
 
     def tare(self) -> None:
         """Take the next values for rest, and begin peaks again."""
@@ -177,7 +166,6 @@ class Look:
                 memory.wipe = None
 
     def follow(self, driver: ShownDriver) -> None:
-        """Take a new snapshot of a driver into account."""
         quantity, newest = self.quantity_of(driver), driver.newest
         if quantity is None or newest is None:
             return
@@ -195,11 +183,9 @@ class Look:
             memory.wipe.follow(values, fresh)
 
     def quantity_of(self, driver: ShownDriver) -> Quantity | None:
-        """Return the quantity of a driver that this viewer sees; None if it has none."""
         return driver.quantities[0] if self.quantity is None else driver.quantity(self.quantity)
 
     def picture(self, driver: ShownDriver) -> QuantityPicture | None:
-        """Return the picture of a driver's newest snapshot; None where nothing of it is seen."""
         quantity, newest = self.quantity_of(driver), driver.newest
         if quantity is None or newest is None:
             return None

@@ -79,7 +79,7 @@ class View:
         return f'<iframe src="{escape(self.url)}" title="skin-view" style="{style}"></iframe>'
 
     def _run(self) -> None:
-        from skinware.views.server import ViewServer, show
+        from skinware.views.server import ViewServer
 
         def ready(port: int) -> None:
             self._port = port
@@ -87,7 +87,7 @@ class View:
 
         server = ViewServer(self._follower, Access("127.0.0.1"), files=self._files, is_framed=True)
         try:
-            self._loop.run_until_complete(show(server, "127.0.0.1", 0, ready, self._stop))
+            self._loop.run_until_complete(server.show("127.0.0.1", 0, ready, self._stop))
         except OSError as error:
             self._failed = error
             self._is_ready.set()

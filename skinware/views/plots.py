@@ -56,8 +56,6 @@ class PlotBlock(NamedTuple):
 
 
 class _Feed:
-    """The samples of one service that wait for the next turn."""
-
     def __init__(self, source: _PlotSource) -> None:
         reader = ContactsReader if source.of == "contacts" else DriverReader
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
@@ -74,7 +72,12 @@ class _Feed:
         self.number, self.lines = number, lines
         if self.of == "contacts":
             ids = [line.contact for line in lines.values()]
-            self._values = lambda sample: _loads(sample, ids)
+
+            def loads(sample: ContactsSample) -> Values:
+                known = dict(zip(sample.contacts.id.tolist(), sample.contacts.load.tolist(), strict=True))
+                return np.array([known.get(contact, np.nan) for contact in ids])
+
+            self._values = loads
         elif self.of == "function":
             names = [line.function or "" for line in lines.values()]
             self._values = lambda frame: np.array([functions[name](frame) for name in names])
@@ -110,11 +113,7 @@ class _Feed:
 
 
 class Plots:
-    """The lines of one viewer.
-
-    Attributes:
-        has_news: values wait for a turn.
-    """
+    """The lines of one viewer; ``has_news``: values wait for a turn."""
 
     def __init__(self, follower: Follower) -> None:
         self.has_news = False
@@ -131,19 +130,20 @@ class Plots:
         return sum(feed.missed for feed in self._feeds.values())
 
     def choose(self, number: int, lines: list[Line], edition: int) -> None:
-        """Send the values of these lines from now on; of new taxels also those of the last seconds.
-
-        Args:
-            edition: of the structures that the lines are from.
-        """
+        """Send the values of lines of this edition from now on; of new taxels also those of the last seconds."""
         before, self._lines, self._number, self._edition = self._lines, lines, number, edition
         self._find()
-        new = [(at, line) for at, line in enumerate(lines) if line not in before]
-        self._waiting += [block for at, line in new if (block := self._past_of(at, line)) is not None]
+        for at, line in enumerate(lines):
+            driver = self._follower.get(line.driver)
+            if driver is None or line.position is None or line in before:
+                continue
+            if line.position < driver.structure.n_sensors:
+                time_ns, raw = driver.past.series(line.position)
+                scale, offset = _units_of(driver.structure, np.array([line.position]))
+                self._waiting.append(PlotBlock(number, "driver", [at], time_ns, raw[:, None] * scale + offset))
         self.has_news = bool(self._waiting)
 
     def take(self) -> None:
-        """Take the samples that came."""
         if self._lines and now_ns() >= self._look_ns:
             self._find()
         for source, feed in list(self._feeds.items()):
@@ -186,7 +186,7 @@ class Plots:
     def _source_of(self, driver: ShownDriver, line: Line) -> _PlotSource | None:
         origin = driver.origin
         if line.contact is not None:
-            reader = origin.services.contacts_reader(driver.live.name)
+            reader = origin.contacts_reader(driver.live.name)
             return None if reader is None else _PlotSource("contacts", reader.namespace, reader.name)
         if line.function is not None:
             is_known = line.function in self._follower.functions
@@ -195,14 +195,6 @@ class Plots:
         if line.modules and is_calm and origin.calm is not None:
             return _PlotSource("calm", origin.calm, driver.live.name)
         return _PlotSource("driver", origin.namespace, driver.live.name)
-
-    def _past_of(self, at: int, line: Line) -> PlotBlock | None:
-        driver = self._follower.get(line.driver)
-        if driver is None or line.position is None or line.position >= driver.structure.n_sensors:
-            return None
-        time_ns, raw = driver.past.series(line.position)
-        scale, offset = _units_of(driver.structure, np.array([line.position]))
-        return PlotBlock(self._number, "driver", [at], time_ns, raw[:, None] * scale + offset)
 
 
 def _sensors_of(driver: ShownDriver, line: Line) -> Sensors:
@@ -216,7 +208,6 @@ def _sensors_of(driver: ShownDriver, line: Line) -> Sensors:
 
 
 def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
-    """Return (k,) scale and (k,) offset of sensors."""
     by_id = {t.id: (t.scale, t.offset) for t in structure.types}
     units = np.array([by_id[of_type] for of_type in structure.sensor_type[sensors].tolist()]).reshape(-1, 2)
     return units[:, 0], units[:, 1]
@@ -246,8 +237,3 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
         return found
 
     return totals
-
-
-def _loads(sample: ContactsSample, ids: list[int | None]) -> Values:
-    loads = dict(zip(sample.contacts.id.tolist(), sample.contacts.load.tolist(), strict=True))
-    return np.array([loads.get(contact, np.nan) for contact in ids])

@@ -82,7 +82,6 @@ class Quantity:
 
     @property
     def is_touch(self) -> bool:
-        """Whether a touch changes its values."""
         return self.type.id not in _NO_TOUCH
 
     @property
@@ -164,7 +163,6 @@ def _with_uids(structure: Structure, uids: list[int], types: tuple[str, ...]) ->
 
 
 def pads_of(structure: Structure) -> Pads:
-    """Return the pads of a driver in the order of its modules."""
     part = np.full(structure.n_sensors, -1)
     geometry = structure.geometry
     for frame in () if geometry is None else set(geometry.frame[geometry.known].tolist()):

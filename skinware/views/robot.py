@@ -37,12 +37,7 @@ _NOWHERE: Triple = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """The mesh of a link.
-
-    Attributes:
-        frame: the link's coordinate frame.
-        pose: (4, 4) of the mesh in that frame, with its scale.
-    """
+    """The mesh of a link; ``pose``: (4, 4) of the mesh in the link's coordinate frame, with its scale."""
 
     frame: str
     file: Path
@@ -51,12 +46,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Places of coordinate frames, and meshes.
-
-    Attributes:
-        poses: (4, 4) of each frame, by name.
-        left_out: the parts of the file that could not be used, for people.
-    """
+    """(4, 4) poses of coordinate frames by name, meshes, and for people the parts of the file that are not used."""
 
     poses: dict[str, Pose] = field(default_factory=dict)
     meshes: tuple[Mesh, ...] = ()
@@ -78,11 +68,7 @@ class _RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_robot(path: Path) -> Robot:
-    """Read a file of links, or a URDF file.
-
-    Raises:
-        ConfigurationError: it does not exist, is of another format, or is wrong; the message says where.
-    """
+    """Read a file of links, or a URDF file; a ConfigurationError says what is wrong and where."""
     return _from_urdf(path) if path.suffix in (".urdf", ".xml") else _from_toml(path)
 
 
@@ -139,7 +125,6 @@ def _from_urdf(path: Path) -> Robot:
 
 
 def _poses(robot: ElementTree.Element) -> dict[str, Pose]:
-    """Return the places of all links with all joints at 0."""
     above: dict[str, tuple[str, Pose]] = {}
     for joint in robot.iterfind("joint"):
         parent, child = (_name(joint.find(which), "link") for which in ("parent", "child"))

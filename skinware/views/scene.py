@@ -32,12 +32,7 @@ _BY_KIND = {("triangle", 10): _TRIANGLE, ("fingertip", 12): _FINGERTIP}
 
 @dataclass(frozen=True)
 class ModuleShape:
-    """The places of the sensors of a module.
-
-    Attributes:
-        cells: one for each sensor, in the order of a snapshot.
-        halves: width in halves of a sensor.
-    """
+    """The places of the sensors of a module, in the order of a snapshot; ``halves``: width in halves of a sensor."""
 
     cells: tuple[Cell, ...]
     rows: int
@@ -142,7 +137,12 @@ class Scene:
             name: [laid_out(structure, quantity.index[~quantity.geometry.known]) for quantity in quantities]
             for name, (structure, quantities) in drivers.items()
         }
-        corners = self._arrange_flat({name: _size(places) for name, places in flat.items() if any(map(len, places))})
+        sizes = {}
+        for name, places in flat.items():
+            if any(map(len, places)):
+                at = np.concatenate(places)
+                sizes[name] = float(at[:, 0].max()), -float(at[:, 1].min())
+        corners = self._arrange_flat(sizes)
         for name, (_, quantities) in drivers.items():
             self._place(name, quantities, flat[name], corners.get(name, np.zeros(3)))
 
@@ -166,7 +166,10 @@ class Scene:
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
         for body in sorted(bodies, key=lambda body: (not self._is_placed(body), body.drivers[0], body.frame)):
             pose = self._poses.get(body.frame, np.eye(4)).copy()
-            outlines = _hand_around(body)
+            side, outlines = side_of(body.frame), []
+            if side is not None:  # the parts of a nominal hand on which the taxels are, and the palm
+                parts = {*parts_at(body.at, side).tolist(), len(PARTS) - 1}
+                outlines = [outline(name, side) for number, name in enumerate(PARTS) if number in parts]
             self._outlines |= {(driver, body.frame): outlines for driver in body.drivers if outlines}
             places = np.concatenate([body.at, *outlines])
             corners = np.array(np.meshgrid(*zip(places.min(axis=0), places.max(axis=0), strict=True))).reshape(3, -1)
@@ -224,15 +227,6 @@ class _Body:
     is_first: bool
     drivers: list[str]
     at: npt.NDArray[np.float64]
-
-
-def _hand_around(body: _Body) -> list[npt.NDArray[np.float64]]:
-    """Return the outlines of the parts of a nominal hand on which a body's taxels are, and of the palm."""
-    side = side_of(body.frame)
-    if side is None:
-        return []
-    parts = {*parts_at(body.at, side).tolist(), len(PARTS) - 1}
-    return [outline(name, side) for number, name in enumerate(PARTS) if number in parts]
 
 
 def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
@@ -321,7 +315,6 @@ def _shelves(sizes: Sequence[tuple[float, float]], gap: float, longest: float) -
 
 
 def _window(corners: Sequence[tuple[float, float]], sizes: Sequence[tuple[float, float]]) -> float:
-    """Return the height of a window that shows all boxes."""
     wide = max(right + width for (right, _), (width, _) in zip(corners, sizes, strict=True))
     high = max(height - up for (_, up), (_, height) in zip(corners, sizes, strict=True))
     return max(wide / ASPECT, high)
@@ -330,9 +323,3 @@ def _window(corners: Sequence[tuple[float, float]], sizes: Sequence[tuple[float,
 def _per_line(count: int, width: float, height: float) -> int:
     """Return the number of boxes of one size in a line, so that all fit into a small window."""
     return min(range(1, count + 1), key=lambda line: max(line * width / ASPECT, -(-count // line) * height))
-
-
-def _size(flat: Sequence[Places]) -> tuple[float, float]:
-    """Return width and height of flat layouts, m."""
-    places = np.concatenate(flat)
-    return float(places[:, 0].max()), -float(places[:, 1].min())

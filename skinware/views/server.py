@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -22,9 +22,8 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.views import looks
 from skinware.views.access import Access, AccessRefused
-from skinware.views.advice import DoctorProgram
 from skinware.views.following import Follower
-from skinware.views.recording import RecordingProgram
+from skinware.views.programs import DoctorProgram, RecordingProgram
 from skinware.views.shows import RecordingFiles, Show
 from skinware.views.tree import NOTE, problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
@@ -81,16 +80,19 @@ class ViewServer:
         self._viewers: set[Viewer] = set()
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._news = asyncio.Event()
-        self._server: Server | None = None
         self._frames, self._tls = _NOTEBOOKS if is_framed else "'none'", tls
 
-    async def start(self, host: str, port: int) -> int:
-        """Listen, and return the port, which the system chooses if ``port`` is 0.
+    async def show(self, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
+        """Serve until ``stop`` is set; at the end, disconnect all viewers, and end the recording that they began.
+
+        Args:
+            port: to listen at; 0: any.
+            ready: called with the port when browsers can connect.
 
         Raises:
             OSError: the address or port cannot be used.
         """
-        self._server = await serve(
+        server = await serve(
             self._attend,
             host,
             port,
@@ -101,9 +103,23 @@ class ViewServer:
             close_timeout=_CLOSE_TIMEOUT_S,
             ssl=self._tls,
         )
-        return int(next(iter(self._server.sockets)).getsockname()[1])
+        following, stopping = asyncio.create_task(self._follow()), asyncio.create_task(stop.wait())
+        try:
+            ready(int(next(iter(server.sockets)).getsockname()[1]))
+            await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (following, stopping):
+                task.cancel()
+            server.close()
+            with contextlib.suppress(TimeoutError):  # of connections that stay silent
+                await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
+            await self._doctor.close()
+            if self._recording is not None:
+                await self._recording.close()
+        if following.done() and not following.cancelled():
+            following.result()
 
-    async def run(self) -> None:
+    async def _follow(self) -> None:
         """Follow the drivers while there are viewers, without end."""
         while True:
             if self._viewers:
@@ -121,18 +137,7 @@ class ViewServer:
                 self._wake()
             await asyncio.sleep(_TICK_S)
 
-    async def close(self) -> None:
-        """Disconnect all viewers, and end the recording that they began."""
-        if self._server is not None:
-            self._server.close()
-            with contextlib.suppress(TimeoutError):  # of connections that stay silent
-                await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
-        await self._doctor.close()
-        if self._recording is not None:
-            await self._recording.close()
-
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a request; None: it opens a web socket."""
         try:
             self._access.check_account(connection.remote_address[:2], connection.local_address[:2])
             self._access.check(request.path, request.headers)
@@ -162,7 +167,8 @@ class ViewServer:
         file = files.get("/index.html" if path == "/" else path)
         if file is None or not file.is_file():
             raise AccessRefused(HTTPStatus.NOT_FOUND, "there is no such file")
-        return _response(HTTPStatus.OK, file.read_bytes(), _type_of(file))
+        kind = _TYPES.get(file.suffix) or mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+        return _response(HTTPStatus.OK, file.read_bytes(), kind)
 
     async def _attend(self, connection: ServerConnection) -> None:
         if len(self._viewers) >= _MOST_VIEWERS:
@@ -224,35 +230,17 @@ class ViewServer:
             case looks.Next():
                 if operation.protocol not in (None, PROTOCOL):
                     raise ConfigurationError(f"this server speaks {PROTOCOL}: reload the page")
-            case looks.Choose():
-                viewer.choose(operation)
-            case looks.Exact():
-                viewer.pin(operation.sensors)
-            case looks.Names():
-                viewer.ask(operation)
-            case looks.Plot():
-                viewer.plot(operation)
             case looks.Mark() if viewer.show.is_live:
-                self._mark(operation.text)
-            case looks.Tare():
-                viewer.tare()
-            case looks.Wipe():
-                viewer.wipe(operation.action == "start")
+                time_ns = now_ns()
+                in_recording = self._recording is not None and self._recording.mark(operation.text, time_ns)
+                self._marks.append({"time_ns": str(time_ns), "text": operation.text, "is_recorded": in_recording})
             case looks.Record() if self._recording is not None and viewer.show.is_live:
                 if operation.action == "start":
                     self._recording.start()
                 else:
                     self._recording.stop()
-            case looks.Replay():
-                viewer.show.act(operation, viewer.refuse)
-            case _:
+            case _ if not viewer.obey(operation):
                 raise ConfigurationError("this server cannot do that")
-
-    def _mark(self, text: str) -> None:
-        """Mark an event for all viewers, and in the recording if one is made."""
-        time_ns = now_ns()
-        in_recording = self._recording is not None and self._recording.mark(text, time_ns)
-        self._marks.append({"time_ns": str(time_ns), "text": text, "is_recorded": in_recording})
 
     def _besides(self, show: Show) -> dict[str, Any]:
         besides: dict[str, Any] = {"recording": None}
@@ -276,34 +264,6 @@ class ViewServer:
         return besides
 
 
-async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
-    """Serve until ``stop`` is set.
-
-    Args:
-        port: to listen at; 0: any.
-        ready: called with the port when browsers can connect.
-        stop: set it to end.
-
-    Raises:
-        OSError: the address or port cannot be used.
-    """
-    found = await server.start(host, port)
-    following, stopping = asyncio.create_task(server.run()), asyncio.create_task(stop.wait())
-    try:
-        ready(found)
-        await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in (following, stopping):
-            task.cancel()
-        await server.close()
-    if following.done() and not following.cancelled():
-        following.result()
-
-
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
     own = {"Content-Type": f"{content_type}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
     return Response(status.value, status.phrase, Headers(own | _HEADERS), body)
-
-
-def _type_of(file: Path) -> str:
-    return _TYPES.get(file.suffix) or mimetypes.guess_type(file.name)[0] or "application/octet-stream"

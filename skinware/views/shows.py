@@ -21,7 +21,7 @@ from skinware.realtime import NS_PER_S
 from skinware.tactile.contacts_service import NAME as CONTACTS
 from skinware.views.following import Follower, Origin
 from skinware.views.looks import Replay
-from skinware.views.recording import REPLAY_VALUES, ReplayControl
+from skinware.views.programs import REPLAY_VALUES, ReplayControl
 
 if TYPE_CHECKING:
     from skinware.recording import Recording
@@ -95,6 +95,15 @@ class Outline:
         self.until_s = recording.duration_s
         yield
 
+    def as_data(self) -> dict[str, Any]:
+        return {
+            "until_s": self.until_s,
+            "samples": self.samples.tolist(),
+            "missed": self.missed.tolist(),
+            "contacts": None if self.contacts is None else self.contacts.tolist(),
+            "events": list(self.events),
+        }
+
     def _bin(self, time_s: float) -> int:
         share = time_s / self._recording.duration_s if self._recording.duration_s else 0.0
         return min(self._bins - 1, max(0, int(share * self._bins)))
@@ -110,11 +119,6 @@ class PlayedRecording:
         state: as :meth:`skinware.recording.replaying.Replayer.replay` returns it.
         outline: of the part so far, as the page reads it; another thread makes it, and replaces it.
         problems: of the file, and why it stopped.
-
-    Raises:
-        MissingExtra: packages for recordings are not installed.
-        BadRecording: it is not a recording, or needs a newer version or more shared memory than the limits allow.
-        OSError: it cannot be read.
     """
 
     def __init__(self, file: Path, title: str) -> None:
@@ -145,7 +149,6 @@ class PlayedRecording:
         return [f"{self.title}: {problem}" for problem in found]
 
     def act(self, action: str, value: float | bool | None, complain: Callable[[str], object]) -> None:
-        """Call an operation of the replay; ``complain`` is called with the reason if it failed."""
         self._orders.put((action, value, complain))
         os.eventfd_write(self._bell, 1)
 
@@ -192,23 +195,13 @@ class PlayedRecording:
                 for _ in outline.steps():
                     end_ns = time.monotonic_ns()
                     if end_ns >= due_ns or outline.until_s == recording.duration_s:
-                        self.outline, due_ns = _written(outline), end_ns + _OUTLINE_EVERY_NS
+                        self.outline, due_ns = outline.as_data(), end_ns + _OUTLINE_EVERY_NS
                     if self._is_over.wait((end_ns - begin_ns) / NS_PER_S):  # half of the time is for the replay
                         return
                     begin_ns = time.monotonic_ns()
                 self._of_file = recording.problems
         except (SkinwareError, OSError) as error:
             self._failure = str(error)
-
-
-def _written(outline: Outline) -> dict[str, Any]:
-    return {
-        "until_s": outline.until_s,
-        "samples": outline.samples.tolist(),
-        "missed": outline.missed.tolist(),
-        "contacts": None if outline.contacts is None else outline.contacts.tolist(),
-        "events": list(outline.events),
-    }
 
 
 class Show:
@@ -247,19 +240,11 @@ class Show:
         return [*self._problems, *(problem for played in self.played for problem in played.problems)]
 
     def follow(self) -> None:
-        """Hear from a replay by another program; never wait."""
         if self.is_live:
             self._control.follow(self.follower.drivers)
 
     def act(self, order: Replay, complain: Callable[[str], object]) -> None:
-        """Control the replays, or one of them.
-
-        Args:
-            complain: called with the reason if that failed, perhaps by another thread.
-
-        Raises:
-            ConfigurationError: no replay is shown, or there is no such operation.
-        """
+        """Control the replays, or one of them; call ``complain`` with the reason if that fails, perhaps by a thread."""
         if order.action not in REPLAY_VALUES:
             raise ConfigurationError("no replay is shown")
         if not self.played:

@@ -51,7 +51,6 @@ _REASONS = {
 
 
 def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
-    """Return the part of the tree for a driver, as the page reads it."""
     loads = [bus.load for bus in report.buses if bus.load is not None]
     return {
         "id": driver.number,
@@ -150,7 +149,6 @@ def problem_of_all(text: str) -> dict[str, Any]:
 
 
 def worst_first(problems: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return errors, then warnings, then notes; otherwise in their order."""
     return sorted(problems, key=lambda problem: _SEVERITIES.index(problem["severity"]))
 
 

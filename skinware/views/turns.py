@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.tactile.motion_service import MotionSample
 from skinware.text import why_text
 from skinware.views import looks
 from skinware.views.following import Newest, ShownDriver
@@ -32,8 +31,6 @@ _MOST_QUESTIONS = 64
 
 
 class Blobs:
-    """The arrays of a turn."""
-
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
@@ -72,34 +69,33 @@ class Viewer:
         self.plots = Plots(self._follower)
         self._error: str | None = None
 
-    def choose(self, choice: looks.Choose) -> None:
-        self.look.choose(choice.mode, choice.type, choice.scale, choice.fps)
-        self._see_all_again()
-
-    def tare(self) -> None:
-        self.look.tare()
-        self._see_all_again()
-
-    def wipe(self, on: bool) -> None:
-        self.look.wipe(on)
-        self._see_all_again()
-
-    def pin(self, sensors: list[tuple[int, int]]) -> None:
-        """Send the exact values of these sensors, pairs of driver and position, in every turn."""
-        self._exact, self._asked = sensors, True
-
-    def plot(self, choice: looks.Plot) -> None:
-        """Send every sample of these lines from now on."""
-        self.plots.choose(choice.number, choice.lines, self._edition)
-
-    def ask(self, question: looks.Names) -> None:
-        if len(self._questions) == _MOST_QUESTIONS:
-            self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
-        else:
-            self._questions.append(question)
+    def obey(self, operation: looks.Operation) -> bool:
+        """Carry out an operation that concerns this viewer alone; return whether it is one."""
+        match operation:
+            case looks.Choose():
+                self.look.choose(operation)
+                self._see_all_again()
+            case looks.Tare():
+                self.look.tare()
+                self._see_all_again()
+            case looks.Wipe():
+                self.look.wipe(operation.action == "start")
+                self._see_all_again()
+            case looks.Exact():
+                self._exact, self._asked = operation.sensors, True
+            case looks.Plot():
+                self.plots.choose(operation.number, operation.lines, self._edition)
+            case looks.Names() if len(self._questions) == _MOST_QUESTIONS:
+                self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
+            case looks.Names():
+                self._questions.append(operation)
+            case looks.Replay():
+                self.show.act(operation, self.refuse)
+            case _:
+                return False
+        return True
 
     def refuse(self, why: str) -> None:
-        """Report in the next turn why something could not be done."""
         self._error = why
 
     @property
@@ -127,7 +123,14 @@ class Viewer:
             self._edition = self._follower.edition
             header["skin"] = self._skin(blobs)
             self._see_all_again()
-        self._add_pictures(header, blobs)
+        pictures = []
+        for driver in self._follower.drivers:
+            if self._changes.get(driver.number) != _seen(driver):
+                self._changes[driver.number] = _seen(driver)
+                shown = self._picture(driver, blobs)
+                pictures += [shown] if shown is not None else []
+        if pictures:
+            header |= {"pictures": pictures, "mode": self.look.mode}
         if self._exact:
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         self._asked = False
@@ -184,19 +187,6 @@ class Viewer:
             ],
         }
 
-    def _add_pictures(self, header: dict[str, Any], blobs: Blobs) -> None:
-        pictures = []
-        for driver in self._follower.drivers:
-            if self._changes.get(driver.number) == _seen(driver):
-                continue
-            self._changes[driver.number] = _seen(driver)
-            shown = self._picture(driver, blobs)
-            pictures += [shown] if shown is not None else []
-        if not pictures:
-            return
-        header["pictures"] = pictures
-        header["mode"] = self.look.mode
-
     def _picture(self, driver: ShownDriver, blobs: Blobs) -> dict[str, Any] | None:
         picture, newest = self.look.picture(driver), driver.newest
         if picture is None or newest is None:
@@ -211,7 +201,18 @@ class Viewer:
             "unit": quantity.type.unit,
             "levels": blobs.add(picture.levels, "u1"),
             "contacts": self._contacts(driver, quantity, newest),
-            "regions": [] if newest.motion is None else _regions(newest.motion),
+            "regions": [
+                {
+                    "name": region.name,
+                    "value": region.load,
+                    "unit": newest.motion.source.unit,
+                    "touched": region.contacts > 0,
+                    "speed": region.speed_m_s,
+                }
+                for region in newest.motion
+            ]
+            if newest.motion is not None
+            else [],
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
@@ -291,19 +292,6 @@ class Viewer:
             drivers.append(state_of(driver, report))
             problems = problems + problems_of(driver, report)
         return {"drivers": drivers, "problems": worst_first(problems)}
-
-
-def _regions(motion: MotionSample) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": region.name,
-            "value": region.load,
-            "unit": motion.source.unit,
-            "touched": region.contacts > 0,
-            "speed": region.speed_m_s,
-        }
-        for region in motion
-    ]
 
 
 def _seen(driver: ShownDriver) -> tuple[int, int]:

@@ -28,7 +28,6 @@ Value = int | str | Sequence["Value"]
 
 
 def in_text(values: Sequence[Value]) -> str:
-    """Return a list in text."""
     texts = []
     for value in values:
         if isinstance(value, YarpWord):
@@ -47,7 +46,6 @@ def of_text(line: str) -> list[str]:
 
 
 def packed(values: Sequence[Value]) -> bytes:
-    """Return a list in binary."""
     parts = [struct.pack("<ii", _LIST, len(values))]
     for value in values:
         if isinstance(value, YarpWord):
@@ -61,11 +59,7 @@ def packed(values: Sequence[Value]) -> bytes:
 
 
 def unpacked(data: bytes) -> list[Value]:
-    """Return the values of a list in binary.
-
-    Raises:
-        ValueError: it is malformed, or has values of other types.
-    """
+    """Return the values of a list in binary, or raise ValueError."""
     try:
         (tag,) = struct.unpack_from("<i", data)
         values, end = _unpacked_list(data, 4, tag, _DEEPEST)

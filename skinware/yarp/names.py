@@ -28,12 +28,6 @@ _LONGEST_NAME = 200
 
 
 class PortAddress(NamedTuple):
-    """Address of a port.
-
-    Attributes:
-        port: of TCP, 1 to 65535.
-    """
-
     name: str
     host: str
     port: int
@@ -74,12 +68,7 @@ class NameServer:
         return f"YARP's name server at {self.host}:{self.port}"
 
     def query(self, name: str) -> PortAddress | None:
-        """Return the address of a port; None: there is none of that name.
-
-        Raises:
-            OSError: no name server answers; also in all other methods.
-            ValueError: no port can have this name; also in all other methods.
-        """
+        """Return the address of a port; None: it is not known. OSError: no name server answers, as in all methods."""
         return self._ask(name, f"query {name}")
 
     def register(self, name: str, host: str, port: int) -> PortAddress:
@@ -113,14 +102,11 @@ class NameServer:
                     answer += more
         except OSError as error:
             raise OSError(f"{self}: {error.strerror or error}") from None
-        found = [contact for line in answer.splitlines() if (contact := _contact(line)) and contact.name == name]
-        return found[0] if found else None
-
-
-def _contact(line: bytes) -> PortAddress | None:
-    """Return the port that a line of an answer is about; None: it is about no port."""
-    match = _REGISTRATION.fullmatch(line.strip())
-    if match is None or not 0 < int(match["port"]) < 1 << 16:
+        for line in answer.splitlines():
+            match = _REGISTRATION.fullmatch(line.strip())
+            if match is None or not 0 < int(match["port"]) < 1 << 16:
+                continue
+            about, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
+            if about == name:
+                return PortAddress(name, host, int(match["port"]), carrier)
         return None
-    name, host, carrier = (match[part].decode("utf-8", "replace") for part in ("name", "host", "carrier"))
-    return PortAddress(name, host, int(match["port"]), carrier)

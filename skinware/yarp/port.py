@@ -73,11 +73,7 @@ _ADMINISTRATION = (
 
 @dataclass(eq=False)
 class Receiver:
-    """A reader.
-
-    Attributes:
-        passed_over: messages that it missed because it had not finished the one before.
-    """
+    """A reader; ``passed_over``: messages that it missed because it had not finished the one before."""
 
     name: str
     carrier: Carrier
@@ -97,11 +93,7 @@ class Receiver:
 
 
 class OutputPort:
-    """An output port; to be used in the event loop in which :meth:`open` was called.
-
-    Args:
-        yarp: major version of the YARP of binary readers, 3 or 4; None: not known.
-    """
+    """An output port, for the event loop in which it is opened; ``yarp``: version of binary readers, 3 or 4."""
 
     def __init__(self, name: str, server: NameServer, yarp: int | None = None) -> None:
         self.name = name
@@ -114,22 +106,15 @@ class OutputPort:
         self._conversations: set[asyncio.Task[None]] = set()
 
     async def open(self, host: str) -> int:
-        """Listen, and return the number of the TCP port.
-
-        Raises:
-            OSError: it cannot listen there.
-        """
         self._server = await asyncio.start_server(self._called, host, 0, limit=_LONGEST_LINE)
         self._number = self._server.sockets[0].getsockname()[1]
         return self._number
 
     def send(self, message: VectorMessage) -> None:
-        """Send a message to all readers that can take it now."""
         for receiver in self.receivers:
             receiver.offer(message)
 
     async def close(self) -> None:
-        """Close all connections."""
         if self._server is not None:
             self._server.close()
         for task in list(self._conversations):
@@ -180,7 +165,6 @@ class OutputPort:
                 writer.write(b"<ACK>\r\n")
 
     async def _greeted_in_binary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-        """Greet a caller in binary and return its name, or raise ValueError if it sends none."""
         size = int.from_bytes(await reader.readexactly(4), "little")
         if not 1 <= size <= _LONGEST_LINE:
             raise ValueError(f"a name of {size} bytes")
@@ -345,7 +329,6 @@ class OutputPort:
 
 
 async def _line(reader: asyncio.StreamReader) -> str:
-    """Return the next line; raise EOFError at the end, ValueError if it is too long."""
     line = await reader.readline()
     if not line.endswith(b"\n"):
         raise EOFError("hung up")
@@ -353,12 +336,7 @@ async def _line(reader: asyncio.StreamReader) -> str:
 
 
 async def _binary_message(reader: asyncio.StreamReader) -> tuple[str, bytes]:
-    """Return the next message in binary: its command, and the data after it.
-
-    Raises:
-        EOFError: the connection ended.
-        ValueError: it is malformed, or too long.
-    """
+    """Return the next message in binary: its command, and the data after it."""
     begin, n_blocks, n_answers = _INDEX.unpack(await reader.readexactly(_INDEX.size))
     if unframed(begin) != _INDEX_NUMBER or n_blocks + n_answers > _MOST_BLOCKS:
         raise ValueError("no message of YARP")

@@ -61,7 +61,7 @@ class Settings:
 
 
 class _ServedPort:
-    """A port in the event loop; other threads call ``offer`` and read its attributes."""
+    """A port in the event loop until ``over`` is set there; other threads call ``offer`` and read its attributes."""
 
     def __init__(
         self, name: str, driver: str, names: NameServer, settings: Settings, loop: asyncio.AbstractEventLoop
@@ -76,7 +76,7 @@ class _ServedPort:
         self._names, self._host, self._loop = names, settings.host, loop
         self._lock = threading.Lock()
         self._newest: VectorMessage | None = None
-        self._over = asyncio.Event()
+        self.over = asyncio.Event()
 
     def offer(self, values: npt.NDArray[np.float64], acquired_ns: int) -> None:
         """Send a vector, in place of one that was not sent yet."""
@@ -101,19 +101,16 @@ class _ServedPort:
         number = await self.port.open(self._host)
         host = "..." if self._host in _ANYWHERE else self._host
         try:
-            while not self._over.is_set():
+            while not self.over.is_set():
                 await asyncio.to_thread(self._register, host, number)
                 try:
                     async with asyncio.timeout(_LOOK_S):
-                        await self._over.wait()
+                        await self.over.wait()
                 except TimeoutError:
                     pass
         finally:
             await self.port.close()
             await asyncio.to_thread(self._unregister)
-
-    def end(self) -> None:
-        self._over.set()
 
     def _register(self, host: str, number: int) -> None:
         """Register the port, unless its name is registered, perhaps by another program meanwhile."""
@@ -194,7 +191,7 @@ class YarpServer:
         if self._loop.is_closed():
             return
         for served in self._ports.values():
-            self._loop.call_soon_threadsafe(served.end)
+            self._loop.call_soon_threadsafe(served.over.set)
         for life in self._lives:
             try:
                 life.result(_END_S)
@@ -265,7 +262,6 @@ class YarpServer:
         return self._ports[name]
 
     def _report(self, about: str, why: str) -> None:
-        """Report trouble when it changes."""
         if self._troubles.get(about, "") != why:
             self._troubles[about] = why
             if why:

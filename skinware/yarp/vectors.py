@@ -40,12 +40,7 @@ class Vector:
     full: float
 
     def of(self, values: npt.NDArray[np.generic], status: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-        """Return (length,) the vector of a frame; 0 for values that are not good.
-
-        Args:
-            values: (n_sensors,) raw values.
-            status: (n_sensors,) their status; 0 is good.
-        """
+        """Return (length,) the vector of (n_sensors,) raw values; 0 for those that are not good (status 0)."""
         vector = np.zeros(self.length)
         good = status[self.sensors] == 0
         numbers = values[self.sensors[good]].astype(np.float64) * self.scale + self.offset

@@ -26,7 +26,7 @@ def driver_of_recording(bus_names: Sequence[str]) -> str:
 
 
 def only_listened(bus_names: Sequence[str]) -> bool:
-    """Return whether all buses are replayed, and were recorded by drivers that sent nothing."""
+    """Return whether all buses are replayed, and were recorded by drivers that sent nothing, or are logs of that."""
     found = [_recorded(name) for name in bus_names]
     return bool(found) and all(recorded is not None and recorded.listen_only for recorded in found)
 
@@ -37,7 +37,7 @@ def options_of_recording(bus_name: str, driver_type: str) -> Mapping[str, Any]:
 
 
 def _recorded(bus_name: str) -> Recorded | None:
-    if not bus_name.startswith("replay:"):
+    if not bus_name.startswith(("replay:", "file:")):
         return None
     from skinware_drivers.virtual.recorded import recorded_driver
 
@@ -49,14 +49,7 @@ _END_S = 30.0
 
 
 class Capture:
-    """A recorder in a process of its own.
-
-    Attributes:
-        result: ``bytes``, ``missed`` and ``problem``, after the end.
-
-    Raises:
-        ConfigurationError: the driver cannot be recorded; the message says why.
-    """
+    """A recorder in a process of its own; ``result`` has ``bytes``, ``missed`` and ``problem`` after the end."""
 
     def __init__(self, path: Path, driver: str, namespace: str) -> None:
         self.path = path
@@ -97,14 +90,7 @@ class Capture:
 
 @contextmanager
 def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture], None]) -> Iterator[Capture]:
-    """Capture a driver while a block runs; start the driver inside.
-
-    Args:
-        on_end: called with the capture when its file is complete.
-
-    Raises:
-        ConfigurationError: the driver cannot be recorded.
-    """
+    """Capture a driver while a block runs; start it inside. ``on_end`` is called when the file is complete."""
     capture = Capture(path, driver, namespace)
     try:
         yield capture
@@ -114,7 +100,6 @@ def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture]
 
 
 def _record(path: Path, driver: str, namespace: str) -> None:
-    """Record until standard input is closed."""
     from skinware.errors import SkinwareError
 
     problem, size, missed = "", 0, 0

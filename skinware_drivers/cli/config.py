@@ -75,10 +75,14 @@ def command(
     Exit status: 0 done, 1 failed or declined, 2 wrong usage or configuration.
     """
     from skinware.memory.namespace import Namespace
+    from skinware_drivers.finding.running import driver_on, running_drivers
 
     place = Namespace(namespace)
     given = dict(_pair(text) for text in arguments)
-    owner, of_bus = _owner(target, place.name)
+    drivers, of_bus = running_drivers(), None
+    owner = next((each for each in drivers if (each.name, each.namespace) == (target, place.name)), None)
+    if owner is None and (owner := driver_on(target, drivers)) is not None:
+        of_bus = owner.bus_named(target)
     if owner is not None:
         if driver_name or options or config or force:
             raise click.UsageError(
@@ -92,17 +96,6 @@ def command(
         print_json({"target": target, "driver": owner, "operation": operation, **outcome})
     else:
         echo("\n".join(_lines(outcome["operations" if operation is None else "results"])))
-
-
-def _owner(target: str, namespace: str) -> tuple[RunningDriver | None, str | None]:
-    from skinware_drivers.finding.running import driver_on, running_drivers
-
-    drivers = running_drivers()
-    for driver in drivers:
-        if (driver.name, driver.namespace) == (target, namespace):
-            return driver, None
-    owner = driver_on(target, drivers)
-    return owner, None if owner is None else owner.bus_named(target)
 
 
 def _through_driver(
@@ -197,12 +190,6 @@ def _adapter(
 
 
 def _confirm(what: str, description: str, yes: bool) -> None:
-    """Ask for confirmation.
-
-    Raises:
-        Declined: the user did not confirm.
-        ConfigurationError: there is no terminal.
-    """
     if yes:
         return
     if not sys.stdin.isatty():

@@ -12,12 +12,11 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, style
+from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 from skinware.text import age_text, plural, wrapped
 from skinware_drivers.doctor.finding import Finding, Severity
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from skinware_drivers.doctor.evidence import Evidence
     from skinware_drivers.doctor.examining import Examination
 
@@ -27,11 +26,7 @@ _SIGNS = {Severity.ERROR: ("✗", "red"), Severity.WARNING: ("!", "yellow"), Sev
 
 
 def as_text(evidence: Evidence, found: Examination, report: str | None = None) -> list[str]:
-    """Return the lines to print, with colours, which ``echo`` takes out without a terminal.
-
-    Args:
-        report: name of the file with the report, if one was written.
-    """
+    """Return the lines to print, with colours, which ``echo`` takes out without a terminal."""
     lines = [*_verdict(evidence, found), ""]
     for finding in found.findings:
         lines += [*_finding(finding), ""]
@@ -114,12 +109,16 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
     from skinware_drivers.doctor.examining import examine
     from skinware_drivers.doctor.looking import look
 
-    progress = _progress()
-    evidence = look(Namespace(namespace), watch_s, progress) if file is None else _recorded(file, progress)
-    progress(-1.0)
+    evidence = look(Namespace(namespace), watch_s, _progress) if file is None else _recorded(file)
+    _progress(-1.0)
     found = examine(evidence)
     if report is not None:
-        _write(report, evidence, found)
+        from skinware_drivers.doctor.report import as_markdown
+
+        try:
+            report.write_text(as_markdown(evidence, found), encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"{report}: {error.strerror or error}") from None
     if as_json:
         print_json(as_data(evidence, found))
     else:
@@ -147,50 +146,21 @@ def as_data(evidence: Evidence, found: Examination) -> dict[str, Any]:
     }
 
 
-def _write(report: Path, evidence: Evidence, found: Examination) -> None:
-    """Write the report.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
-    from skinware.errors import ConfigurationError
-    from skinware_drivers.doctor.report import as_markdown
-
-    try:
-        report.write_text(as_markdown(evidence, found), encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"{report}: {error.strerror or error}") from None
-
-
-def _recorded(file: Path, progress: Callable[[float], None]) -> Evidence:
-    """Return the evidence of a recording.
-
-    Raises:
-        ConfigurationError: the file is not a recording, or cannot be read here.
-    """
-    from skinware.errors import BadRecording, ConfigurationError, MissingExtra
-
+def _recorded(file: Path) -> Evidence:
     try:
         from skinware_drivers.doctor.recorded import look_at
 
-        return look_at(file, progress)
+        return look_at(file, _progress)
     except (BadRecording, MissingExtra) as error:
         raise ConfigurationError(str(error)) from None
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror or error}") from None
 
 
-def _progress() -> Callable[[float], None]:
-    """Return a function that shows the passed seconds on a terminal; a negative number ends it."""
-    is_terminal = sys.stderr is not None and sys.stderr.isatty()
-
-    def show(passed_s: float) -> None:
-        if is_terminal and passed_s < 0:
-            overwrite("", err=True)
-        elif is_terminal:
-            overwrite(f"looking ... {passed_s:.1f} s", err=True)
-
-    return show
+def _progress(passed_s: float) -> None:
+    """Show the passed seconds on a terminal; a negative number ends it."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        overwrite("" if passed_s < 0 else f"looking ... {passed_s:.1f} s", err=True)
 
 
 def main() -> None:

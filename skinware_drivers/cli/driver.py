@@ -37,30 +37,20 @@ _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
 """Stands in that file for this program."""
 
 
-class DriverCommand(HardwareCommand):
-    """A command that also takes the options of the driver it is asked to run."""
+def _options_of(given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
+    from skinware_drivers.cli.capturing import driver_of_recording
+    from skinware_drivers.loading import short_name
+    from skinware_drivers.options.file import ConfigFile
+    from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
-    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
-        from skinware_drivers.cli.capturing import driver_of_recording
-        from skinware_drivers.loading import short_name
-        from skinware_drivers.options.file import ConfigFile
-        from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
-
-        name = given.get("driver_name")
-        if not name and given.get("config"):
-            name = ConfigFile(Path(given["config"])).settings.driver
-        if not name:
-            with contextlib.suppress(SkinwareError):  # the bus raises it again when it is made
-                name = driver_of_recording(given.get("buses", ()))
-        name = name or DEFAULT_DRIVER
-        return short_name(name), load_driver(name).Options
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.allow_extra_args = True
-        left = super().parse_args(ctx, args)
-        if left:
-            raise click.UsageError(f"{left[0]!r} is not an option; name a driver with --driver, a bus with --bus", ctx)
-        return left
+    name = given.get("driver_name")
+    if not name and given.get("config"):
+        name = ConfigFile(Path(given["config"])).settings.driver
+    if not name:
+        with contextlib.suppress(SkinwareError):  # the bus raises it again when it is made
+            name = driver_of_recording(given.get("buses", ()))
+    name = name or DEFAULT_DRIVER
+    return short_name(name), load_driver(name).Options
 
 
 def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
@@ -85,7 +75,8 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
     "skin-driver --bus can0 --capture it.mcap   make a capture for a bug report",
     "skin-driver --bus replay:it.mcap           decode it again, with the recorded driver and options",
-    cls=DriverCommand,
+    cls=HardwareCommand,
+    options_of=_options_of,
 )
 @click.option(
     "--bus",
@@ -271,7 +262,6 @@ def print_patches(runner: Runner, change: PatchChange) -> None:
 
 
 def print_capture(capture: Capture, as_json: bool) -> None:
-    """Print that the captured file is complete, or why it is not."""
     with contextlib.suppress(BrokenPipeError):
         if as_json:
             print_json({"event": "captured", "file": str(capture.path), **capture.result})

@@ -49,14 +49,7 @@ class DriverArguments:
 
 
 class DriverSetup:
-    """A driver with its buses and options.
-
-    Attributes:
-        profile: how it is scheduled; None: as any program.
-
-    Raises:
-        ConfigurationError: the command line or the file has a mistake.
-    """
+    """A driver with its buses and options; ``profile``: how it is scheduled, None: as any program."""
 
     def __init__(self, arguments: DriverArguments) -> None:
         self._arguments = arguments
@@ -69,20 +62,25 @@ class DriverSetup:
         self.driver_type = short_name(self._driver_name)
         self.name = arguments.name or settings.name or self.driver_type
         self.namespace = Namespace(arguments.namespace)
-        self.profile = _profile(arguments, settings)
+        realtime = settings.realtime if arguments.realtime is None else arguments.realtime
+        cpus = settings.cpus if arguments.cpus is None else cpus_from_text(arguments.cpus)
+        self.profile: Profile | None = None
+        if realtime is not None or cpus:
+            self.profile = Profile.from_text("normal" if realtime is None else realtime, cpus=cpus)
         self._listen_only = arguments.listen_only or settings.listen_only or only_listened(buses)
         if not buses:
             raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
         self._buses = self._named(buses)
-        _check_own_options(arguments.buses, settings)
+        own = [bus.name for bus in settings.bus]
+        for name in arguments.buses:  # it would silently lack the options that the file has for its own buses
+            if name not in own and any(bus.options for bus in settings.bus):
+                raise ConfigurationError(
+                    f"--bus {name}: the file has options for {', '.join(own)} and none for this bus;"
+                    " change the name there"
+                )
 
     def make_runner(self, on_ready: Callable[[], None], on_patches: Callable[[PatchChange], None]) -> Runner:
-        """Return the driver, which does not run yet; see :class:`Runner` for the arguments.
-
-        Raises:
-            ConfigurationError: an option is wrong, or a bus does not fit the driver.
-            DriverError: the driver's own code failed.
-        """
+        """Return the driver, which does not run yet; see :class:`Runner` for the arguments."""
         arguments, settings = self._arguments, self._file.settings
         latency_ms = settings.latency_ms if arguments.latency_ms is None else arguments.latency_ms
         adapters = [self._make_adapter(bus, self._file) for bus in self._buses]
@@ -107,12 +105,7 @@ class DriverSetup:
         )
 
     async def read_again(self, runner: Runner) -> None:
-        """Read the files again, and change the buses and places of a running driver to what they say now.
-
-        Raises:
-            ConfigurationError: a file has a mistake; nothing is changed.
-            DriverError: the driver's own code failed.
-        """
+        """Read the files again, and change the buses and places of a running driver to what they say now."""
         file = ConfigFile(self._arguments.config)
         settings, geometry = file.settings, self._geometry(file.settings)
         if self._arguments.config is not None and not self._arguments.buses:  # those of the command line stay
@@ -158,22 +151,3 @@ class DriverSetup:
     def _geometry(self, settings: DriverConfig) -> Geometry | None:
         path = self._arguments.geometry_file or settings.geometry
         return read_geometry(path) if path else None
-
-
-def _profile(arguments: DriverArguments, settings: DriverConfig) -> Profile | None:
-    realtime = settings.realtime if arguments.realtime is None else arguments.realtime
-    cpus = settings.cpus if arguments.cpus is None else cpus_from_text(arguments.cpus)
-    if realtime is None and not cpus:
-        return None
-    return Profile.from_text("normal" if realtime is None else realtime, cpus=cpus)
-
-
-def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
-    """Refuse a bus that would silently lack the options that the file has for its own buses."""
-    known = [bus.name for bus in settings.bus]
-    for name in buses:
-        if name not in known and any(bus.options for bus in settings.bus):
-            raise ConfigurationError(
-                f"--bus {name}: the file has options for {', '.join(known)} and none for this bus;"
-                " change the name there"
-            )

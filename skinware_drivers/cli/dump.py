@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import time
 from collections.abc import Iterator
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.driver_snapshot import DriverSnapshot
     from skinware.memory.namespace import Namespace
-    from skinware.structure import Structure
     from skinware_drivers.bus import Bus, FrameBatch
 
 _LOOK_EVERY_S = 0.1
@@ -41,14 +41,7 @@ _SHARED = ("socketcan", "udp_multicast", "virtual")
 )
 @click.argument("name", required=False)
 @click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
-@click.option(
-    "-T",
-    "--timeout",
-    "timeout_s",
-    metavar="SECONDS",
-    type=cli.seconds,
-    help="Fail after SECONDS without a frame; also wait for the driver.",
-)
+@cli.timeout_option("Fail after SECONDS without a frame; also wait for the driver.")
 @cli.type_option("Only the sensors of one type, such as pressure.")
 @click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
 @click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
@@ -73,6 +66,7 @@ def command(
     A line of text has the minimum, maximum and mean of the fresh sensors of each type. JSON has everything.
     """
     from skinware.cli._terminal import terminal_width
+    from skinware.errors import ConfigurationError, StructureError
     from skinware.memory.namespace import Namespace
     from skinware.text import wrapped
 
@@ -81,7 +75,11 @@ def command(
         dump_bus(raw, count, timeout_s, as_json)
         return
     with _attach(Namespace(namespace), name, timeout_s) as reader:
-        _check_type(reader.structure, type_name)
+        try:
+            if type_name is not None:
+                reader.structure.type(type_name)
+        except StructureError as error:
+            raise ConfigurationError(str(error)) from None
         for frame in islice(_frames(reader, rate_hz, timeout_s), count):
             if as_json:
                 print_json(as_data(reader, frame, type_name, counts))
@@ -138,16 +136,6 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
     return "  ".join([*parts, f"{not_fresh} not fresh"])
 
 
-def _check_type(structure: Structure, type_name: str | None) -> None:
-    from skinware.errors import ConfigurationError, StructureError
-
-    try:
-        if type_name is not None:
-            structure.type(type_name)
-    except StructureError as error:
-        raise ConfigurationError(str(error)) from None
-
-
 def _attach(namespace: Namespace, name: str | None, timeout_s: float | None) -> DriverReader:
     from skinware.driver_service import DriverReader
 
@@ -161,45 +149,26 @@ def _attach(namespace: Namespace, name: str | None, timeout_s: float | None) -> 
 
 
 def _only_driver(namespace: Namespace, end_s: float) -> str:
-    """Return the only living driver, or else the only dead one.
-
-    Raises:
-        ConfigurationError: there are several.
-        ServiceNotFound: there is none by ``end_s`` of CLOCK_MONOTONIC.
-    """
+    """Return the only living driver, or else the only dead one."""
     from skinware.errors import ConfigurationError, ServiceNotFound
+    from skinware.views.live import LiveDrivers
 
-    while True:
-        living = _drivers(namespace)
-        candidates = [name for name, alive in living.items() if alive] or list(living)
-        if len(candidates) == 1:
-            return candidates[0]
-        if candidates:
-            raise ConfigurationError(
-                f"which driver? Namespace {namespace.name!r} has: {', '.join(candidates)}; give one as NAME"
-            )
-        if time.monotonic() >= end_s:
-            raise ServiceNotFound(
-                f"no driver in namespace {namespace.name!r}; start one: skin-driver --bus virtual (-T waits for one)"
-            )
-        time.sleep(_LOOK_EVERY_S)
-
-
-def _drivers(namespace: Namespace) -> dict[str, bool]:
-    from skinware.driver_service import KIND
-    from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
-    from skinware.memory.ring import Sample
-    from skinware.service import ServiceReader
-
-    found = {}
-    for name in namespace.services():
-        try:
-            with ServiceReader[Sample](name, namespace=namespace, announce=False) as service:
-                if service.kind == KIND:
-                    found[name] = service.alive
-        except (BadServiceFile, ConfigurationError, ServiceNotFound):
-            continue  # it cannot be read, or was just withdrawn
-    return found
+    with contextlib.closing(LiveDrivers(namespace)) as drivers:
+        while True:
+            found = drivers.look()
+            candidates = [driver.name for driver in found if driver.reader.alive] or [driver.name for driver in found]
+            if len(candidates) == 1:
+                return candidates[0]
+            if candidates:
+                raise ConfigurationError(
+                    f"which driver? Namespace {namespace.name!r} has: {', '.join(candidates)}; give one as NAME"
+                )
+            if time.monotonic() >= end_s:
+                raise ServiceNotFound(
+                    f"no driver in namespace {namespace.name!r}; start one: skin-driver --bus virtual"
+                    " (-T waits for one)"
+                )
+            time.sleep(_LOOK_EVERY_S)
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverSnapshot]:
@@ -224,11 +193,6 @@ def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None
 
 
 def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
-    """Read the driver's new structure, and wait for a driver that is gone again.
-
-    Raises:
-        ServiceNotFound: it was gone for ``timeout_s``.
-    """
     from skinware.errors import ServiceNotFound
 
     end_s = None if timeout_s is None else time.monotonic() + timeout_s
@@ -243,12 +207,7 @@ def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
 
 
 def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    """Yield the newest snapshot at the deadlines of a rate, each once.
-
-    Raises:
-        StructureChanged: the driver came back with another structure.
-        ServiceTimeout: no newer snapshot for ``timeout_s``.
-    """
+    """Yield the newest snapshot at the deadlines of a rate, each once."""
     from skinware.realtime import Periodic
 
     timer = Periodic(rate_hz)
@@ -260,20 +219,24 @@ def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> I
 
 
 def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json: bool) -> None:
-    """Print the frames of a CAN bus as they come; nothing is sent.
-
-    Raises:
-        ConfigurationError: not a CAN bus, or a driver has it and no other program can listen.
-        BusNotAvailable: the bus cannot be opened, or went away.
-        BusError: no frame came for ``timeout_s``.
-    """
+    from skinware.errors import ConfigurationError
     from skinware.realtime import now_ns
     from skinware.wire import EXTENDED, MASK, candump_line, channel_name
     from skinware_drivers.bus_names import parse_bus_name
+    from skinware_drivers.finding.running import driver_on, running_drivers
     from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)
-    _refuse_owned(bus_name, interface)
+    if interface in _SERIAL:
+        raise ConfigurationError(
+            f"{bus_name}: a serial line has one owner, so no other program can listen; to see the data of its driver:"
+            " skin-dump NAME"
+        )
+    owner = None if interface in _SHARED else driver_on(bus_name, running_drivers())
+    if owner is not None:
+        raise ConfigurationError(
+            f"{bus_name}: {owner} uses it, and no other program can listen; use skin-dump {owner.name}"
+        )
     name = channel_name(interface, channel)
     bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     left = count
@@ -306,11 +269,7 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
 
 
 def frames_of(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[tuple[int, int, int | None, bytes]]:
-    """Yield time (microseconds since 1970), identifier, flags of CAN FD (None: a classic frame) and payload of frames.
-
-    Args:
-        epoch_offset_ns: time since 1970 minus CLOCK_MONOTONIC, ns.
-    """
+    """Yield time (us since 1970), identifier, flags of CAN FD (None: a classic frame) and payload of frames."""
     from skinware.wire import IS_FD
 
     rows = slice(batch.start, batch.stop)
@@ -319,22 +278,6 @@ def frames_of(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[tuple[int, in
     for time_ns, identifier, length, flags, payload in zip(times_ns, *columns, wire["payload"], strict=True):
         fd_flags = flags & _FD_FLAGS if length > _CLASSIC_PAYLOAD or flags & IS_FD else None
         yield (time_ns + epoch_offset_ns) // 1000, identifier, fd_flags, payload[:length].tobytes()
-
-
-def _refuse_owned(bus_name: str, interface: str) -> None:
-    from skinware.errors import ConfigurationError
-    from skinware_drivers.finding.running import driver_on, running_drivers
-
-    if interface in _SERIAL:
-        raise ConfigurationError(
-            f"{bus_name}: a serial line has one owner, so no other program can listen; to see the data of its driver:"
-            " skin-dump NAME"
-        )
-    owner = None if interface in _SHARED else driver_on(bus_name, running_drivers())
-    if owner is not None:
-        raise ConfigurationError(
-            f"{bus_name}: {owner} uses it, and no other program can listen; use skin-dump {owner.name}"
-        )
 
 
 def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[FrameBatch]:

@@ -27,13 +27,12 @@ _DEFAULT_DRIVER = "roboskin"
 _LONGEST_COMMAND = {"can": 8, "serial": 4096, "modbus": 4096}
 
 
-class EmulateCommand(HardwareCommand):
-    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
-        from skinware_drivers.loading import short_name
-        from skinware_drivers.virtual.hardware import load_emulator
+def _options_of(given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
+    from skinware_drivers.loading import short_name
+    from skinware_drivers.virtual.hardware import load_emulator
 
-        driver = given.get("driver") or _DEFAULT_DRIVER
-        return f"emulated {short_name(driver)}", load_emulator(driver).Options
+    driver = given.get("driver") or _DEFAULT_DRIVER
+    return f"emulated {short_name(driver)}", load_emulator(driver).Options
 
 
 @cli.command(
@@ -43,7 +42,8 @@ class EmulateCommand(HardwareCommand):
     "skin-emulate --driver openpatch --bus pty:/tmp/skin    on a serial line",
     "skin-emulate --driver skintalk --bus tcp://:5000       as a TCP server",
     "skin-emulate --driver xela --help                      options of another",
-    cls=EmulateCommand,
+    cls=HardwareCommand,
+    options_of=_options_of,
 )
 @click.option("--bus", "bus_name", metavar="BUS", required=True, help="Bus to use: vcan0, pty:/tmp/skin ...")
 @click.option(
@@ -116,21 +116,16 @@ def command(
         if geometry_path is not None:
             groups = _placed(hardware, "--geometry").geometry().to_groups()
             geometry_path.write_text(geometry_to_toml(groups, f"the sensors of an emulated {short_name(driver)}"))
-        companion = None
+        pressing = None
         if name is not None:
             service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
-            companion = open_things.enter_context(contextlib.closing(service))
-        emulation = Emulation(bus, hardware, report_to(sys.stdout, as_json=as_json), companion=companion)
+            pressing = open_things.enter_context(contextlib.closing(service))
+        emulation = Emulation(bus, hardware, report_to(sys.stdout, as_json=as_json), pressing=pressing)
         signals = open_things.enter_context(SignalWatch())
         emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
 
 
 def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
-    """Return hardware that knows the places of its sensors.
-
-    Raises:
-        ConfigurationError: it does not.
-    """
     from skinware_drivers.virtual.hardware import PlacedHardware
 
     if not isinstance(hardware, PlacedHardware):

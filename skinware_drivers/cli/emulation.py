@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
-import signal
-import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from types import FrameType
 from typing import Any, Protocol, Self, TextIO
 
 import msgspec
 import numpy as np
 
+from skinware.cli._command import signals_end
 from skinware.cli._terminal import json_text, shown
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.memory.namespace import Namespace
@@ -64,29 +63,23 @@ class SignalWatch:
 
     def __init__(self) -> None:
         self.stopped: bool = False
-        self._reader, self._writer = socket.socketpair()
-        self._reader.setblocking(False)
-        self._writer.setblocking(False)
-        self._before: list[tuple[signal.Signals, Any]] = []
-        self._wakeup_before = -1
+        self._bell = os.eventfd(0, os.EFD_CLOEXEC)
+        self._handlers = signals_end(self._stop)
 
     def __enter__(self) -> Self:
-        self._wakeup_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        self._before = [(number, signal.signal(number, self._stop)) for number in (signal.SIGINT, signal.SIGTERM)]
+        self._handlers.__enter__()
         return self
 
     def __exit__(self, *raised: object) -> None:
-        for number, handler in self._before:
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._wakeup_before)
-        self._reader.close()
-        self._writer.close()
+        self._handlers.__exit__(None, None, None)
+        os.close(self._bell)
 
     def fileno(self) -> int:
-        return self._reader.fileno()
+        return self._bell
 
-    def _stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - a signal handler's arguments
+    def _stop(self) -> None:
         self.stopped = True
+        os.eventfd_write(self._bell, 1)
 
 
 class Stop(Protocol):
@@ -96,14 +89,6 @@ class Stop(Protocol):
 
     def fileno(self) -> int:
         """Return a descriptor that is readable when ``stopped`` may have changed."""
-
-
-class Companion(Protocol):
-    def fileno(self) -> int:
-        """Return a descriptor that is readable when ``step`` has work."""
-
-    def step(self, now_ns: int) -> int:
-        """Do the work that is due, and return the time of the next."""
 
 
 class Emulation:
@@ -119,7 +104,7 @@ class Emulation:
         hardware: not powered up yet.
         clock: CLOCK_MONOTONIC ns.
         poll: waits until a descriptor is readable, or for a time: ``(descriptors, timeout_s)``.
-        companion: other work in the same loop.
+        pressing: lets programs press it.
     """
 
     def __init__(
@@ -130,11 +115,11 @@ class Emulation:
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,
-        companion: Companion | None = None,
+        pressing: PressingService | None = None,
     ) -> None:
         self._bus, self._hardware, self._report = bus, hardware, report
         self._clock, self._poll = clock, poll or wait_readable
-        self._companion = companion
+        self._pressing = pressing
         self._outbox: deque[WireFrame] = deque()
         self._batch = FrameBatch(256, bus.payload_size)
         self._open = False
@@ -151,11 +136,6 @@ class Emulation:
         options: msgspec.Struct,
         duration_s: float | None = None,
     ) -> None:
-        """Emulate until ``stop``, or for ``duration_s``.
-
-        Raises:
-            BusNotAvailable: the bus cannot be opened at the start. Later it is opened again whenever it goes down.
-        """
         self._bus.open()
         self._open = True
         start_ns = self._clock()
@@ -173,19 +153,33 @@ class Emulation:
                     self._report("status", **self._totals())
                     status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
                 next_ns = self._step(now_ns)
-                companion_ns = None if self._companion is None else self._companion.step(now_ns)
-                moments = [moment for moment in (next_ns, companion_ns, end_ns, status_ns) if moment is not None]
-                self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
+                pressing_ns = None if self._pressing is None else self._pressing.step(now_ns)
+                moments = [moment for moment in (next_ns, pressing_ns, end_ns, status_ns) if moment is not None]
+                descriptors = [stop.fileno(), self._bus.fileno()] if self._open else [stop.fileno()]
+                if self._pressing is not None:
+                    descriptors.append(self._pressing.fileno())
+                self._poll(descriptors, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
         self._report("stopped", **self._totals())
 
     def _step(self, now_ns: int) -> int | None:
-        """Do the work that is due, and return the time of the next."""
         if not self._open:
-            return self._reopen(now_ns)
+            try:
+                self._bus.open()
+            except BusNotAvailable:
+                self._backoff_ns = min(2 * self._backoff_ns, _LONGEST_BACKOFF_NS)
+                return now_ns + self._backoff_ns
+            self._open = True
+            self._hardware.skip(now_ns)
+            self._report("bus_up")
+            return now_ns
         try:
-            self._receive(now_ns)
+            while self._bus.receive(self._batch, 0):
+                for row in self._batch.wire[self._batch.start : self._batch.stop]:
+                    payload = row["payload"][: row["length"]].tobytes()
+                    self._hardware.receive(int(row["identifier"]), payload, now_ns)
+                self._batch.clear()
             return self._send(now_ns)
         except BusNotAvailable as error:
             self._open = False
@@ -195,24 +189,6 @@ class Emulation:
             self._backoff_ns = _FIRST_BACKOFF_NS
             self._report("bus_down", reason=str(error))
             return now_ns + self._backoff_ns
-
-    def _reopen(self, now_ns: int) -> int | None:
-        try:
-            self._bus.open()
-        except BusNotAvailable:
-            self._backoff_ns = min(2 * self._backoff_ns, _LONGEST_BACKOFF_NS)
-            return now_ns + self._backoff_ns
-        self._open = True
-        self._hardware.skip(now_ns)
-        self._report("bus_up")
-        return now_ns
-
-    def _receive(self, now_ns: int) -> None:
-        while self._bus.receive(self._batch, 0):
-            for row in self._batch.wire[self._batch.start : self._batch.stop]:
-                payload = row["payload"][: row["length"]].tobytes()
-                self._hardware.receive(int(row["identifier"]), payload, now_ns)
-            self._batch.clear()
 
     def _send(self, now_ns: int) -> int | None:
         due_ns = self._hardware.next_due_ns()
@@ -229,12 +205,6 @@ class Emulation:
                 return now_ns + _RETRY_NS
             self._outbox.popleft()
         return self._hardware.next_due_ns()
-
-    def _wait(self, stop: Stop, timeout_s: float) -> None:
-        descriptors = [stop.fileno(), self._bus.fileno()] if self._open else [stop.fileno()]
-        if self._companion is not None:
-            descriptors.append(self._companion.fileno())
-        self._poll(descriptors, timeout_s)
 
     def _totals(self) -> dict[str, int]:
         return {**self._hardware.totals(), "send_failures": self.send_failures}
@@ -257,9 +227,6 @@ class PressingService:
 
     Args:
         bus_name: of the emulation, for the replies.
-
-    Raises:
-        NameInUse, NamespaceError, ConfigurationError: as for :class:`skinware.ServiceWriter`.
     """
 
     def __init__(self, name: str, hardware: PlacedHardware, bus_name: str, namespace: Namespace | None = None) -> None:
@@ -293,6 +260,14 @@ class PressingService:
             request.reply(position=self._writer.position)
         return self._due_ns
 
+    def _publish(self, now_ns: int) -> None:
+        found = self._hardware.pressing(now_ns)[:_MOST]
+        columns = self._writer.begin(from_last=True)
+        columns["count"][0] = len(found)
+        for row, (point_m, force_n) in enumerate(found):
+            columns["point_m"][row], columns["force_n"][row] = point_m, force_n
+        self._writer.commit(now_ns)
+
     def press(
         self, at_m: object, force_n: object = 3.0, radius_m: object = 0.006, seconds: object = 1.0
     ) -> dict[str, object]:
@@ -306,11 +281,3 @@ class PressingService:
 
     def close(self) -> None:
         self._writer.close()
-
-    def _publish(self, now_ns: int) -> None:
-        found = self._hardware.pressing(now_ns)[:_MOST]
-        columns = self._writer.begin(from_last=True)
-        columns["count"][0] = len(found)
-        for row, (point_m, force_n) in enumerate(found):
-            columns["point_m"][row], columns["force_n"][row] = point_m, force_n
-        self._writer.commit(now_ns)

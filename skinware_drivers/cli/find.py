@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import echo, print_json, style
+from skinware.text import count_text, plural, words, wrapped
+from skinware_drivers.bus_names import BusName, parse_bus_name
 
 if TYPE_CHECKING:
     from skinware_drivers.finding.interfaces import CanInterface
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
     from skinware_drivers.finding.running import RunningDriver
 
 _DETECTION_S = 10.0
+_WIDTH = 80
+"""Columns of the text for people."""
+_MOST_CLASSES = 6
 
 
 @cli.command(
@@ -65,8 +70,6 @@ def command(
     if as_json:
         print_json(found)
     else:
-        from skinware_drivers.cli.find_text import as_text
-
         echo("\n".join(as_text(found)))
 
 
@@ -78,18 +81,20 @@ async def look(
     force: bool = False,
     driver_names: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Return everything that ``skin-find`` prints, as data for JSON.
+    import msgspec
 
-    Raises:
-        BusNotAvailable: one of ``buses`` does not exist.
-        ConfigurationError: one of ``driver_names`` does not exist, or one of ``buses`` is not the name of a bus.
-    """
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.bus_names import BusName
+    from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.guess import known_drivers
-    from skinware_drivers.finding.interfaces import Detection, can_interfaces, detect_adapters
+    from skinware_drivers.finding.interfaces import (
+        NO_INTERFACE,
+        Detection,
+        can_interfaces,
+        detect_adapters,
+        kernel_has_can,
+    )
     from skinware_drivers.finding.looking import listen, topics_on
-    from skinware_drivers.finding.running import running_drivers
+    from skinware_drivers.finding.running import driver_on, running_drivers
     from skinware_drivers.registry import make_bus
 
     drivers = known_drivers("can", driver_names)
@@ -116,15 +121,35 @@ async def look(
     if buses and problems:
         raise BusNotAvailable(problems[0])
     answers = await _ask(heard, ports, networks, running, force, driver_names) if probe else {}
+    in_kernel, advice = kernel_has_can(), []
+    if not buses and not interfaces:
+        advice.append(NO_INTERFACE if in_kernel else NO_CAN)
+
+    def on_bus(name: str) -> dict[str, Any]:
+        owner = driver_on(name, running)
+        return {"bus": name, "used_by": owner, "heard": heard.get(name), "probe": answers.get(name)}
+
     return {
-        "can": _can_data(interfaces, heard, answers, running, whole=not buses),
-        "buses": [
-            _heard_data(name, heard, answers, running) | ({"topics": topics[name]} if name in topics else {})
-            for name in others
-        ],
+        "can": {
+            "in_kernel": in_kernel,
+            "advice": advice,
+            "interfaces": [
+                {**msgspec.to_builtins(one), "advice": one.advice(), **on_bus(one.name)} for one in interfaces
+            ],
+        },
+        "buses": [on_bus(name) | ({"topics": topics[name]} if name in topics else {}) for name in others],
         "adapters": detection.found,
         "adapters_problem": detection.problem,
-        "ports": [_port_data(port, answers, running) for port in ports],
+        "ports": [
+            {
+                **msgspec.to_builtins(port),
+                "name": port.name,
+                "advice": port.advice(),
+                "used_by": driver_on(port.path, running),
+                "probe": answers.get(port.path),
+            }
+            for port in ports
+        ],
     }
 
 
@@ -133,7 +158,6 @@ def _chosen(
 ) -> tuple[list[CanInterface], list[SerialPort], list[str]]:
     """Return CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.ports import pseudo_terminal, serial_ports
     from skinware_drivers.finding.running import same_bus
 
@@ -163,7 +187,6 @@ async def _ask(
     force: bool,
     driver_names: tuple[str, ...],
 ) -> dict[str, ProbeAnswer]:
-    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.looking import ProbeAnswer, ask, ask_port
     from skinware_drivers.finding.running import driver_on
@@ -192,59 +215,6 @@ async def _ask(
     return answers
 
 
-def _can_data(
-    interfaces: list[CanInterface],
-    heard: dict[str, HeardOnBus],
-    answers: dict[str, ProbeAnswer],
-    running: list[RunningDriver],
-    *,
-    whole: bool,
-) -> dict[str, Any]:
-    import msgspec
-
-    from skinware_drivers.can.controller import NO_CAN
-    from skinware_drivers.finding.interfaces import NO_INTERFACE, kernel_has_can
-
-    in_kernel = kernel_has_can()
-    advice = []
-    if whole and not interfaces:
-        advice.append(NO_INTERFACE if in_kernel else NO_CAN)
-    return {
-        "in_kernel": in_kernel,
-        "advice": advice,
-        "interfaces": [
-            {
-                **msgspec.to_builtins(one),
-                "advice": one.advice(),
-                **_heard_data(one.name, heard, answers, running),
-            }
-            for one in interfaces
-        ],
-    }
-
-
-def _heard_data(
-    name: str, heard: dict[str, HeardOnBus], answers: dict[str, ProbeAnswer], running: list[RunningDriver]
-) -> dict[str, Any]:
-    from skinware_drivers.finding.running import driver_on
-
-    return {"bus": name, "used_by": driver_on(name, running), "heard": heard.get(name), "probe": answers.get(name)}
-
-
-def _port_data(port: SerialPort, answers: dict[str, ProbeAnswer], running: list[RunningDriver]) -> dict[str, Any]:
-    import msgspec
-
-    from skinware_drivers.finding.running import driver_on
-
-    return {
-        **msgspec.to_builtins(port),
-        "name": port.name,
-        "advice": port.advice(),
-        "used_by": driver_on(port.path, running),
-        "probe": answers.get(port.path),
-    }
-
-
 def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
     from skinware_drivers.finding.ports import PLACE, RELOAD, rules_for, shipped_rules
 
@@ -260,6 +230,150 @@ def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
     else:
         echo(rules, nl=False)
         cli.warn(f"to use them: skin-find --udev | sudo tee {PLACE}; {'; '.join(RELOAD)}")
+
+
+def as_text(found: dict[str, Any]) -> list[str]:
+    """Return the whole report, with colours, which ``echo`` takes out without a terminal."""
+    can = found["can"]
+    lines: list[str] = []
+    if can["interfaces"] or can["advice"]:
+        lines += [style("CAN interfaces of the kernel", underline=True)]
+        for interface in can["interfaces"]:
+            lines += ["", *_interface_lines(interface)]
+        lines += _advice(can["advice"])
+    for bus in found["buses"]:
+        lines += ["", style(bus["bus"], underline=True), *_bus_lines(bus)]
+    if found["adapters"] or found["adapters_problem"]:
+        lines += ["", style("other CAN adapters, by python-can", underline=True)]
+        for adapter in found["adapters"]:
+            details = ", ".join(f"{key} {value}" for key, value in adapter.details.items())
+            lines += _wrapped(f"{style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
+        lines += _advice([found["adapters_problem"]] if found["adapters_problem"] else [])
+    if found["ports"]:
+        lines += ["", style("serial ports", underline=True)]
+        for port in found["ports"]:
+            lines += ["", *_port_lines(port)]
+    elif not can["interfaces"] and not found["buses"] and not found["adapters"]:
+        lines += ["", "no serial port and no other CAN adapter"]
+    return lines[1:] if lines and not lines[0] else lines
+
+
+def _interface_lines(one: dict[str, Any]) -> list[str]:
+    state = style("up", fg="green") if one["up"] else style("down", fg="yellow")
+    parts = [state, f"kernel driver {one['driver']}" if one["driver"] else one["kind"]]
+    if one["bit_rate"]:
+        parts.append(f"{one['bit_rate'] / 1000:g} kbit/s")
+        parts += [f"data {one['data_bit_rate'] / 1000:g} kbit/s"] if one["data_bit_rate"] else []
+    elif one["kind"] == "can":
+        parts.append("no bit rate known")
+    if one["state"]:
+        parts.append(one["state"].lower())
+    parts += ["FD" if one["is_fd"] else "no FD", f"queue {one['queue_length']}"]
+    counts = one["statistics"]
+    went = [f"received {count_text(counts['rx_packets'])}", f"sent {count_text(counts['tx_packets'])}"]
+    troubles = {**counts, **one["controller_errors"]}
+    went += [
+        f"{words(name)} {count_text(count)}"
+        for name, count in troubles.items()
+        if count and not name.endswith("_packets")
+    ]
+    lines = [*_wrapped(f"{style(one['name'], bold=True)}  {', '.join(parts)}", first="")]
+    return [*lines, *_wrapped(", ".join(went)), *_bus_lines(one), *_advice(one["advice"])]
+
+
+def _bus_lines(bus: dict[str, Any]) -> list[str]:
+    lines = []
+    if bus["used_by"] is not None:
+        lines += _wrapped(f"{bus['used_by']} runs on it")
+    heard, probe, topics = bus["heard"], bus["probe"], bus.get("topics")
+    for one in topics or ():
+        readers = f"; read by {', '.join(one.drivers)}" if one.drivers else ""
+        lines += _wrapped(f"{one.topic}: {one.type_name}, {plural(one.publishers, 'publisher')}{readers}")
+    if topics == []:
+        lines += _wrapped("no topic is published in this domain; a robot's network is named as ?interface=eth0")
+    if (
+        topics is None
+        and heard is None
+        and probe is None
+        and bus["used_by"] is None
+        and BusName.of(bus["bus"]).is_only_asked
+    ):
+        lines += _wrapped(
+            f"not opened, because a connection may change what a device does; to ask which device is on it:"
+            f" skin-find {bus['bus']} --probe"
+        )
+    if heard is not None and heard.problem:
+        lines += _advice([heard.problem])
+    elif heard is not None:
+        load = f", {100 * heard.load:.0f} % of the bus' time" if heard.load is not None and heard.frames else ""
+        what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
+        errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""
+        errors += f"; the controller is {heard.trouble}" if heard.trouble else ""
+        lines += _wrapped(f"heard in {heard.duration_s:.1f} s: {what}{errors}")
+        for one in heard.classes[:_MOST_CLASSES]:
+            span = f"{one.first:X}" if one.first == one.last else f"{one.first:X} to {one.last:X}"
+            which = f"{plural(one.identifiers, 'identifier')}, {span}"
+            lines += _wrapped(f"{one.name}: {plural(one.frames, 'frame')} of {which}", first="    ")
+        for one in heard.guesses:
+            share = "all frames" if one.share == 1 else f"{100 * one.share:.0f} % of the frames"
+            patches = ", ".join(one.patches)
+            how = "looks like" if one.likely else "or perhaps"
+            name = style(one.driver, bold=one.likely)
+            lines += _wrapped(f"{how} {name}{'' if one.likely else '?'}: {patches} ({share})")
+        if heard.frames and not heard.guesses:
+            lines += _wrapped("no installed driver knows these frames")
+        if not heard.frames and probe is None and bus["used_by"] is None:
+            lines += _wrapped(f"to ask which devices are on it: skin-find {bus['bus']} --probe")
+    return lines + _probe_lines(probe)
+
+
+def _probe_lines(probe: Any) -> list[str]:
+    if probe is None:
+        return []
+    if probe.refused:
+        return _wrapped(f"not asked: {probe.refused}")
+    lines = []
+    for text in probe.answers.values():
+        lines += _wrapped(f"answers: {text}")
+    for driver, text in probe.problems.items():
+        lines += _wrapped(f"{driver} could not ask: {text}")
+    return lines or _wrapped(f"no answer (asked by {', '.join(probe.asked)})")
+
+
+def _port_lines(port: dict[str, Any]) -> list[str]:
+    usb = port["usb"]
+    parts = [port["name"]]
+    if usb is not None:
+        parts.append(f"{usb['vendor_id']}:{usb['product_id']}")
+        parts.append(f"serial number {usb['serial_number']}" if usb["serial_number"] else "no serial number")
+    if port["driver"]:
+        parts.append(f"kernel driver {port['driver']}")
+    lines = _wrapped(f"{style(port['path'], bold=True)}  {', '.join(parts)}", first="")
+    for link in port["links"]:
+        lines.append(f"  {link}")
+    if port["used_by"] is not None:
+        lines += _wrapped(f"{port['used_by']} runs on it")
+    elif port["users"]:
+        lines += _wrapped("in use by " + ", ".join(f"{user['program']} (pid {user['pid']})" for user in port["users"]))
+    elif not port["users_known"]:
+        lines += _wrapped("whether a program of another user has it open is not known")
+    return [*lines, *_advice(port["advice"]), *_probe_lines(port["probe"])]
+
+
+def _advice(texts: list[str]) -> list[str]:
+    """Return problems and what to do, with marks; the commands can be copied as they stand."""
+    lines = []
+    for text in texts:
+        why, colon, commands = text.partition(": sudo ")
+        mark = style("!", fg="yellow")
+        lines += _wrapped(f"{mark} {why}{':' if colon else ''}")
+        if colon:
+            lines += [f"      sudo {command}" for command in commands.replace("; sudo ", ";").split(";")]
+    return lines
+
+
+def _wrapped(text: str, first: str = "  ") -> list[str]:
+    return wrapped(first + text, _WIDTH)
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import click
 from skinware.cli import _command as cli
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import msgspec
 
@@ -23,34 +23,35 @@ _LONGEST_KIND = 24
 
 
 class HardwareCommand(click.Command):
-    """A command of which ``--driver`` says what further options it has; their values are the texts that were given."""
+    """A command of which ``--driver`` says what further options it has; their values are the texts that were given.
 
-    def options_class(self, given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
-        """Return the driver that a command line names, and the options that the driver adds.
+    Args:
+        options_of: returns the driver that a command line names, and the options it adds, from the command's own ones.
+    """
 
-        Args:
-            given: values of the command's own flags, as texts.
-
-        Raises:
-            ConfigurationError: there is no such driver.
-        """
-        raise NotImplementedError
+    def __init__(
+        self, *arguments: Any, options_of: Callable[[Mapping[str, Any]], tuple[str, type[msgspec.Struct]]], **more: Any
+    ) -> None:
+        super().__init__(*arguments, **more)
+        self._options_of = options_of
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Find out whose options the command line may hold, then parse it."""
         from skinware_drivers.options import check_names, describe_options
 
-        driver, options_class = self.options_class(own_values(self, args))
+        driver, options_class = self._options_of(own_values(self, args))
         check_names(options_class, reserved_names(self), str(ctx.info_name), f"driver {driver}")
         ctx.meta[_HARDWARE_OPTIONS] = driver, [_click_option(option) for option in describe_options(options_class)]
-        return super().parse_args(ctx, args)
+        ctx.allow_extra_args = True
+        left = super().parse_args(ctx, args)
+        if left:
+            raise click.UsageError(f"{left[0]!r} is not an option; name a driver with --driver, a bus with --bus", ctx)
+        return left
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         _, theirs = ctx.meta.get(_HARDWARE_OPTIONS, ("", []))
         return [*super().get_params(ctx), *theirs]
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Print the two kinds of options apart."""
         driver, theirs = ctx.meta.get(_HARDWARE_OPTIONS, ("", []))
         for title, options in (("Options", super().get_params(ctx)), (f"Options of {driver}", theirs)):
             records = [record for option in options if (record := option.get_help_record(ctx)) is not None]

@@ -26,7 +26,8 @@ _HEADINGS = {
 }
 
 
-@cli.group("skin-import")
+@click.group("skin-import", context_settings=cli.CONTEXT_SETTINGS)
+@cli.version_option
 def command() -> None:
     """Create configurations for skin-driver from the files of other systems."""
 

@@ -96,11 +96,7 @@ _OF_TRANSPORT = {
 
 
 def check_name(name: str) -> None:
-    """Check that a name can be that of a driver and of a Python package.
-
-    Raises:
-        ConfigurationError: it cannot; the message has the reason, and a better name if possible.
-    """
+    """Refuse what cannot be the name of a driver and of a Python package; propose a better one if possible."""
     from skinware_drivers.loading import registered
     from skinware_drivers.registry import DRIVERS
     from skinware_drivers.virtual.hardware import EMULATORS
@@ -123,18 +119,7 @@ def check_name(name: str) -> None:
 
 
 def make_package(name: str, transport: str, where: Path) -> list[Path]:
-    """Make the package in the folder ``where / name``, completely or not at all.
-
-    Args:
-        transport: ``can``, ``serial``, ``modbus``, ``tcp`` or ``virtual``.
-
-    Returns:
-        The files, relative to the new folder.
-
-    Raises:
-        ConfigurationError: the folder exists already.
-        SkinwareError: it cannot be written.
-    """
+    """Make the package in ``where / name``, completely or not at all; return its files, relative to that."""
     folder = where / name
     if folder.exists() or folder.is_symlink():
         raise ConfigurationError(f"{folder} already exists; nothing was changed")

@@ -1,4 +1,4 @@
-"""``skin-prove``: walk the owner of a device through a proof of its driver."""
+"""``skin-prove``: walk the owner of a device through a proof of its driver, or compare how it decodes a capture."""
 
 from __future__ import annotations
 
@@ -11,22 +11,27 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, style
-from skinware.errors import DriverError, SkinwareError
+from skinware.errors import ConfigurationError, DriverError, SkinwareError
+from skinware_drivers.cli.hardware_options import hardware_values, own_values
 
 if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
+    from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.cli.capturing import Capture
     from skinware_drivers.proving.proof import Proof, ProofFiles
+    from skinware_drivers.proving.updates import Comparison
     from skinware_drivers.proving.walk import Step
 
 _STARTS_WITHIN_S = 30.0
@@ -111,9 +116,7 @@ def command(
         driver_arguments, name = (name, *driver_arguments), None
     if captured is not None:
         cli.refuse_others("--captured", {"save", "driver_arguments", "as_json", *(["name"] if name is None else [])})
-        from skinware_drivers.cli.comparing import compare_capture
-
-        if not compare_capture(captured, driver_arguments, save=save, as_json=as_json):
+        if not _compare(captured, driver_arguments, save=save, as_json=as_json):
             context.exit(cli.EXIT_FAILED)
         return
     if save:
@@ -124,7 +127,13 @@ def command(
     stem = stem or Path(time.strftime(f"prove-{name or 'driver'}-%Y%m%d-%H%M%S"))
     files = ProofFiles(stem)
     files.refuse_old()
-    proof = Proof(name or "driver", "", _facts())
+    versions = {"skinware": version("skinware"), "python": platform.python_version(), "linux": platform.release()}
+    facts = {
+        "date": time.strftime("%Y-%m-%d"),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+        "verified against": "a device in the hands of its owner, as this table says",
+    }
+    proof = Proof(name or "driver", "", facts)
     manner = Manner(type_name, only, patience_s, rest_s, with_tare)
     person = _AtTerminal(as_json)
     trouble: Exception | None = None
@@ -169,22 +178,9 @@ def _captured(
         yield reader
 
 
-def _facts() -> dict[str, str]:
-    versions = {"skinware": version("skinware"), "python": platform.python_version(), "linux": platform.release()}
-    return {
-        "date": time.strftime("%Y-%m-%d"),
-        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
-        "verified against": "a device in the hands of its owner, as this table says",
-    }
-
-
 @contextlib.contextmanager
 def _interrupted_once() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C, SIGTERM or a closed terminal interrupt the block once; the code after it runs undisturbed.
-
-    Yields:
-        A function that ends the interruptions.
-    """
+    """Let Ctrl-C, SIGTERM or a closed terminal interrupt the block once; yield a function that ends that."""
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         numbers.append(signal.SIGHUP)
@@ -207,11 +203,7 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def _started(arguments: Sequence[str], name: str | None, place: Namespace, files: ProofFiles) -> Iterator[str]:
-    """Run a driver that captures while the block runs, and yield its name.
-
-    Raises:
-        DriverError: it does not start; it has printed why.
-    """
+    """Run a driver that captures while the block runs, and yield its name."""
     more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(files.capture), "--json"]
     process = subprocess.Popen(
         [sys.executable, "-c", _DRIVER, *arguments, *more],
@@ -226,7 +218,10 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
     def listen() -> None:
         assert process.stdout is not None  # noqa: S101 - it is a pipe
         for line in process.stdout:
-            event = _event_of(line)
+            try:
+                event = dict(json.loads(line))
+            except (ValueError, TypeError):  # its code has printed something else
+                continue
             if event.get("event") == "ready":
                 ready.update(event)
                 is_ready.set()
@@ -251,15 +246,6 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
         thread.join()
         if process.stdout is not None:
             process.stdout.close()
-
-
-def _event_of(line: str) -> dict[str, Any]:
-    """Return an event of the driver; empty for other output of its code."""
-    try:
-        event = json.loads(line)
-    except ValueError:
-        return {}
-    return event if isinstance(event, dict) else {}
 
 
 class _AtTerminal:
@@ -304,6 +290,77 @@ def _print(proof: Proof, files: ProofFiles, as_json: bool) -> None:
         cli.warn(f"{files.capture} ended early: {files.captured['problem']}")
     if files.written:
         echo(f"written to {', '.join(files.written)}; read them before you give them to others")
+
+
+def _compare(capture: Path, arguments: Sequence[str], *, save: bool, as_json: bool) -> bool:
+    """Compare, print the result, and return whether all values are equal; ``arguments``: of skin-driver."""
+    from skinware_drivers.proving import updates
+    from skinware_drivers.proving.captures import check_capture, decoded_now, expected_of
+
+    driver, options = _driver_of(capture, arguments)
+    try:
+        if save:
+            now = decoded_now(capture, driver, options)
+            if not now:
+                raise ConfigurationError(f"{capture}: nothing in it is decoded, so there is nothing to save")
+            updates.save(now, expected_of(capture))
+        compared, now = check_capture(capture, driver, options)
+    except OSError as error:
+        raise ConfigurationError(f"{error.filename or capture}: {error.strerror}") from None
+    if not compared.then:
+        raise ConfigurationError(
+            f"{capture}: nothing was decoded then, {compared.now} updates are now; if they are right: --save"
+        )
+    _print_compared(capture, compared, as_json)
+    return compared.difference is None
+
+
+def _driver_of(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] | None, Mapping[str, Any]]:
+    """Return the chosen driver and its options; None: the recorded driver."""
+    from skinware_drivers.cli.driver import command as driver_command
+    from skinware_drivers.options import options_from_strings
+    from skinware_drivers.proving.captures import driver_type_of
+    from skinware_drivers.registry import load_driver
+
+    if not arguments:
+        return None, {}
+    name = own_values(driver_command, arguments).get("driver_name") or driver_type_of(capture)
+    context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
+    driver = load_driver(name)
+    chosen = {
+        key: text
+        for key, text in context.params.items()
+        if context.get_parameter_source(key) is ParameterSource.COMMANDLINE and key != "driver_name"
+    }
+    for option in driver_command.params:
+        if option.name in chosen:
+            raise click.UsageError(f"--captured: {option.opts[0]} is not about decoding")
+    given = hardware_values(chosen)
+    options = options_from_strings(driver.Options, given) if given else None
+    return driver, {key: getattr(options, key) for key in given}
+
+
+def _print_compared(capture: Path, compared: Comparison, as_json: bool) -> None:
+    difference = compared.difference
+    if as_json:
+        print_json(
+            {
+                "event": "compared",
+                "file": str(capture),
+                "equal": difference is None,
+                "compared": compared.compared,
+                "then": compared.then,
+                "now": compared.now,
+                "difference": None if difference is None else asdict(difference),
+            }
+        )
+        return
+    counts = f"{compared.then} updates of modules then, {compared.now} now, {compared.compared} compared"
+    echo(f"{capture}: {counts}")
+    if difference is None:
+        echo(style("equal", fg="green"))
+    else:
+        echo(f"{style('different', fg='red')} {difference}")
 
 
 def main() -> None:

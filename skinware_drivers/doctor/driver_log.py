@@ -19,7 +19,7 @@ from skinware.state import count_statuses, state_name
 from skinware.status import BusReason, BusState, PatchState, Status, load_report
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import ChainHealth
 from skinware_drivers.doctor.evidence import (
     BusSeen,
@@ -147,7 +147,7 @@ class DriverLog:
         Args:
             status: (n_sensors,) of the sensors at the end.
             at_ns: time of the end, CLOCK_MONOTONIC.
-            facts: fields that no snapshot has: the name of the driver, its process, its life and restarts.
+            facts: fields that are not in snapshots: the name of the driver, its process, its life and restarts.
         """
         statuses, affected = self._affected(status)
         suspect = (self._always & np.uint8(Status.SUSPECT)) != 0

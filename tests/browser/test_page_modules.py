@@ -85,21 +85,6 @@ def test_parts_of_a_hand_have_names_and_totals_where_there_is_room(tell: Callabl
     assert tell("names.js", HAND, 1, None, -9) == []  # from behind
 
 
-# -- overlay.js ----------------------------------------------------------------------------------------------------
-
-
-def test_numbers_of_contacts_leave_names_free(tell: Callable[..., Any]) -> None:
-    def place(*names: tuple[int, int]) -> Any:
-        return tell("overlay.js", "m.tagPlace(50, 50, 10, a[0])", [{"x": x, "y": y, "width": 30} for x, y in names])
-
-    right_top, right_bottom, left_bottom = (65, 35), (65, 65), (35, 65)
-    assert np.allclose(place(), right_top, atol=1)
-    assert np.allclose(place(right_top), right_bottom, atol=1)
-    assert np.allclose(place((50, 20), (50, 80)), right_top, atol=1)
-    assert np.allclose(place(right_top, right_bottom), left_bottom, atol=1)
-    assert np.allclose(place((50, 35), (50, 65)), right_top, atol=1)  # no corner is free
-
-
 # -- turn.js -------------------------------------------------------------------------------------------------------
 
 

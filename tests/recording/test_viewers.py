@@ -246,7 +246,7 @@ def test_they_are_recorded_live_too_beside_all_frames(tmp_path: Path) -> None:
     file = tmp_path / "live.mcap"
     with (
         FakeSkin("torso", placed(fake_structure(1, 2))) as skin,
-        recording(file, Files(file), renderer=Viewers()) as recorder,
+        recording(file, Files(file), renderer=Viewers().messages) as recorder,
     ):
         for _ in range(60):
             skin.publish()

@@ -15,9 +15,9 @@ import pytest
 from skinware import Namespace
 from skinware.views.access import Access
 from skinware.views.following import Follower, Origin
-from skinware.views.recording import RecordingProgram
+from skinware.views.programs import RecordingProgram
 from skinware.views.robot import Robot
-from skinware.views.server import ViewServer, show
+from skinware.views.server import ViewServer
 from skinware.views.shows import RecordingFiles
 from skinware_drivers.testing.waiting import wait_until
 
@@ -58,7 +58,7 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
             recording = RecordingProgram(program, namespace.name, names, page_folder)
             server = ViewServer(follower, Access("127.0.0.1", token), recording, page_folder, files=files)
             loop = asyncio.get_running_loop()
-            await show(server, "127.0.0.1", 0, lambda port: found.append((port, loop, stop)), stop)
+            await server.show("127.0.0.1", 0, lambda port: found.append((port, loop, stop)), stop)
 
         def run_all() -> None:
             try:

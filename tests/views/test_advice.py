@@ -9,8 +9,8 @@ from collections.abc import Coroutine
 
 import pytest
 
-from skinware.views import advice
-from skinware.views.advice import DoctorProgram
+from skinware.views import programs
+from skinware.views.programs import DoctorProgram
 from skinware_drivers.testing.waiting import wait_until
 
 SAYS = "import json, sys; print(json.dumps({'findings': [{'what': 'silent', 'asked': sys.argv[1:]}]}))"
@@ -39,7 +39,7 @@ def test_it_is_asked_while_problems_last(monkeypatch: pytest.MonkeyPatch) -> Non
         doctor.findings = []
         doctor.follow(["stale", "dead"])  # too soon
         assert doctor._running is None
-        monkeypatch.setattr(advice, "_SOON_NS", 0)
+        monkeypatch.setattr(programs, "_SOON_NS", 0)
         doctor.follow(["stale", "dead"])
         await until_done(doctor)
         assert doctor.findings

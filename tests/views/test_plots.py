@@ -138,9 +138,7 @@ def test_the_load_of_a_contact_and_the_sum_of_what_is_calm(namespace: Namespace,
             return bool(follower.drivers and follower.drivers[0].newest and follower.drivers[0].newest.calm)
 
         wait_until(is_calm)
-        wait_until(
-            lambda: follower.take(0) is not None and follower.origins[0].services.contacts_reader("torso") is not None
-        )
+        wait_until(lambda: follower.take(0) is not None and follower.origins[0].contacts_reader("torso") is not None)
         lines = Plots(follower)
         lines.choose(1, [Line(0, type="pressure", modules=(1,)), Line(0, contact=1)], follower.edition)
         lines.take()

@@ -153,8 +153,8 @@ class WatchedJoiner(Joiner):
 
     def _service_states(self) -> dict[str, ServiceState]:
         for follower in self._followers.values():
-            traffic = follower.output.traffic
-            self._came.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=list(traffic.ages_ns)))
+            output = follower.output
+            self._came.add(Account(output.frames, bytes=output.bytes, ages_ns=list(output.ages_ns)))
         return super()._service_states()
 
 

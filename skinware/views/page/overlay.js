@@ -39,7 +39,7 @@ export class Overlay {
       if (sheet.shown.shear) this.#shear(stage, sheet);
     }
     for (const name of what.names) this.#name(name);
-    for (const contact of what.contacts) this.#contact(stage, contact, what.names);
+    for (const contact of what.contacts) this.#contact(stage, contact);
     for (const { sheet, i, letter } of what.pins) this.#ring(stage, sheet, i, letter);
     if (what.hovered) this.#ring(stage, what.hovered.sheet, what.hovered.i, "");
   }
@@ -80,7 +80,7 @@ export class Overlay {
     this.#stroke(1.6);
   }
 
-  #contact(stage, contact, names) {
+  #contact(stage, contact) {
     const at = contact.at;
     const [x, y, depth] = stage.project(...at);
     if (depth <= 0) return;
@@ -99,7 +99,7 @@ export class Overlay {
       arrow(context, x, y, nx, ny);
       this.#stroke(2);
     }
-    this.#tag(String(contact.id), ...tagPlace(x, y, size, names));
+    this.#tag(String(contact.id), x + 0.72 * size + 8, y - 0.72 * size - 8);
     context.globalAlpha = 1;
   }
 
@@ -152,14 +152,6 @@ export class Overlay {
     context.fillStyle = this.ground;
     context.fillText(text, x, y + 0.5);
   }
-}
-
-/** The middle of the number of a contact: the first corner of its circle at which no name is. */
-export function tagPlace(x, y, size, names) {
-  const away = 0.72 * size + 8;
-  const places = [[1, -1], [1, 1], [-1, 1], [-1, -1]].map(([right, down]) => [x + right * away, y + down * away]);
-  const isFree = ([left, top]) => !names.some((name) => Math.abs(name.y - top) < 15 && Math.abs(name.x - left) < name.width / 2 + 12);
-  return places.find(isFree) ?? places[0];
 }
 
 function facing(stage, sheet, i) {

@@ -1,4 +1,4 @@
-"""Begin and end recordings from a page, and control a replay."""
+"""Programs beside a page: run ``skin-record`` and ``skin-doctor``, and control a replay by ``skin-replay``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from skinware.service.messages import OPERATIONS
 from skinware.state import DEAD
 from skinware.views.following import ShownDriver
 
+_AGAIN_NS, _SOON_NS = 30 * NS_PER_S, 5 * NS_PER_S
+"""Between two examinations while problems stay as they are, and when they change."""
 _END_S = 10.0
 """Time for a recording to complete its file."""
 
@@ -55,7 +57,6 @@ class RecordingProgram:
         return {"file": str(self._file), **figures, "s": round(time.monotonic() - self._begin_s, 1)}
 
     def start(self) -> None:
-        """Begin to record, unless a recording runs."""
         if self._running is None:
             self.problem, self._report, self._begin_s = None, {}, time.monotonic()
             self._file = self._folder / time.strftime("skin-%Y%m%d-%H%M%S.mcap")
@@ -67,11 +68,7 @@ class RecordingProgram:
             self._process.stdin.close()
 
     def mark(self, text: str, time_ns: int) -> bool:
-        """Write an event into the recording, and return whether there is one.
-
-        Args:
-            time_ns: when it happened, CLOCK_MONOTONIC.
-        """
+        """Write an event that happened at a time, CLOCK_MONOTONIC, into the recording; return whether there is one."""
         process = self._process
         if process is None or process.stdin is None or process.stdin.is_closing():
             return False
@@ -79,7 +76,6 @@ class RecordingProgram:
         return True
 
     async def close(self) -> None:
-        """End the recording, and wait for the end."""
         if self._running is None:
             return
         self.stop()
@@ -96,23 +92,67 @@ class RecordingProgram:
             stderr=asyncio.subprocess.PIPE,
         )
         try:
-            _, errors = await asyncio.gather(self._listen(process), _all_of(process.stderr))
+            assert process.stdout is not None and process.stderr is not None  # noqa: S101, PT018 - they are pipes
+            errors = asyncio.create_task(process.stderr.read())
+            async for line in process.stdout:
+                self._report = json.loads(line)
             if await process.wait():
-                self.problem = errors.strip().rpartition("\n")[2] or "the recording ended by itself"
+                text = (await errors).decode(errors="replace")
+                self.problem = text.strip().rpartition("\n")[2] or "the recording ended by itself"
         finally:
             if process.returncode is None:
                 process.kill()
                 await process.wait()
             self._running = self._process = None
 
-    async def _listen(self, process: asyncio.subprocess.Process) -> None:
-        assert process.stdout is not None  # noqa: S101 - it is a pipe
-        async for line in process.stdout:
-            self._report = json.loads(line)
 
+class DoctorProgram:
+    """Run ``skin-doctor``, one at a time.
 
-async def _all_of(stream: asyncio.StreamReader | None) -> str:
-    return "" if stream is None else (await stream.read()).decode(errors="replace")
+    Args:
+        program: that prints findings, with the arguments of ``skin-doctor``; empty: none.
+        namespace: to examine.
+
+    Attributes:
+        findings: those of the last examination, as ``skin-doctor --json`` has them; empty while there are no problems.
+    """
+
+    def __init__(self, program: Sequence[str], namespace: str) -> None:
+        self.findings: list[dict[str, Any]] = []
+        self._command = [*program, "--json", "--seconds", "2", "--namespace", namespace] if program else []
+        self._running: asyncio.Task[None] | None = None
+        self._seen: frozenset[object] = frozenset()
+        self._begun_ns = -_AGAIN_NS
+
+    def follow(self, problems: Collection[object]) -> None:
+        """Examine if problems have changed, or stay; without problems there are no findings."""
+        seen = frozenset(problems)
+        if not seen:
+            self.findings, self._seen = [], seen
+            return
+        due_ns = self._begun_ns + (_AGAIN_NS if seen == self._seen else _SOON_NS)
+        if self._command and self._running is None and now_ns() >= due_ns:
+            self._begun_ns, self._seen = now_ns(), seen
+            self._running = asyncio.create_task(self._examine())
+
+    async def _examine(self) -> None:
+        pipe, nothing = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
+        process = await asyncio.create_subprocess_exec(*self._command, stdin=nothing, stdout=pipe, stderr=nothing)
+        try:
+            told, _ = await process.communicate()
+            with contextlib.suppress(ValueError, KeyError, TypeError):  # it failed
+                self.findings = json.loads(told)["findings"] if self._seen else []
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+            self._running = None
+
+    async def close(self) -> None:
+        if self._running is not None:
+            self._running.cancel()
+            await asyncio.wait({self._running})
+            self._running = None
 
 
 _STATE = "replay"
@@ -124,8 +164,6 @@ _PATIENCE_NS = 2 * NS_PER_S
 
 
 class ReplayControl:
-    """Find a driver of a replay, and control the replay for viewers."""
-
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
         self._replayed: ShownDriver | None = None
@@ -135,7 +173,6 @@ class ReplayControl:
         self._next_ns = 0
 
     def follow(self, drivers: Sequence[ShownDriver]) -> None:
-        """Take answers, and ask again; never wait."""
         self._acts = [act for act in self._acts if not act.is_done()]
         if self._asked is not None and self._asked.is_done():
             self._asked = None
@@ -144,7 +181,12 @@ class ReplayControl:
         if self._asked is not None or now_ns() < self._next_ns:
             return
         self._next_ns = now_ns() + _ASK_EVERY_NS
-        driver = self._replayed or next((driver for driver in drivers if self._may_be(driver)), None)
+        candidates = (
+            driver
+            for driver in drivers
+            if driver.life != DEAD and self._others.get(driver.name) != driver.live.reader.generation
+        )
+        driver = self._replayed or next(candidates, None)
         if driver is None:
             return
         if driver is self._replayed:
@@ -155,22 +197,12 @@ class ReplayControl:
             )
 
     def act(self, action: str, value: int | float | bool | None, complain: Callable[[str], object]) -> None:
-        """Call an operation of the replay.
-
-        Args:
-            complain: called with the reason if the operation failed.
-
-        Raises:
-            ConfigurationError: no replay is shown.
-        """
+        """Call an operation of the replay; call ``complain`` with the reason if it fails."""
         if self._replayed is None:
             raise ConfigurationError("no replay is shown")
         name = REPLAY_VALUES[action]
         arguments = {} if name is None or value is None else {name: value}
         self._acts.append(_Question(self._replayed, action, arguments, self._hear, complain))
-
-    def _may_be(self, driver: ShownDriver) -> bool:
-        return driver.life != DEAD and self._others.get(driver.name) != driver.live.reader.generation
 
     def _learn(self, driver: ShownDriver, operations: dict[str, str]) -> None:
         if _STATE in operations and operations.keys() >= REPLAY_VALUES.keys():
@@ -187,8 +219,6 @@ class ReplayControl:
 
 
 class _Question:
-    """A request to a driver, with what follows its answer."""
-
     def __init__(
         self,
         driver: ShownDriver,

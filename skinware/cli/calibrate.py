@@ -219,10 +219,10 @@ def finger(
         _, shapes = read_layout(structure, type_name, layout)
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
-        write_places(file, gathering, found.placement, frame or service, pitch_m)
+        write_places(file, gathering, found, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
     words = f"; the tip is at {', '.join(f'{1e3 * number:.1f}' for number in tip)} mm"
-    report_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+    report_placed(how.as_json, file, found, {"tip_m": tip}, words)
 
 
 @command.command(

@@ -31,7 +31,7 @@ class LogFile:
     """A log, as a recording that has only wires.
 
     Args:
-        path: of the log; what it is, is seen by its first bytes.
+        path: of the log; its first bytes show its format.
         bus: a bus that must be in it; empty: those among its first frames count.
 
     Raises:
@@ -88,7 +88,7 @@ class LoggedWire:
     """A bus in a log; see :class:`skinware.recording.WireTrack`.
 
     Attributes:
-        driver: empty: a log does not tell it.
+        driver: empty: a log does not have it.
         bus: its name.
     """
 

@@ -21,7 +21,7 @@ _INSTEAD = {
 
 
 def open_source(path: Path) -> ColumnSource:
-    """Open foreign data; what they are is seen by their first bytes, or by the files of a folder.
+    """Open foreign data; their first bytes, or the files of a folder, show their format.
 
     Raises:
         ConfigurationError: they are nothing that is known, or are damaged.

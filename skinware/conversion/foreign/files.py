@@ -61,7 +61,7 @@ class NpzSource:
             for length, table in self._table_of.items()
         }
 
-    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, names tell it
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, the names are enough
         arrays = {name: self._arrays[name] for name in names}
         length = next((each.shape[0] for each in arrays.values()), 0)
         count = max(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 Rows = dict[str, npt.NDArray[Any]]
 """m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns since 1970."""
 BLOCK_BYTES = 4 << 20
-"""Of the rows that a source reads together."""
+"""Size of the rows that a source reads together."""
 
 
 class ColumnSource(Protocol):

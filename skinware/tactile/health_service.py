@@ -7,9 +7,9 @@
         for position in np.flatnonzero(report.faulty):
             print(health.source.uid[position], report.evidence(position))
 
-Columns of a sample: those of :data:`skinware.tactile.health.COLUMNS`, of all sensors of the driver in the order of its
-frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns: ``sensor_uid``,
-``sensor_type``, and the name of the ``driver``.
+Columns of a sample: those of :data:`skinware.tactile.health_report.COLUMNS`, of all sensors of the driver in the order
+of its frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
+``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from skinware.errors import ConfigurationError
 from skinware.structure import Structure
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
-from skinware.tactile.health import COLUMNS, Health, HealthKind, HealthReport
+from skinware.tactile.health import Health
+from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.source_service import (
     ServiceForm,
     ServiceOptions,

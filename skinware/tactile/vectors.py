@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from skinware import native
 from skinware.errors import ConfigurationError
-from skinware.native.structs import give_arrays, read_structs
+from skinware.native import give_arrays, read_structs
 from skinware.tactile.rule import FORGET_AFTER_S
 from skinware.tactile.stages import Floats, Positive, Signal, Stage, StageSettings, Taxels
 
